@@ -1,0 +1,1 @@
+"""On what: readers, writers and splits."""

@@ -1,0 +1,131 @@
+"""What a method, a reconstruction and a dataset reader promise. Structural: nobody has to inherit."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import msgspec
+import torch
+
+from rewild4d.types import Camera, Clip, Prior, Splats, Truth
+
+Log = Callable[[int, int, Mapping[str, float]], None]
+"""log(step, total, values): progress of a long computation, called every few steps."""
+
+
+@runtime_checkable
+class Reconstruction(Protocol):
+    """A function from time to Gaussians."""
+
+    def at(self, time: float) -> Splats:
+        """The Gaussians at a time in seconds, in the world frame."""
+        ...
+
+    def camera(self, time: float) -> Camera | None:
+        """The input camera at a time, in the world frame, or None where the method does not know it."""
+        ...
+
+    def save(self, folder: Path) -> None:
+        """Write everything `Method.load` needs into an existing, empty folder."""
+        ...
+
+
+@dataclass(frozen=True)
+class MethodInfo:
+    """What a table prints about a method: pure data."""
+
+    title: str
+    paper: str
+    licence: str
+    sees_test_frames: bool = False
+    is_floor: bool = False
+    uses_prior: bool = True
+
+
+class Method(Protocol):
+    """One competitor.
+
+    `Config` is a frozen msgspec.Struct; its presets are TOML tables in baselines/presets/<name>.toml.
+    """
+
+    info: MethodInfo
+    Config: type[msgspec.Struct]
+
+    def fit(
+        self,
+        clip: Clip,
+        prior: Prior,
+        *,
+        config: Any,
+        seed: int,
+        device: torch.device,
+        log: Log,
+        workdir: Path | None,
+    ) -> Reconstruction:
+        """Reconstruct from the clip and the prior, and nothing else.
+
+        Args:
+            clip: the frames that the method may see.
+            prior: a start.
+            config: an instance of `Config`.
+            seed: two runs with one seed on one machine give the same result on the CPU.
+            device: where to compute.
+            log: progress.
+            workdir: where checkpoints go; a second call with the same folder resumes to the same result. None: no checkpoints.
+        """
+        ...
+
+    def load(self, folder: Path, device: torch.device) -> Reconstruction:
+        """Read back what `Reconstruction.save` wrote: the same pixels."""
+        ...
+
+
+class Selection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Which frames a method gets and which are held out, and at what size: the data part of a protocol.
+
+    Attributes:
+        cameras: "fixed" (one camera), "sweep" (the camera index advances per frame) or "random" (one seeded camera a frame).
+        size: longest image side in pixels.
+        framing: "full" keeps the frame's aspect, "letterbox" pads it to a square, "crop" takes one square window that
+            holds the animal in every selected image of a view.
+        placements: for "fixed": where the camera stands relative to the animal; each is a case of its own.
+        step: for "sweep": camera indices advanced per frame.
+        stride: keep every stride-th frame of the motion.
+        seed: of "random".
+    """
+
+    cameras: Literal["fixed", "sweep", "random"]
+    size: int
+    framing: Literal["full", "letterbox", "crop"] = "full"
+    placements: tuple[Literal["side", "oblique", "frontal"], ...] = ()
+    step: int = 1
+    stride: int = 1
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of `check`: an error keeps the data from being used, a warning does not."""
+
+    level: Literal["error", "warning", "ok"]
+    path: str
+    message: str
+
+
+class DatasetReader(Protocol):
+    """Reads one dataset folder into clips and truths."""
+
+    licence: str
+
+    def cases(self, selection: Selection) -> list[str]:
+        """Names of all cases, "<animal>/<motion>" (with "@<placement>" under a fixed camera), cheaply."""
+        ...
+
+    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
+        """Decode one case."""
+        ...
+
+    def check(self) -> list[Finding]:
+        """Verify layout and contents without stopping at the first fault."""
+        ...

@@ -1,0 +1,22 @@
+"""The one exception for bad input: one clear sentence, exit code 2, no traceback."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class UserError(Exception):
+    """What a person gave cannot be used. The message names the path, what was expected and what came."""
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
+    """Make the error for a name that is not in ``known``, with a suggestion where one is close.
+
+    Args:
+        kind: what the name stands for, as it reads in a sentence ("method", "dataset").
+        name: what the user gave.
+        known: every valid name.
+    """
+    names = sorted(known)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    hint = f" Did you mean '{close[0]}'?" if close else ""
+    return UserError(f"unknown {kind} '{name}'.{hint} Available: {', '.join(names) or 'none'}.")

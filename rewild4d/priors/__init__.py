@@ -1,0 +1,1 @@
+"""Where a reconstruction starts from: the procedural quadruped and its fit to a masked clip."""

@@ -1,0 +1,1 @@
+"""The one differentiable rasterizer every method renders with."""

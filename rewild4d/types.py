@@ -1,0 +1,197 @@
+"""The types that flow through the house: frozen, small, shapes in the comments.
+
+Conventions, everywhere: OpenCV camera axes (x right, y down, z forward); pixel centres at +0.5 inside the package
+(column u covers [u, u+1)); quaternions are wxyz; colours and mattes lie in [0, 1]; time is in seconds.
+
+Two frames of reference:
+  world   the dataset's own coordinates. `Reconstruction.at` answers here; held-out cameras live here.
+  object  the animal's: x lateral (+x its left), y up, z towards the head, x = 0 the symmetry plane, and the rest
+          shape's bounding-box diagonal scaled to `OBJECT_DIAGONAL`. A prior and `ours` work here.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+OBJECT_DIAGONAL = 5.0
+"""Rest-shape bounding-box diagonal in the object frame, so that one loss weight means the same on every scene."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera.
+
+    Attributes:
+        world_to_camera: rigid transform, float64, [4, 4].
+        intrinsics: pixels, pixel centres at +0.5, float64, [3, 3].
+        width: image width in pixels.
+        height: image height in pixels.
+    """
+
+    world_to_camera: Tensor
+    intrinsics: Tensor
+    width: int
+    height: int
+
+    @property
+    def center(self) -> Tensor:
+        """Camera centre in the world, [3]."""
+        rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return -rotation.T @ translation
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Project world points [..., 3] to pixels [..., 2] and depths [...]."""
+        matrix = self.world_to_camera.to(points)
+        local = points @ matrix[:3, :3].T + matrix[:3, 3]
+        image = local @ self.intrinsics.to(points).T
+        return image[..., :2] / image[..., 2:].clamp_min(1e-9), local[..., 2]
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same view at another image size (the two axes scale on their own)."""
+        scale = torch.tensor([width / self.width, height / self.height, 1.0], dtype=self.intrinsics.dtype)
+        return replace(self, intrinsics=scale[:, None] * self.intrinsics, width=width, height=height)
+
+    def shifted(self, left: float, top: float, width: int, height: int) -> "Camera":
+        """The view of a window whose upper left corner is at (left, top); negative values pad."""
+        moved = self.intrinsics.clone()
+        moved[0, 2] -= left
+        moved[1, 2] -= top
+        return replace(self, intrinsics=moved, width=width, height=height)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of the animal.
+
+    Attributes:
+        time: seconds from the start of the clip.
+        camera: world camera, or None where nobody knows it.
+        rgb: colour already multiplied by the mask (black outside the animal), float32 in [0, 1], [3, h, w].
+        mask: soft matte, float32 in [0, 1], [1, h, w].
+        view: index of the camera in the dataset, or -1.
+    """
+
+    time: float
+    camera: Camera | None
+    rgb: Tensor
+    mask: Tensor
+    view: int = -1
+
+    def over(self, background: float | Tensor) -> Tensor:
+        """The frame composited on a background colour (a number or a tensor that broadcasts), [3, h, w]."""
+        return self.rgb + (1.0 - self.mask) * background
+
+
+@dataclass(frozen=True)
+class Clip:
+    """What a method may see: one image per moment.
+
+    Attributes:
+        name: case name, "<animal>/<motion>".
+        species: free text, for reports only; nothing may depend on it.
+        frames: in the order of time.
+        fps: frames per second.
+        licence: of the data.
+        digest: SHA-256 over the pixels, mattes and cameras that the method gets.
+    """
+
+    name: str
+    species: str
+    frames: tuple[Frame, ...]
+    fps: float
+    licence: str
+    digest: str
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        return tuple(frame.time for frame in self.frames)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What only the evaluation sees.
+
+    Attributes:
+        held_out: frames of views (or moments) that the clip does not hold; a lazy sequence, each item decoded on access.
+        surface: time in seconds -> the true surface points at that time in the world, the same point in the same row
+            at every time, float64, [n, 3]; None where the data set has no geometry.
+        digest: SHA-256 over the held-out data.
+    """
+
+    held_out: Sequence[Frame]
+    surface: Callable[[float], Tensor] | None
+    digest: str
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A posed template: a start, never a constraint. Everything is in the object frame but `object_to_world`.
+
+    Attributes:
+        name: how it was made ("template", "coarse", a file's name).
+        provenance: one sentence for the record (what it saw, noise, version).
+        vertices: rest shape, float32, [n, 3].
+        faces: int64, [f, 3].
+        weights: skinning weights, each row sums to one, float32, [n, J].
+        bones: start (inner end, the pivot) and end of each bone at rest, float32, [J, 2, 3].
+        parents: parent of each bone, -1 for a root, int64, [J].
+        mirror: the bone on the other side of each bone (an involution), int64, [J].
+        times: seconds of the frames it knows, float64, [T].
+        object_to_world: similarity at each frame, float64, [T, 4, 4].
+        cameras: per frame, in the object frame (rigid: the similarity's scale is divided out); the same pixels as the clip.
+        transforms: rest -> posed, per bone, float32, [T, J, 4, 4].
+        cameras_flip: the same for the horizontally flipped frames.
+        transforms_flip: the same for the horizontally flipped frames, float32, [T, J, 4, 4].
+        quality: named figures of the fit (mask_iou, ...), copied into the record.
+        digest: SHA-256 of all of the above.
+    """
+
+    name: str
+    provenance: str
+    vertices: Tensor
+    faces: Tensor
+    weights: Tensor
+    bones: Tensor
+    parents: Tensor
+    mirror: Tensor
+    times: Tensor
+    object_to_world: Tensor
+    cameras: tuple[Camera, ...]
+    transforms: Tensor
+    cameras_flip: tuple[Camera, ...]
+    transforms_flip: Tensor
+    quality: dict[str, float]
+    digest: str
+
+
+@dataclass(frozen=True)
+class Case:
+    """One unit of the benchmark."""
+
+    clip: Clip
+    prior: Prior
+    truth: Truth
+
+
+@dataclass(frozen=True)
+class Splats:
+    """The Gaussians of one moment, activated values.
+
+    Attributes:
+        means: [n, 3].
+        quats: unit, wxyz, [n, 4].
+        scales: standard deviations, [n, 3].
+        opacities: in [0, 1], [n].
+        colors: RGB in [0, 1] for k = 1; spherical-harmonic coefficients for k = 4, 9, 16, [n, k, 3].
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
