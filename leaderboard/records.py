@@ -1,0 +1,122 @@
+"""Run records: one JSON file a run, strict to read, written atomically, traceable from any table cell."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from rewild4d.errors import UserError
+from rewild4d.files import digest, write_text
+
+SCHEMA = 1
+FILE = "record.json"
+
+
+class Score(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One measured quantity.
+
+    Attributes:
+        value: the mean over ``count`` items, or None where it could not be computed; ``note`` then says why.
+        unit: "dB", "1" for a ratio, ...
+        better: "higher" or "lower".
+        count: how many items the mean is over.
+        per_item: the value of each item, in the order of the record's ``items``; None for an item without a value.
+        note: why there is no value, or what was left out of the mean.
+    """
+
+    value: float | None
+    unit: str
+    better: str
+    count: int
+    per_item: list[float | None] = []
+    note: str = ""
+
+
+class Timing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """All that may differ between two runs with one seed on one machine."""
+
+    started: str
+    fit_seconds: float
+    evaluate_seconds: float
+    peak_memory_mib: float
+
+
+class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a run was and what it found.
+
+    Attributes:
+        schema: version of this layout.
+        run_id: digest of all that decides the result: method, config, data, prior, protocol, seed, code, device.
+        status: "ok" or "failed"; ``error`` then holds the message.
+        config: every setting of the method, defaults included.
+        data: digests of the clip and of the truth, and the folder they came from.
+        prior: name, provenance, digest and the quality of its fit.
+        protocol: name, digest and settings.
+        coverage: what the numbers lean on (see rewild4d.coverage).
+        items: label of each held-out image, as in ``Score.per_item``.
+        diagnostics: what the method says of itself (Gaussians, joint motion, ...).
+        pictures: files written beside the record, relative to it.
+    """
+
+    schema: int
+    run_id: str
+    method: str
+    dataset: str
+    case: str
+    seed: int
+    preset: str
+    status: str
+    error: str
+    scores: dict[str, Score]
+    coverage: dict[str, float]
+    config: dict[str, Any]
+    data: dict[str, str]
+    prior: dict[str, Any]
+    protocol: dict[str, Any]
+    diagnostics: dict[str, Any]
+    items: list[str]
+    pictures: list[str]
+    code: dict[str, str]
+    machine: dict[str, str]
+    timing: Timing
+
+
+def make_run_id(**parts: Any) -> str:
+    """Sixteen hex digits of the SHA-256 over the JSON of all parts, in a fixed order."""
+    return digest(msgspec.json.encode(parts, order="deterministic"))[:16]
+
+
+def write_record(record: RunRecord, folder: Path) -> Path:
+    """Write ``folder/record.json`` atomically and return its path."""
+    path = folder / FILE
+    write_text(path, to_json(record) + "\n")
+    return path
+
+
+def to_json(record: RunRecord) -> str:
+    """The record as indented JSON; non-finite numbers are an error, never written."""
+    return msgspec.json.format(msgspec.json.encode(record, order="sorted"), indent=1).decode()
+
+
+def read_record(path: Path) -> RunRecord:
+    """Read one record file.
+
+    Raises:
+        UserError: missing, not JSON, or not of this schema.
+    """
+    try:
+        record = msgspec.json.decode(path.read_bytes(), type=RunRecord)
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: expected a run record, but there is no such file.") from error
+    except (msgspec.DecodeError, msgspec.ValidationError) as error:
+        raise UserError(f"{path}: expected a run record of schema {SCHEMA}, but {error}.") from error
+    if record.schema != SCHEMA:
+        raise UserError(f"{path}: expected a run record of schema {SCHEMA}, got schema {record.schema}.")
+    return record
+
+
+def read_records(folder: Path) -> list[RunRecord]:
+    """All records below a folder, sorted by path."""
+    if not folder.is_dir():
+        raise UserError(f"{folder}: expected a folder of runs, but there is no such folder.")
+    return [read_record(path) for path in sorted(folder.rglob(FILE))]

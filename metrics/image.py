@@ -1,0 +1,76 @@
+"""Image similarity: PSNR and SSIM, each as a pure function that gives one value per image.
+
+All images are float tensors in [0, 1], [B, C, H, W]; predictions and truths share size and background.
+"""
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+PSNR_CAP = 100.0
+"""Identical images have an infinite PSNR; it is reported as this many dB so that a mean exists."""
+
+
+def psnr(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Peak signal-to-noise ratio, 10 log10(1 / MSE), peak 1, capped at `PSNR_CAP`.
+
+    Args:
+        prediction: in [0, 1], [B, C, H, W].
+        target: in [0, 1], [B, C, H, W].
+        mask: pixels to count, boolean, [B, 1, H, W]; all where None. The mean is over the counted pixels only,
+            so a larger empty background does not change it.
+
+    Returns:
+        Decibels per image, float64, [B]; NaN for an image with no counted pixel (the caller reports it as not computed).
+    """
+    _check_pair(prediction, target)
+    squares = (prediction.double() - target.double()).square()
+    if mask is None:
+        error = squares.flatten(1).mean(1)
+    else:
+        if mask.shape != (target.shape[0], 1, *target.shape[2:]):
+            raise ValueError(f"expected a mask of shape {(target.shape[0], 1, *target.shape[2:])}, got {tuple(mask.shape)}")
+        counted = mask.to(squares)
+        error = (squares * counted).flatten(1).sum(1) / (counted.flatten(1).sum(1) * target.shape[1])
+    return (-10.0 * error.clamp_min(10 ** (-PSNR_CAP / 10)).log10()).where(~error.isnan(), error)
+
+
+def ssim(prediction: Tensor, target: Tensor) -> Tensor:
+    """Structural similarity (Wang et al. 2004): 11x11 Gaussian window, sigma 1.5, population covariance, valid region.
+
+    Equals scikit-image with gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.
+
+    Args:
+        prediction: in [0, 1], [B, C, H, W], at least 11 pixels each way.
+        target: in [0, 1], [B, C, H, W].
+
+    Returns:
+        Mean over the map and the channels per image, float64, [B].
+    """
+    _check_pair(prediction, target)
+    if min(target.shape[2:]) < 11:
+        raise ValueError(f"expected images of at least 11x11 pixels for SSIM, got {target.shape[3]}x{target.shape[2]}")
+    x, y = prediction.double(), target.double()
+    mean_x, mean_y, xx, yy, xy = (_blur(image) for image in (x, y, x * x, y * y, x * y))
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
+    structure = (2 * (xy - mean_x * mean_y) + c2) / (xx - mean_x**2 + yy - mean_y**2 + c2)
+    return (luminance * structure).flatten(1).mean(1)
+
+
+def _blur(images: Tensor) -> Tensor:
+    """Separable Gaussian window over the valid region, [B, C, H, W] -> [B, C, H-10, W-10]."""
+    offsets = torch.arange(-5, 6, dtype=images.dtype, device=images.device)
+    window = torch.exp(-(offsets**2) / (2 * 1.5**2))
+    window = window / window.sum()
+    single = images.flatten(0, 1)[:, None]
+    return conv2d(conv2d(single, window.view(1, 1, 11, 1)), window.view(1, 1, 1, 11)).view(
+        *images.shape[:2], images.shape[2] - 10, images.shape[3] - 10
+    )
+
+
+def _check_pair(prediction: Tensor, target: Tensor) -> None:
+    if prediction.shape != target.shape or prediction.ndim != 4:
+        raise ValueError(
+            f"expected two image batches of one shape [B, C, H, W], got {tuple(prediction.shape)} and {tuple(target.shape)}"
+        )

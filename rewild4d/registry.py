@@ -1,0 +1,66 @@
+"""Names to objects: lazy "module:object" strings, plus what installed packages add by entry points.
+
+A package scan would miss the mapped folders of an editable install; a table cannot.
+"""
+
+import importlib
+from importlib import metadata
+from typing import Any
+
+from rewild4d.errors import unknown_name
+
+METHODS = {
+    "ours": "rewild4d.ours.method:Ours",
+    "prior-only": "rewild4d.baselines.prior_only:PriorOnly",
+    "empty": "rewild4d.baselines.empty:Empty",
+}
+DATASETS = {"artemis": "rewild4d.datasets.artemis:Artemis"}
+BUILTIN = {"artemis": "rewild4d.datasets.synthetic:ensure"}
+"""Data sets that make themselves on first use: a function that returns their folder."""
+
+
+def names(kind: str) -> list[str]:
+    """Every known name of a kind ("methods" or "datasets"), ours first; imports nothing."""
+    return list(_table(kind))
+
+
+def load_method(name: str) -> Any:
+    """An instance of the method called ``name`` (contracts.Method).
+
+    Raises:
+        UserError: no such method, with the nearest name.
+    """
+    return _load("methods", name)()
+
+
+def load_dataset(name: str) -> Any:
+    """The reader class of the data set called ``name``: reader(root) -> contracts.DatasetReader.
+
+    Raises:
+        UserError: no such data set, with the nearest name.
+    """
+    return _load("datasets", name)
+
+
+def load_builtin(name: str) -> Any:
+    """The function that makes a data set's built-in folder, or None where there is none."""
+    target = BUILTIN.get(name)
+    return _resolve(target) if target else None
+
+
+def _load(kind: str, name: str) -> Any:
+    table = _table(kind)
+    if name not in table:
+        raise unknown_name(kind.removesuffix("s"), name, table)
+    return _resolve(table[name])
+
+
+def _table(kind: str) -> dict[str, str]:
+    own = {"methods": METHODS, "datasets": DATASETS}[kind]
+    plugged = {entry.name: entry.value for entry in metadata.entry_points(group=f"rewild4d.{kind}")}
+    return own | {name: target for name, target in plugged.items() if name not in own}
+
+
+def _resolve(target: str) -> Any:
+    module, _, attribute = target.partition(":")
+    return getattr(importlib.import_module(module), attribute)
