@@ -1,0 +1,52 @@
+"""Forward kinematics: joint angles to rest -> posed transforms in object space."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from rewild4d.transforms import axis_angle_to_matrix, rigid
+
+
+def depth_levels(parents: Sequence[int]) -> list[list[int]]:
+    """Bones grouped by their distance from a root, roots first.
+
+    Raises:
+        ValueError: the parents form a cycle or point outside.
+    """
+    remaining, done, levels = set(range(len(parents))), {-1}, []
+    while remaining:
+        level = sorted(bone for bone in remaining if parents[bone] in done)
+        if not level:
+            raise ValueError(f"parents {list(parents)} do not form a forest")
+        levels.append(level)
+        remaining -= set(level)
+        done |= set(level)
+    return levels
+
+
+def pose(angles: Tensor, pivots: Tensor, parents: Sequence[int]) -> Tensor:
+    """Chained transforms P_j = P_parent(j) T(c_j) R_j T(-c_j): rest -> posed, identity at zero angles.
+
+    The axes of every joint are the object's (x flexes in the side view, y turns sideways, z rolls), so a mirrored
+    pose has angles (x, -y, -z) on the bone of the other side. Composition from leaf to root as in METHOD section 2.
+
+    Args:
+        angles: axis-angle vectors in radians, [..., J, 3].
+        pivots: start of each bone at rest, broadcastable to [..., J, 3].
+        parents: parent of each bone, -1 for a root.
+
+    Returns:
+        Rigid transforms, [..., J, 4, 4].
+    """
+    rotations = axis_angle_to_matrix(angles)
+    pivots = pivots.expand(angles.shape)
+    local = rigid(rotations, pivots - (rotations @ pivots[..., None])[..., 0])
+    levels = depth_levels(parents)
+    posed: dict[int, Tensor] = {}
+    for level in levels:
+        own = local[..., level, :, :]
+        if parents[level[0]] >= 0:
+            own = torch.stack([posed[parents[bone]] for bone in level], dim=-3) @ own
+        posed.update(zip(level, own.unbind(-3), strict=True))
+    return torch.stack([posed[bone] for bone in range(len(parents))], dim=-3)

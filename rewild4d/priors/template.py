@@ -1,0 +1,367 @@
+"""A procedural quadruped: a differentiable function from body proportions to a skinned mesh with the 20-bone layout.
+
+Layout and numbering are 3D-Fauna's (design notes, FORMATS 4.4): body bones 0-3 run from the head to the middle of the
+back, 4-7 from the tail tip to the middle; legs are front left 8-10, rear left 11-13, rear right 14-16, front right
+17-19, each from foot to top. Unlike Fauna's, the joints are placed by proportions instead of being estimated from
+vertices, and a leg starts at its shoulder or hip beside the spine.
+
+The mesh is five closed tubes (nose to tail tip, and four legs) lofted through a few elliptical control sections by
+quadratic B-splines, so its topology and its skinning weights never change while the proportions do.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.interpolate import BSpline
+from torch import Tensor
+
+from rewild4d.transforms import mirror_points
+from rewild4d.types import OBJECT_DIAGONAL
+
+PARENTS = (1, 2, 3, -1, 5, 6, 7, -1, 9, 10, 3, 12, 13, 7, 15, 16, 7, 18, 19, 3)
+MIRROR = (0, 1, 2, 3, 4, 5, 6, 7, 17, 18, 19, 14, 15, 16, 11, 12, 13, 8, 9, 10)
+
+BODY_RINGS, BODY_SEGMENTS = 48, 16
+LEG_RINGS, LEG_SEGMENTS = 16, 10
+SKINNING_SOFTNESS = 0.12
+"""Width of the blend between neighbouring bones, in bone lengths."""
+
+
+class Proportion(NamedTuple):
+    """One body measure: half sizes and lengths in object units, angles in radians.
+
+    Attributes:
+        average: of a generic quadruped.
+        spread: one standard deviation over species, relative (of the logarithm) unless additive.
+        additive: the measure is average + spread * z instead of average * exp(spread * z).
+    """
+
+    average: float
+    spread: float
+    additive: bool = False
+
+
+PROPORTIONS: dict[str, Proportion] = {
+    "body_length": Proportion(1.75, 0.20),
+    "chest_width": Proportion(0.36, 0.25),
+    "chest_height": Proportion(0.46, 0.20),
+    "belly_width": Proportion(0.36, 0.25),
+    "belly_height": Proportion(0.40, 0.20),
+    "hip_width": Proportion(0.33, 0.25),
+    "hip_height": Proportion(0.42, 0.20),
+    "chest_drop": Proportion(0.0, 0.08, True),
+    "belly_drop": Proportion(0.0, 0.08, True),
+    "front_leg": Proportion(1.40, 0.25),
+    "rear_leg": Proportion(1.45, 0.25),
+    "front_stance": Proportion(0.20, 0.25),
+    "rear_stance": Proportion(0.20, 0.25),
+    "front_thigh": Proportion(0.17, 0.25),
+    "rear_thigh": Proportion(0.23, 0.25),
+    "front_shank": Proportion(0.085, 0.30),
+    "rear_shank": Proportion(0.085, 0.30),
+    "paw": Proportion(0.10, 0.30),
+    "elbow_back": Proportion(0.08, 0.08, True),
+    "knee_forward": Proportion(0.12, 0.10, True),
+    "hock_back": Proportion(0.16, 0.10, True),
+    "neck_length": Proportion(0.85, 0.30),
+    "neck_angle": Proportion(0.85, 0.40, True),
+    "neck_base": Proportion(0.29, 0.25),
+    "neck_top": Proportion(0.19, 0.25),
+    "head_length": Proportion(0.72, 0.25),
+    "head_angle": Proportion(-0.45, 0.30, True),
+    "head_height": Proportion(0.20, 0.25),
+    "head_width": Proportion(0.17, 0.25),
+    "muzzle": Proportion(0.10, 0.30),
+    "tail_length": Proportion(1.0, 0.40),
+    "tail_angle": Proportion(-0.95, 0.50, True),
+    "tail_base": Proportion(0.075, 0.35),
+    "tail_middle": Proportion(0.075, 0.45),
+}
+
+
+@dataclass(frozen=True)
+class Proportions:
+    """Body proportions as deviations from the average quadruped, in spreads: zeros are the average animal.
+
+    Attributes:
+        deviations: one column per entry of `PROPORTIONS`, float32, [..., P]; gradients flow through.
+    """
+
+    deviations: Tensor
+
+    @staticmethod
+    def average() -> "Proportions":
+        return Proportions(torch.zeros(len(PROPORTIONS)))
+
+    @staticmethod
+    def of(**measures: float) -> "Proportions":
+        """The average animal but for the named measures (object units, radians)."""
+        deviations = torch.zeros(len(PROPORTIONS))
+        for name, value in measures.items():
+            average, spread, additive = PROPORTIONS[name]
+            deviation = (value - average) / spread if additive else np.log(value / average) / spread
+            deviations[list(PROPORTIONS).index(name)] = float(deviation)
+        return Proportions(deviations)
+
+    def measures(self) -> dict[str, Tensor]:
+        """Every measure by name, each [...]."""
+        return {
+            name: p.average + p.spread * z if p.additive else p.average * torch.exp(p.spread * z)
+            for (name, p), z in zip(PROPORTIONS.items(), self.deviations.unbind(-1), strict=True)
+        }
+
+
+@dataclass(frozen=True)
+class Template:
+    """A quadruped at rest in object axes; leading dimensions are those of its proportions.
+
+    Attributes:
+        vertices: [..., n, 3].
+        faces: counter-clockwise from outside, int64, [f, 3].
+        weights: rows sum to one, [n, J].
+        bones: start (the pivot) and end of each bone, [..., J, 2, 3].
+        blobs: centres of a few hundred round Gaussians that fill the same tubes, [..., m, 3].
+        blob_sizes: their standard deviations, [..., m].
+        blob_weights: rows sum to one, [m, J].
+    """
+
+    vertices: Tensor
+    faces: Tensor
+    weights: Tensor
+    bones: Tensor
+    blobs: Tensor
+    blob_sizes: Tensor
+    blob_weights: Tensor
+
+
+class _Tube(NamedTuple):
+    """A lofted tube: ring centres [..., r, 3], in-plane axes [..., r, 3] and half sizes [..., r]."""
+
+    centers: Tensor
+    across: Tensor
+    upward: Tensor
+    widths: Tensor
+    heights: Tensor
+
+    def points(self, segments: int, inset: Tensor | float = 0.0) -> Tensor:
+        """Points around each ring, moved inwards by ``inset`` ([..., r]), [..., r * segments, 3]."""
+        angles = torch.arange(segments) * (2 * torch.pi / segments)
+        rim = ((self.widths - inset)[..., None, None] * self.across[..., None, :]) * angles.cos()[:, None] + (
+            (self.heights - inset)[..., None, None] * self.upward[..., None, :]
+        ) * angles.sin()[:, None]
+        return (self.centers[..., None, :] + rim).flatten(-3, -2)
+
+    def mesh(self, segments: int) -> Tensor:
+        """Rings and one cap point at each end, [..., r * segments + 2, 3]."""
+        return torch.cat((self.points(segments), self.centers[..., :1, :], self.centers[..., -1:, :]), dim=-2)
+
+    def blobs(self, segments: int) -> tuple[Tensor, Tensor]:
+        """Round Gaussians inside whose common 50 % contour is close to the tube, [..., m, 3] and [..., m]."""
+        sizes = 0.42 * torch.minimum(self.widths, self.heights)
+        return self.points(segments, 1.35 * sizes), sizes.repeat_interleave(segments, dim=-1)
+
+
+@cache
+def _spline(controls: int, rings: int) -> tuple[Tensor, Tensor]:
+    """Values and derivatives of a clamped quadratic B-spline at even parameters, each [rings, controls]."""
+    degree = 2
+    knots = np.concatenate((np.zeros(degree), np.linspace(0.0, 1.0, controls - degree + 1), np.ones(degree)))
+    basis = BSpline(knots, np.eye(controls), degree)
+    at = np.linspace(0.0, 1.0, rings)
+    return torch.from_numpy(basis(at)).float(), torch.from_numpy(basis.derivative()(at)).float()
+
+
+def _loft(controls: Tensor, widths: Tensor, heights: Tensor, rings: int) -> _Tube:
+    """A tube through control sections: centres [..., c, 3], half sizes [..., c]."""
+    values, slopes = _spline(controls.shape[-2], rings)
+    tangents = torch.nn.functional.normalize(slopes @ controls, dim=-1)
+    lateral = torch.tensor((1.0, 0.0, 0.0))
+    across = torch.nn.functional.normalize(lateral - tangents * tangents[..., :1], dim=-1)
+    upward = torch.linalg.cross(tangents, across)
+    return _Tube(values @ controls, across, upward, widths @ values.T, heights @ values.T)
+
+
+@cache
+def _tube_faces(rings: int, segments: int) -> Tensor:
+    """Triangles of a capped tube whose vertices are ordered as `_Tube.mesh` gives them, [f, 3]."""
+    ring, segment = torch.meshgrid(torch.arange(rings - 1), torch.arange(segments), indexing="ij")
+    a = (ring * segments + segment).flatten()
+    b = (ring * segments + (segment + 1) % segments).flatten()
+    around = torch.arange(segments)
+    following, last = (around + 1) % segments, (rings - 1) * segments
+    start, end = torch.full_like(around, rings * segments), torch.full_like(around, rings * segments + 1)
+    return torch.cat(
+        (
+            torch.stack((a, b, b + segments), 1),
+            torch.stack((a, b + segments, a + segments), 1),
+            torch.stack((start, following, around), 1),
+            torch.stack((end, last + around, last + following), 1),
+        )
+    )
+
+
+def _point(y: Tensor, z: Tensor, x: Tensor | None = None) -> Tensor:
+    return torch.stack((torch.zeros_like(y) if x is None else x, y, z), dim=-1)
+
+
+def _spine(m: dict[str, Tensor]) -> list[Tensor]:
+    """The nine spine joints from the nose to the tail tip, each [..., 3]."""
+    half, high = m["body_length"] / 2, 0.45 * m["chest_height"]
+    zero = torch.zeros_like(half)
+    withers, hips = _point(high, half), _point(0.45 * m["hip_height"], -half)
+    neck = _point(m["neck_angle"].sin(), m["neck_angle"].cos()) * m["neck_length"][..., None]
+    head = _point(m["head_angle"].sin(), m["head_angle"].cos()) * m["head_length"][..., None]
+    tail = _point(m["tail_angle"].sin(), -m["tail_angle"].cos()) * m["tail_length"][..., None]
+    root = hips + _point(zero, -0.8 * m["hip_height"])
+    return [
+        withers + neck + head, withers + neck, withers + neck / 2, withers, _point(high, zero),
+        hips, root, root + tail / 2, root + tail,
+    ]  # fmt: skip
+
+
+def _leg(m: dict[str, Tensor], end: str) -> list[Tensor]:
+    """The four joints of a left leg from the top to the foot, each [..., 3]; ``end`` is "front" or "rear"."""
+    side = 1.0 if end == "front" else -1.0
+    length, stance = m[f"{end}_leg"], m[f"{end}_stance"]
+    top = side * m["body_length"] / 2
+    if end == "front":
+        knee, hock = top - m["elbow_back"], top
+    else:
+        knee, hock = top + m["knee_forward"], top - m["hock_back"]
+    zero = torch.zeros_like(length)
+    return [
+        _point(zero, top, stance),
+        _point(-0.36 * length, knee, stance),
+        _point(-0.68 * length, hock, stance),
+        _point(-length, top - (0.0 if end == "front" else 0.5) * m["hock_back"], stance),
+    ]
+
+
+def _body_tube(m: dict[str, Tensor], joints: list[Tensor]) -> _Tube:
+    """Nose to tail tip."""
+    half, zero = m["body_length"] / 2, torch.zeros_like(m["body_length"])
+    nose, poll, neck, withers, _, hips, root, tail, tip = joints
+    snout = torch.nn.functional.normalize(nose - poll, dim=-1)
+    sections = (
+        (nose, 0.55 * m["muzzle"], 0.55 * m["muzzle"]),
+        (nose - 0.18 * snout * m["head_length"][..., None], m["muzzle"], m["muzzle"]),
+        (0.5 * (nose + poll), 0.8 * m["head_width"], 0.85 * m["head_height"]),
+        (poll + 0.12 * snout, 1.1 * m["head_width"], 1.15 * m["head_height"]),
+        (poll - 0.25 * (poll - neck), m["neck_top"] * 0.85, m["neck_top"]),
+        (neck, 0.5 * (m["neck_top"] + m["neck_base"]) * 0.8, 0.5 * (m["neck_top"] + m["neck_base"])),
+        (withers + _point(-0.35 * m["chest_height"], 0.12 * half), 0.8 * m["chest_width"], 1.2 * m["neck_base"]),
+        (_point(m["chest_drop"], 0.8 * half), m["chest_width"], m["chest_height"]),
+        (_point(m["belly_drop"], zero), m["belly_width"], m["belly_height"]),
+        (_point(zero, -0.75 * half), m["hip_width"], m["hip_height"]),
+        (_point(zero, -half - 0.45 * m["hip_height"]), 0.75 * m["hip_width"], 0.75 * m["hip_height"]),
+        (root, 1.3 * m["tail_base"], 1.3 * m["tail_base"]),
+        (0.5 * (root + tail), m["tail_base"], m["tail_base"]),
+        (tail + 0.25 * (tip - tail), m["tail_middle"], m["tail_middle"]),
+        (tip, 0.4 * m["tail_middle"], 0.4 * m["tail_middle"]),
+    )
+    centers, widths, heights = zip(*sections, strict=True)
+    return _loft(torch.stack(centers, -2), torch.stack(widths, -1), torch.stack(heights, -1), BODY_RINGS)
+
+
+BODY_STATIONS = (0.0, 0.2, 0.5, 0.95, 1.25, 2.0, 3.0, 3.25, 4.0, 4.75, 5.5, 6.0, 6.5, 7.25, 8.0)
+"""Bone coordinate of each body section: k to k + 1 is the k-th bone from the nose (bones 0 1 2 3 7 6 5 4)."""
+LEG_STATIONS = (-0.3, 0.1, 0.6, 1.0, 1.5, 2.0, 2.5, 2.85, 3.0)
+"""Bone coordinate of each leg section: 0 to 1 is the top bone; below zero the vertex hangs on the body bone."""
+
+
+def _leg_tube(m: dict[str, Tensor], joints: list[Tensor], end: str) -> _Tube:
+    """From inside the body to the toes."""
+    top, knee, hock, foot = joints
+    thigh, shank, paw = m[f"{end}_thigh"], m[f"{end}_shank"], m["paw"]
+    lift, forward = _point(0.9 * thigh, torch.zeros_like(thigh)), _point(torch.zeros_like(paw), paw)
+    sections = (
+        (top + lift, 0.4 * thigh, 0.6 * thigh),
+        (top, 0.8 * thigh, 1.3 * thigh),
+        (0.45 * top + 0.55 * knee, 0.7 * thigh, 1.1 * thigh),
+        (knee, 0.5 * (thigh + shank), 0.5 * (thigh + shank)),
+        (0.5 * (knee + hock), 1.05 * shank, 1.15 * shank),
+        (hock, shank, shank),
+        (0.5 * (hock + foot), 0.9 * shank, 0.9 * shank),
+        (foot, 0.9 * paw, paw),
+        (foot + 0.7 * forward + 0.1 * (foot - hock), 0.5 * paw, 0.6 * paw),
+    )
+    centers, widths, heights = zip(*sections, strict=True)
+    return _loft(torch.stack(centers, -2), torch.stack(widths, -1), torch.stack(heights, -1), LEG_RINGS)
+
+
+def _chain_weights(stations: tuple[float, ...], rings: int, bones: tuple[int, ...], first: float) -> Tensor:
+    """Smooth weights of rings along a chain of bones, [rings, J]; ``first`` is where the chain's coordinate starts."""
+    values, _ = _spline(len(stations), rings)
+    along = values @ torch.tensor(stations)
+    middle = torch.arange(len(bones)) + first + 0.5
+    outside = ((along[:, None] - middle).abs() - 0.5).clamp_min(-0.25)
+    weights = torch.zeros(rings, len(PARENTS))
+    weights[:, list(bones)] = torch.softmax(-outside / SKINNING_SOFTNESS, dim=1)
+    return weights
+
+
+@cache
+def _skinning() -> tuple[tuple[Tensor, ...], Tensor]:
+    """Weights of the rings of every tube, each [r, J] (body, then the legs by number), and all faces, [f, 3]."""
+    body = _chain_weights(BODY_STATIONS, BODY_RINGS, (0, 1, 2, 3, 7, 6, 5, 4), 0.0)
+    tops = (10, 13, 16, 19)
+    legs = tuple(_chain_weights(LEG_STATIONS, LEG_RINGS, (PARENTS[t], t, t - 1, t - 2), -1.0) for t in tops)
+    faces, offset = [_tube_faces(BODY_RINGS, BODY_SEGMENTS)], BODY_RINGS * BODY_SEGMENTS + 2
+    for leg in range(4):
+        triangles = _tube_faces(LEG_RINGS, LEG_SEGMENTS)
+        faces.append(offset + (triangles if leg < 2 else triangles.flip(1)))
+        offset += LEG_RINGS * LEG_SEGMENTS + 2
+    return (body, *legs), torch.cat(faces)
+
+
+def quadruped(shape: Proportions | None = None, *, unit: bool = True) -> Template:
+    """Build the template; differentiable in the proportions.
+
+    Args:
+        shape: body proportions, any leading dimensions; None is the average animal.
+        unit: scale so that the bounding-box diagonal is `OBJECT_DIAGONAL`.
+
+    Returns:
+        The template, symmetric about x = 0, chest centre near the origin.
+    """
+    m = (shape or Proportions.average()).measures()
+    spine = _spine(m)
+    front, rear = _leg(m, "front"), _leg(m, "rear")
+    body, left = _body_tube(m, spine), [_leg_tube(m, front, "front"), _leg_tube(m, rear, "rear")]
+    ring_weights, faces = _skinning()
+
+    meshes = [body.mesh(BODY_SEGMENTS), *(leg.mesh(LEG_SEGMENTS) for leg in left)]
+    meshes += [mirror_points(meshes[2]), mirror_points(meshes[1])]
+    weights = [
+        torch.cat((w.repeat_interleave(BODY_SEGMENTS if k == 0 else LEG_SEGMENTS, 0), w[:1], w[-1:]))
+        for k, w in enumerate(ring_weights)
+    ]
+    body_blobs, front_blobs, rear_blobs = body.blobs(6), left[0].blobs(3), left[1].blobs(3)
+    blobs = [body_blobs[0], front_blobs[0], rear_blobs[0], mirror_points(rear_blobs[0]), mirror_points(front_blobs[0])]
+    sizes = [body_blobs[1], front_blobs[1], rear_blobs[1], rear_blobs[1], front_blobs[1]]
+    blob_weights = [w.repeat_interleave(6 if k == 0 else 3, 0) for k, w in enumerate(ring_weights)]
+
+    segments = [(spine[k + 1], spine[k]) for k in range(4)] + [(spine[k - 1], spine[k]) for k in (8, 7, 6, 5)]
+    legs = [front, rear, [mirror_points(j) for j in rear], [mirror_points(j) for j in front]]
+    segments += [(leg[k], leg[k + 1]) for leg in legs for k in (2, 1, 0)]
+    bones = torch.stack([torch.stack(pair, -2) for pair in segments], -3)
+
+    vertices = torch.cat(meshes, -2)
+    scale = OBJECT_DIAGONAL / diagonal(vertices) if unit else torch.ones_like(vertices[..., 0, 0])
+    return Template(
+        vertices=vertices * scale[..., None, None],
+        faces=faces,
+        weights=torch.cat(weights),
+        bones=bones * scale[..., None, None, None],
+        blobs=torch.cat(blobs, -2) * scale[..., None, None],
+        blob_sizes=torch.cat(sizes, -1) * scale[..., None],
+        blob_weights=torch.cat(blob_weights),
+    )
+
+
+def diagonal(vertices: Tensor) -> Tensor:
+    """Length of the bounding-box diagonal, [..., n, 3] -> [...]."""
+    return (vertices.amax(-2) - vertices.amin(-2)).norm(dim=-1)
