@@ -1,0 +1,42 @@
+"""The floor under every score: a reconstruction with nothing in it."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import torch
+
+from rewild4d.contracts import Log, MethodInfo
+from rewild4d.types import Camera, Clip, Prior, Splats
+
+
+class EmptyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Nothing to choose."""
+
+
+class EmptyReconstruction:
+    """No Gaussians at any time."""
+
+    def at(self, time: float) -> Splats:
+        return Splats(torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 1, 3))
+
+    def camera(self, time: float) -> Camera | None:
+        return None
+
+    def save(self, folder: Path) -> None:
+        (folder / "empty.txt").write_text("no Gaussians\n")
+
+
+class Empty:
+    """Renders the background: on white, a small animal costs it little, which is why it is always printed."""
+
+    info = MethodInfo(title="empty", paper="", licence="MIT", is_floor=True, uses_prior=False)
+    Config = EmptyConfig
+
+    def fit(
+        self, clip: Clip, prior: Prior, *, config: Any, seed: int, device: torch.device, log: Log, workdir: Path | None
+    ) -> EmptyReconstruction:
+        return EmptyReconstruction()
+
+    def load(self, folder: Path, device: torch.device) -> EmptyReconstruction:
+        return EmptyReconstruction()

@@ -1,0 +1,94 @@
+"""The prior on its own: its posed surface as Gaussians, coloured from the frames (the paper's Fauna row).
+
+What a method adds is its distance from this row.
+"""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import torch
+from torch import Tensor
+
+from rewild4d.contracts import Log, MethodInfo
+from rewild4d.priors.io import load_prior, save_prior
+from rewild4d.priors.motion import (
+    SurfaceSample,
+    colors_from_frames,
+    pose_at,
+    pose_gaussians,
+    quats_from_normals,
+    sample_surface,
+)
+from rewild4d.transforms import transform_splats
+from rewild4d.types import Camera, Clip, Prior, Splats
+
+
+class PriorOnlyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the prior's surface is drawn."""
+
+    gaussians: int = 12000
+    """Points on the surface: enough that their discs close at 512 pixels."""
+    thickness: float = 0.3
+    """Along the normal, as a share of the disc's radius: a thin shell."""
+
+
+class PriorOnlyReconstruction:
+    """A posed, coloured template."""
+
+    def __init__(self, prior: Prior, sample: SurfaceSample, colors: Tensor, cameras: dict[float, Camera], thickness: float):
+        self.prior, self.sample, self.colors, self.cameras = prior, sample, colors, cameras
+        self.thickness = thickness
+        self.quats = quats_from_normals(sample.normals)
+        self.scales = sample.radius * torch.tensor((1.0, 1.0, thickness)).expand(len(colors), 3)
+
+    def at(self, time: float) -> Splats:
+        object_to_world, transforms = pose_at(self.prior, time)
+        return transform_splats(
+            pose_gaussians(self.sample, self.quats, self.scales, self.colors, transforms), object_to_world
+        )
+
+    def camera(self, time: float) -> Camera | None:
+        return self.cameras.get(time)
+
+    def canonical(self) -> Splats:
+        """The Gaussians at rest, in the object frame."""
+        rest = torch.eye(4).expand(self.prior.bones.shape[0], 4, 4)
+        return pose_gaussians(self.sample, self.quats, self.scales, self.colors, rest)
+
+    @property
+    def weights(self) -> Tensor:
+        """Skinning weights of the canonical Gaussians, [n, J]."""
+        return self.sample.weights
+
+    def save(self, folder: Path) -> None:
+        save_prior(self.prior, folder / "prior.npz")
+        state = {
+            "sample": asdict(self.sample),
+            "colors": self.colors,
+            "thickness": self.thickness,
+            "cameras": {time: (c.world_to_camera, c.intrinsics, c.width, c.height) for time, c in self.cameras.items()},
+        }
+        torch.save(state, folder / "surface.pt")
+
+
+class PriorOnly:
+    """The floor that a reconstruction has to leave behind."""
+
+    info = MethodInfo(title="prior only", paper="3D-Fauna (Li et al. 2024) as posed prior", licence="MIT", is_floor=True)
+    Config = PriorOnlyConfig
+
+    def fit(
+        self, clip: Clip, prior: Prior, *, config: Any, seed: int, device: torch.device, log: Log, workdir: Path | None
+    ) -> PriorOnlyReconstruction:
+        sample = sample_surface(prior, config.gaussians, torch.Generator().manual_seed(seed))
+        colors = colors_from_frames(prior, sample, clip.frames)
+        cameras = {frame.time: frame.camera for frame in clip.frames if frame.camera is not None}
+        return PriorOnlyReconstruction(prior, sample, colors, cameras, config.thickness)
+
+    def load(self, folder: Path, device: torch.device) -> PriorOnlyReconstruction:
+        state = torch.load(folder / "surface.pt", weights_only=True)
+        cameras = {time: Camera(*values) for time, values in state["cameras"].items()}
+        prior = load_prior(folder / "prior.npz")
+        return PriorOnlyReconstruction(prior, SurfaceSample(**state["sample"]), state["colors"], cameras, state["thickness"])

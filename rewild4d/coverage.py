@@ -1,0 +1,74 @@
+"""What a clip's cameras ever saw of the animal: the evidence behind a novel-view score.
+
+A score under one fixed camera and a score under a sweeping one lean on different evidence (design note 9.2);
+these two numbers travel with each record so that nobody compares them by accident.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from rewild4d.types import Camera, Clip, Truth
+
+GRID = 48
+"""Cells along the longer side of the depth buffer: coarse, so that 10k surface points leave no holes."""
+VIEWS = 200
+"""Held-out images looked at, evenly spaced."""
+
+
+def coverage(clip: Clip, truth: Truth) -> dict[str, float]:
+    """Coverage statistics of a case.
+
+    Returns:
+        foreground: mean share of a held-out image that the animal fills, in [0, 1].
+        seen_surface: mean share of the surface visible in a held-out image that some input image showed, at any
+            time, in [0, 1]; absent where the data set has no geometry.
+    """
+    chosen = [truth.held_out[i] for i in _spread(len(truth.held_out), VIEWS)]
+    result = {"foreground": sum(float(frame.mask.mean()) for frame in chosen) / max(1, len(chosen))}
+    if truth.surface is None or not chosen:
+        return result
+    points = {time: truth.surface(time) for time in sorted({*clip.times, *(frame.time for frame in chosen)})}
+    seen = torch.zeros(len(next(iter(points.values()))), dtype=torch.bool)
+    for frame in clip.frames:
+        if frame.camera is not None:
+            seen |= visible(points[frame.time], frame.camera)
+    shares = []
+    for frame in chosen:
+        if frame.camera is not None and (shown := visible(points[frame.time], frame.camera)).any():
+            shares.append(float(seen[shown].double().mean()))
+    if shares:
+        result["seen_surface"] = sum(shares) / len(shares)
+    return result
+
+
+def visible(points: Tensor, camera: Camera, tolerance: float = 0.03) -> Tensor:
+    """Which surface points a camera sees, by a coarse depth buffer.
+
+    Args:
+        points: in the world, [n, 3].
+        camera: the view.
+        tolerance: depth behind the nearest point of a cell that still counts, as a share of the points' extent.
+
+    Returns:
+        Boolean, [n].
+    """
+    small = camera.resized(
+        max(1, round(camera.width * GRID / max(camera.width, camera.height))),
+        max(1, round(camera.height * GRID / max(camera.width, camera.height))),
+    )
+    pixels, depth = small.project(points.double())
+    column, row = pixels[:, 0].floor().long(), pixels[:, 1].floor().long()
+    inside = (depth > 0) & (column >= 0) & (column < small.width) & (row >= 0) & (row < small.height)
+    cell = (row * small.width + column).clamp(0, small.width * small.height - 1)
+    nearest = torch.full((small.width * small.height,), torch.inf, dtype=torch.float64)
+    nearest.scatter_reduce_(0, cell[inside], depth[inside], "amin")
+    extent = float((points.amax(0) - points.amin(0)).norm())
+    return inside & (depth <= nearest[cell] + tolerance * extent)
+
+
+def _spread(count: int, most: int) -> Sequence[int]:
+    if count <= most:
+        return range(count)
+    return [i * count // most for i in range(most)]

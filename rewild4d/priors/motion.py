@@ -1,0 +1,164 @@
+"""A prior between its frames, and Gaussians on its surface: what every method starts from."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn.functional import grid_sample, normalize
+
+from rewild4d.transforms import (
+    matrix_to_quat,
+    mirror_points,
+    quat_to_matrix,
+    similarity,
+    skin_points,
+    skin_quats,
+    split_similarity,
+)
+from rewild4d.types import Camera, Frame, Prior, Splats
+
+
+@dataclass(frozen=True)
+class SurfaceSample:
+    """Area-uniform points on a prior's rest mesh.
+
+    Attributes:
+        points: object frame, [n, 3].
+        normals: unit, outwards, [n, 3].
+        weights: skinning weights, rows sum to one, [n, J].
+        radius: of a disc with each point's share of the area, object units.
+    """
+
+    points: Tensor
+    normals: Tensor
+    weights: Tensor
+    radius: float
+
+
+def sample_surface(prior: Prior, count: int, generator: torch.Generator) -> SurfaceSample:
+    """Draw ``count`` points uniformly by area from the rest mesh."""
+    corners = prior.vertices[prior.faces]
+    cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = cross.norm(dim=-1) / 2
+    face = torch.multinomial(area, count, replacement=True, generator=generator)
+    u, v = torch.rand(2, count, generator=generator)
+    barycentric = torch.stack((1 - u.sqrt(), u.sqrt() * (1 - v), u.sqrt() * v), dim=-1)
+    points = (barycentric[..., None] * corners[face]).sum(1)
+    weights = (barycentric[..., None] * prior.weights[prior.faces[face]]).sum(1)
+    radius = math.sqrt(float(area.sum()) / (math.pi * count))
+    return SurfaceSample(points, normalize(cross[face], dim=-1), weights / weights.sum(-1, keepdim=True), radius)
+
+
+def quats_from_normals(normals: Tensor) -> Tensor:
+    """Orientations whose third axis is the normal, [n, 3] -> [n, 4]."""
+    helper = torch.where(normals[:, :1].abs() < 0.9, normals.new_tensor((1.0, 0, 0)), normals.new_tensor((0, 1.0, 0)))
+    first = normalize(torch.linalg.cross(helper, normals), dim=-1)
+    return matrix_to_quat(torch.stack((first, torch.linalg.cross(normals, first), normals), dim=-1))
+
+
+def pose_at(prior: Prior, time: float) -> tuple[Tensor, Tensor]:
+    """The prior's motion at any time: exact at its frames, interpolated between, held beyond the ends.
+
+    Returns:
+        object_to_world, float64, [4, 4]; rest -> posed transforms, float32, [J, 4, 4].
+    """
+    times = prior.times
+    after = min(int(torch.searchsorted(times, torch.tensor(time, dtype=times.dtype) - 1e-9)), len(times) - 1)
+    before = after if time >= float(times[after]) - 1e-9 or after == 0 else after - 1
+    span = float(times[after] - times[before])
+    part = (time - float(times[before])) / span if span > 0 else 0.0
+    if before == after or part <= 1e-9:
+        return prior.object_to_world[before], prior.transforms[before]
+    return (
+        blend_similarities(prior.object_to_world[before], prior.object_to_world[after], part),
+        blend_similarities(prior.transforms[before].double(), prior.transforms[after].double(), part).float(),
+    )
+
+
+def blend_similarities(a: Tensor, b: Tensor, part: float) -> Tensor:
+    """Between two proper similarities: normalised quaternion blend, linear translation, geometric scale, [..., 4, 4]."""
+    (scale_a, turn_a, move_a), (scale_b, turn_b, move_b) = split_similarity(a), split_similarity(b)
+    quat_a, quat_b = matrix_to_quat(turn_a), matrix_to_quat(turn_b)
+    quat_b = torch.where((quat_a * quat_b).sum(-1, keepdim=True) < 0, -quat_b, quat_b)
+    turn = quat_to_matrix((1 - part) * quat_a + part * quat_b)
+    scale = scale_a ** (1 - part) * scale_b**part
+    return similarity(scale, turn, (1 - part) * move_a + part * move_b)
+
+
+def pose_gaussians(sample: SurfaceSample, quats: Tensor, scales: Tensor, colors: Tensor, transforms: Tensor) -> Splats:
+    """Opaque Gaussians on the posed surface, in the object frame.
+
+    Args:
+        sample: the surface at rest.
+        quats: orientations at rest, [n, 4].
+        scales: [n, 3].
+        colors: [n, 3].
+        transforms: rest -> posed, [J, 4, 4].
+    """
+    joint_quats = matrix_to_quat(split_similarity(transforms)[1])
+    return Splats(
+        means=skin_points(sample.points, sample.weights, transforms),
+        quats=skin_quats(quats, sample.weights, joint_quats),
+        scales=scales,
+        opacities=torch.ones(len(scales)),
+        colors=colors[:, None],
+    )
+
+
+def colors_from_frames(prior: Prior, sample: SurfaceSample, frames: Sequence[Frame]) -> Tensor:
+    """Colour of each surface point: the mean over the frames that see it, else its mirror image's, else the mean colour.
+
+    Args:
+        prior: posed at the frames' times.
+        sample: points on its rest surface.
+        frames: training frames, with mattes.
+
+    Returns:
+        RGB in [0, 1], [n, 3].
+    """
+    total = torch.zeros(len(sample.points), 3)
+    weight = torch.zeros(len(sample.points), 1)
+    for frame in frames:
+        index = int((prior.times - frame.time).abs().argmin())
+        camera, transforms = prior.cameras[index], prior.transforms[index]
+        points = skin_points(sample.points, sample.weights, transforms)
+        turned = torch.einsum("nj,jab,nb->na", sample.weights, transforms[:, :3, :3], sample.normals)
+        facing = -(normalize(turned, dim=-1) * normalize(points - camera.center.to(points), dim=-1)).sum(-1)
+        pixels, depth = camera.project(points)
+        color, alpha = _look_up(frame, pixels)
+        shown = (facing > 0.2) & (alpha > 0.5) & _nearest(pixels, depth, camera)
+        total[shown] += facing[shown, None] * color[shown] / alpha[shown, None]
+        weight[shown] += facing[shown, None]
+    seen = weight[:, 0] > 0
+    rgb = sum(frame.rgb.sum((1, 2)) for frame in frames) / sum(frame.mask.sum() for frame in frames)
+    colors = torch.as_tensor(rgb).expand(len(total), 3).clone()
+    colors[seen] = total[seen] / weight[seen]
+    if seen.any() and not seen.all():
+        distance, nearest = cKDTree(sample.points[seen].numpy()).query(mirror_points(sample.points[~seen]).numpy())
+        known = torch.from_numpy(distance) < 0.2
+        colors[torch.nonzero(~seen)[known, 0]] = colors[seen][torch.from_numpy(nearest)[known]]
+    return colors.clamp(0, 1)
+
+
+def _look_up(frame: Frame, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Bilinear colour (premultiplied) [n, 3] and matte [n] at pixel positions [n, 2]."""
+    height, width = frame.mask.shape[1:]
+    grid = pixels / pixels.new_tensor((width, height)) * 2 - 1
+    image = torch.cat((frame.rgb, frame.mask))[None]
+    values = grid_sample(image, grid.view(1, 1, -1, 2).to(image), align_corners=False)[0, :, 0].T
+    return values[:, :3], values[:, 3]
+
+
+def _nearest(pixels: Tensor, depth: Tensor, camera: Camera, cell: float = 3.0) -> Tensor:
+    """Which points lie at the front of a depth buffer with cells of a few pixels, boolean [n]."""
+    width, height = math.ceil(camera.width / cell), math.ceil(camera.height / cell)
+    column, row = (pixels / cell).floor().long().unbind(-1)
+    inside = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    index = (row * width + column).clamp(0, width * height - 1)
+    front = torch.full((width * height,), torch.inf, dtype=depth.dtype)
+    front.scatter_reduce_(0, index[inside], depth[inside], "amin")
+    return inside & (depth <= front[index] + 0.15)
+
