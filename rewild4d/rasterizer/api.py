@@ -1,0 +1,132 @@
+"""The one entry point: checks the input and hands it to a backend."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from rewild4d.rasterizer import reference
+from rewild4d.rasterizer.conventions import RasterInfo
+
+BACKENDS = ("auto", "reference", "numba")
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    world_to_camera: Tensor,
+    intrinsics: Tensor,
+    width: int,
+    height: int,
+    *,
+    background: Tensor | None = None,
+    eps2d: float = 0.3,
+    antialias: bool = False,
+    near: float = 0.01,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor, RasterInfo]:
+    """Blend 3D Gaussians front to back into images (design note "The one rasterizer"; semantics of gsplat).
+
+    Differentiable in every tensor argument. Values and gradients are the same bits for any number of threads.
+
+    Args:
+        means: centres in the world, [N, 3].
+        quats: orientations, wxyz, of any length but zero (normalised here), [N, 4].
+        scales: standard deviations along the Gaussian's own axes, [N, 3].
+        opacities: in [0, 1], [N].
+        features: any number of channels (colour, normal, depth, part), [N, C].
+        world_to_camera: OpenCV axes; converted to the dtype and device of ``means``, [V, 4, 4].
+        intrinsics: pinhole without skew, pixel centres at +0.5; converted likewise, [V, 3, 3].
+        width: image width in pixels.
+        height: image height in pixels.
+        background: composited behind everything, [C] or [V, C]; None leaves the features premultiplied (black).
+        eps2d: variance in square pixels added to every projected Gaussian.
+        antialias: scale opacity down by what ``eps2d`` adds in area, so that far objects do not grow.
+        near: Gaussians whose centre is not farther than this along the camera's z are not drawn.
+        backend: "numba" (CPU, float32), "reference" (dense torch, any device and float type, small scenes only) or
+            "auto": numba for float32 on the CPU, the reference otherwise.
+
+    Returns:
+        features [V, C, height, width], alpha [V, 1, height, width], and the info densification needs.
+
+    Raises:
+        ValueError: a shape, type, device or option is wrong, or a value is not finite; names the tensor and the index.
+    """
+    named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features}
+    _check_gaussians(named)
+    world_to_camera, intrinsics = world_to_camera.to(means), intrinsics.to(means)
+    _check_cameras(world_to_camera, intrinsics, width, height)
+    views, channels = world_to_camera.shape[0], features.shape[1]
+    named |= {"world_to_camera": world_to_camera, "intrinsics": intrinsics}
+    if background is not None:
+        if background.shape not in ((channels,), (views, channels)):
+            raise ValueError(
+                f"background: expected shape [{channels}] or [{views}, {channels}], got {list(background.shape)}."
+            )
+        background = background.to(means).expand(views, channels)
+        named["background"] = background
+    for name, tensor in named.items():
+        _check_finite(name, tensor)
+    if not (eps2d >= 0 and near > 0):
+        raise ValueError(f"expected eps2d >= 0 and near > 0, got eps2d={eps2d} and near={near}.")
+    chosen = _choose(backend, means)
+    return chosen(
+        means, quats, scales, opacities, features, world_to_camera, intrinsics,
+        int(width), int(height), background, float(eps2d), bool(antialias), float(near),
+    )  # fmt: skip
+
+
+def _choose(backend: str, means: Tensor):  # noqa: ANN202
+    if backend not in BACKENDS:
+        raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got '{backend}'.")
+    return reference.rasterize
+
+
+def _check_gaussians(named: dict[str, Tensor]) -> None:
+    means = named["means"]
+    count = means.shape[0] if means.ndim else 0
+    if means.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"means: expected float32 or float64, got {means.dtype}.")
+    wanted = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,)}
+    for name, tensor in named.items():
+        shape = tuple(tensor.shape)
+        if name == "features":
+            if tensor.ndim != 2 or shape[0] != count or shape[1] < 1:
+                raise ValueError(f"features: expected shape [{count}, C] with C >= 1, got {list(shape)}.")
+        elif shape != wanted[name]:
+            raise ValueError(f"{name}: expected shape {list(wanted[name])}, got {list(shape)}.")
+        if tensor.dtype != means.dtype or tensor.device != means.device:
+            raise ValueError(
+                f"{name}: expected {means.dtype} on {means.device} as means has, got {tensor.dtype} on {tensor.device}."
+            )
+
+
+def _check_cameras(world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int) -> None:
+    views = world_to_camera.shape[0] if world_to_camera.ndim else 0
+    if views < 1 or tuple(world_to_camera.shape[1:]) != (4, 4):
+        raise ValueError(f"world_to_camera: expected shape [V, 4, 4] with V >= 1, got {list(world_to_camera.shape)}.")
+    if tuple(intrinsics.shape) != (views, 3, 3):
+        raise ValueError(f"intrinsics: expected shape [{views}, 3, 3], got {list(intrinsics.shape)}.")
+    if width < 1 or height < 1:
+        raise ValueError(f"expected an image of at least one pixel, got {width} x {height}.")
+    for view, matrix in enumerate(intrinsics.tolist()):
+        (fx, skew, _), (lower, fy, _), last = matrix
+        if not (fx > 0 and fy > 0 and skew == 0 and lower == 0 and last == [0, 0, 1]) and all(
+            map(math.isfinite, sum(matrix, []))
+        ):
+            raise ValueError(
+                f"intrinsics[{view}]: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths, got {matrix}."
+            )
+
+
+def _check_finite(name: str, tensor: Tensor) -> None:
+    # A sum is one fast pass and is finite unless something in it is not (or it overflows, then the slow look decides).
+    if math.isfinite(tensor.detach().sum().item()):
+        return
+    bad = (~torch.isfinite(tensor.detach())).nonzero()
+    if len(bad):
+        index = tuple(bad[0].tolist())
+        raise ValueError(f"{name}: expected finite values, got {tensor.detach()[index].item()} at index {list(index)}.")

@@ -1,0 +1,35 @@
+"""The constants of the blend, shared by every backend (gsplat's values), and the result type. See CONVENTIONS.md."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+MIN_ALPHA = 1.0 / 255.0
+"""A Gaussian weaker than this at a pixel is skipped there."""
+
+MAX_ALPHA = 0.99
+"""No single Gaussian covers more than this; above it no gradient reaches opacity, position or shape."""
+
+MIN_TRANSMITTANCE = 1e-4
+"""A pixel is closed before the Gaussian that would push its transmittance to this value or below."""
+
+FRUSTUM_MARGIN = 0.3
+"""The projection's Jacobian is taken at most this share of the half image outside the frame."""
+
+MIN_COMPENSATION = 1e-8
+"""Floor of det(Σ) / det(Σ + eps2d I) under ``antialias``: keeps the square root's derivative finite."""
+
+
+@dataclass(frozen=True)
+class RasterInfo:
+    """What densification needs.
+
+    Attributes:
+        radii: largest distance in pixels from its centre at which a Gaussian is drawn (where its alpha falls to 1/255);
+            0 where it is not visible. float, no gradient, [V, N].
+        means2d: projected centres in pixels (pixel centres at +0.5); after ``backward`` its ``.grad`` holds the loss's
+            gradient per pixel moved. [V, N, 2].
+    """
+
+    radii: Tensor
+    means2d: Tensor
