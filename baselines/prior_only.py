@@ -37,7 +37,9 @@ class PriorOnlyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class PriorOnlyReconstruction:
     """A posed, coloured template."""
 
-    def __init__(self, prior: Prior, sample: SurfaceSample, colors: Tensor, cameras: dict[float, Camera], thickness: float):
+    def __init__(
+        self, prior: Prior, sample: SurfaceSample, colors: Tensor, cameras: dict[float, Camera], thickness: float
+    ):
         self.prior, self.sample, self.colors, self.cameras = prior, sample, colors, cameras
         self.thickness = thickness
         self.quats = quats_from_normals(sample.normals)
@@ -76,7 +78,7 @@ class PriorOnlyReconstruction:
 class PriorOnly:
     """The floor that a reconstruction has to leave behind."""
 
-    info = MethodInfo(title="prior only", paper="3D-Fauna (Li et al. 2024) as posed prior", licence="MIT", is_floor=True)
+    info = MethodInfo(title="prior only", paper="after the 3D-Fauna row (Li et al. 2024)", licence="MIT", is_floor=True)
     Config = PriorOnlyConfig
 
     def fit(
@@ -90,5 +92,5 @@ class PriorOnly:
     def load(self, folder: Path, device: torch.device) -> PriorOnlyReconstruction:
         state = torch.load(folder / "surface.pt", weights_only=True)
         cameras = {time: Camera(*values) for time, values in state["cameras"].items()}
-        prior = load_prior(folder / "prior.npz")
-        return PriorOnlyReconstruction(prior, SurfaceSample(**state["sample"]), state["colors"], cameras, state["thickness"])
+        prior, sample = load_prior(folder / "prior.npz"), SurfaceSample(**state["sample"])
+        return PriorOnlyReconstruction(prior, sample, state["colors"], cameras, state["thickness"])

@@ -21,15 +21,16 @@ def psnr(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tens
             so a larger empty background does not change it.
 
     Returns:
-        Decibels per image, float64, [B]; NaN for an image with no counted pixel (the caller reports it as not computed).
+        Decibels per image, float64, [B]; NaN for an image with no counted pixel (the caller says "not computed").
     """
     _check_pair(prediction, target)
     squares = (prediction.double() - target.double()).square()
     if mask is None:
         error = squares.flatten(1).mean(1)
     else:
-        if mask.shape != (target.shape[0], 1, *target.shape[2:]):
-            raise ValueError(f"expected a mask of shape {(target.shape[0], 1, *target.shape[2:])}, got {tuple(mask.shape)}")
+        expected = (target.shape[0], 1, *target.shape[2:])
+        if mask.shape != expected:
+            raise ValueError(f"expected a mask of shape {expected}, got {tuple(mask.shape)}")
         counted = mask.to(squares)
         error = (squares * counted).flatten(1).sum(1) / (counted.flatten(1).sum(1) * target.shape[1])
     return (-10.0 * error.clamp_min(10 ** (-PSNR_CAP / 10)).log10()).where(~error.isnan(), error)
@@ -71,6 +72,5 @@ def _blur(images: Tensor) -> Tensor:
 
 def _check_pair(prediction: Tensor, target: Tensor) -> None:
     if prediction.shape != target.shape or prediction.ndim != 4:
-        raise ValueError(
-            f"expected two image batches of one shape [B, C, H, W], got {tuple(prediction.shape)} and {tuple(target.shape)}"
-        )
+        shapes = f"{tuple(prediction.shape)} and {tuple(target.shape)}"
+        raise ValueError(f"expected two image batches of one shape [B, C, H, W], got {shapes}")

@@ -72,7 +72,7 @@ class Method(Protocol):
             seed: two runs with one seed on one machine give the same result on the CPU.
             device: where to compute.
             log: progress.
-            workdir: where checkpoints go; a second call with the same folder resumes to the same result. None: no checkpoints.
+            workdir: where checkpoints go; a second call with the same folder resumes to the same result. None: none.
         """
         ...
 
@@ -85,7 +85,7 @@ class Selection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Which frames a method gets and which are held out, and at what size: the data part of a protocol.
 
     Attributes:
-        cameras: "fixed" (one camera), "sweep" (the camera index advances per frame) or "random" (one seeded camera a frame).
+        cameras: "fixed" (one camera), "sweep" (the camera index advances per frame) or "random" (a seeded one a frame).
         size: longest image side in pixels.
         framing: "full" keeps the frame's aspect, "letterbox" pads it to a square, "crop" takes one square window that
             holds the animal in every selected image of a view.

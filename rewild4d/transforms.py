@@ -173,7 +173,7 @@ def skin_points(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
 
 
 def skin_quats(quats: Tensor, weights: Tensor, joint_quats: Tensor) -> Tensor:
-    """Orientation of skinned Gaussians: the normalised blend of the joints' rotations, sign-aligned, times the rest one.
+    """Orientation of skinned Gaussians: the normalised, sign-aligned blend of the joints' rotations times the rest one.
 
     The blended matrix itself would shrink covariances (its singular values fall below one); this does not.
 

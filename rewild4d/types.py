@@ -114,7 +114,7 @@ class Truth:
     """What only the evaluation sees.
 
     Attributes:
-        held_out: frames of views (or moments) that the clip does not hold; a lazy sequence, each item decoded on access.
+        held_out: frames of views (or moments) that the clip does not hold; a lazy sequence, each decoded on access.
         surface: time in seconds -> the true surface points at that time in the world, the same point in the same row
             at every time, float64, [n, 3]; None where the data set has no geometry.
         digest: SHA-256 over the held-out data.
@@ -140,7 +140,7 @@ class Prior:
         mirror: the bone on the other side of each bone (an involution), int64, [J].
         times: seconds of the frames it knows, float64, [T].
         object_to_world: similarity at each frame, float64, [T, 4, 4].
-        cameras: per frame, in the object frame (rigid: the similarity's scale is divided out); the same pixels as the clip.
+        cameras: per frame, in the object frame (rigid: the similarity's scale is divided out); the clip's pixels.
         transforms: rest -> posed, per bone, float32, [T, J, 4, 4].
         cameras_flip: the same for the horizontally flipped frames.
         transforms_flip: the same for the horizontally flipped frames, float32, [T, J, 4, 4].

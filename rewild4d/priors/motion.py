@@ -79,7 +79,7 @@ def pose_at(prior: Prior, time: float) -> tuple[Tensor, Tensor]:
 
 
 def blend_similarities(a: Tensor, b: Tensor, part: float) -> Tensor:
-    """Between two proper similarities: normalised quaternion blend, linear translation, geometric scale, [..., 4, 4]."""
+    """Between two proper similarities: normalised quaternion blend, linear translation, geometric scale."""
     (scale_a, turn_a, move_a), (scale_b, turn_b, move_b) = split_similarity(a), split_similarity(b)
     quat_a, quat_b = matrix_to_quat(turn_a), matrix_to_quat(turn_b)
     quat_b = torch.where((quat_a * quat_b).sum(-1, keepdim=True) < 0, -quat_b, quat_b)
@@ -109,7 +109,7 @@ def pose_gaussians(sample: SurfaceSample, quats: Tensor, scales: Tensor, colors:
 
 
 def colors_from_frames(prior: Prior, sample: SurfaceSample, frames: Sequence[Frame]) -> Tensor:
-    """Colour of each surface point: the mean over the frames that see it, else its mirror image's, else the mean colour.
+    """Colour of each surface point: mean over the frames that see it, else its mirror image's, else the mean colour.
 
     Args:
         prior: posed at the frames' times.

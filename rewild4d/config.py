@@ -1,0 +1,91 @@
+"""Settings: a preset file, then flags, into one frozen msgspec.Struct per method."""
+
+import dataclasses
+import tomllib
+import typing
+from collections.abc import Iterator
+from importlib import resources
+from typing import Any, TypeVar
+
+import msgspec
+import tyro
+
+from rewild4d.errors import UserError, unknown_name
+
+T = TypeVar("T")
+
+
+def preset_names(method: str) -> list[str]:
+    """Names of a method's presets, as its file orders them."""
+    return list(_preset_file(method))
+
+
+def load_preset(method: str, config_type: type[T], preset: str) -> T:
+    """A method's settings under a preset; a method without a preset file has its defaults under every name.
+
+    Raises:
+        UserError: no such preset, or the file does not fit the method's settings.
+    """
+    presets = _preset_file(method)
+    if not presets:
+        return config_type()
+    if preset not in presets:
+        raise unknown_name(f"preset of '{method}'", preset, presets)
+    try:
+        return msgspec.convert(presets[preset], type=config_type)
+    except msgspec.ValidationError as error:
+        raise UserError(f"presets/{method}.toml: [{preset}] does not fit {config_type.__name__}: {error}.") from error
+
+
+def _preset_file(method: str) -> dict[str, Any]:
+    file = resources.files("rewild4d.baselines") / "presets" / f"{method}.toml"
+    return tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+
+
+def parse_flags(options_type: type[T], arguments: list[str], *, prog: str, description: str) -> T:
+    """Parse a command's flags; a misspelt one is a sentence with the nearest name, not a page.
+
+    Args:
+        options_type: a dataclass whose fields are the flags, documented by its docstring.
+        arguments: what came after the command's name.
+        prog: how the command is called, for help.
+        description: shown on top of the help.
+
+    Raises:
+        UserError: a flag that does not exist.
+        SystemExit: --help (0) or a value of the wrong type (2).
+    """
+    options, unknown = tyro.cli(
+        options_type, args=arguments, prog=prog, description=description, return_unknown_args=True
+    )
+    if unknown and unknown[0].startswith("-"):
+        raise unknown_name("option", unknown[0].split("=")[0], _flags(options_type))
+    if unknown:
+        raise UserError(f"{prog}: expected options only, got '{unknown[0]}'; see {prog} --help.")
+    return options
+
+
+def with_method_flags(options_type: type, config: msgspec.Struct) -> type:
+    """``options_type`` with one more field, ``config``, whose settings are flags of their own (--loss.ssim 0.3)."""
+    flattened = typing.Annotated[type(config), tyro.conf.arg(name="")]
+    return dataclasses.make_dataclass(
+        options_type.__name__,
+        [("config", flattened, dataclasses.field(default=config))],
+        bases=(options_type,),
+        frozen=True,
+        namespace={"__doc__": options_type.__doc__},
+    )
+
+
+def _flags(node: Any, prefix: str = "") -> Iterator[str]:
+    """Every flag that a dataclass or Struct type gives, nested ones with dots."""
+    for name, hint in typing.get_type_hints(node).items():
+        if name.startswith("_") or name == "info":
+            continue
+        inner = f"{prefix}{name.replace('_', '-')}"
+        if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
+            yield from _flags(hint, "" if name == "config" else f"{inner}.")
+        else:
+            yield f"--{inner}"
+            if hint is bool:
+                yield f"--{prefix}no-{name.replace('_', '-')}"

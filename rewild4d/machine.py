@@ -1,0 +1,68 @@
+"""What a record says of the machine and of the code that made it."""
+
+import os
+import platform
+import resource
+from functools import cache
+from importlib import metadata, resources
+from pathlib import Path
+
+import torch
+
+from rewild4d import __version__
+from rewild4d.errors import UserError
+from rewild4d.files import digest
+
+PACKAGES = ("baselines", "datasets", "leaderboard", "metrics", "ours", "priors", "rasterizer")
+
+
+@cache
+def code_version() -> dict[str, str]:
+    """The package's version and a digest over its sources, so that edited code never reuses an old run."""
+    parts: list[str | bytes] = []
+    for package in ("rewild4d", *(f"rewild4d.{name}" for name in PACKAGES)):
+        for file in sorted(resources.files(package).iterdir(), key=lambda entry: entry.name):
+            if file.name.endswith((".py", ".toml")):
+                parts += [package, file.name, file.read_bytes()]
+    return {"version": __version__, "sources": digest(*parts)[:16]}
+
+
+def machine() -> dict[str, str]:
+    """Processor, system, threads and the versions that decide the last digit."""
+    versions = {name: metadata.version(name) for name in ("torch", "numpy", "numba")}
+    return {
+        "processor": _processor(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "threads": str(torch.get_num_threads()),
+        **versions,
+    }
+
+
+def peak_memory_mib() -> float:
+    """Largest resident memory of this process so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def pick_device(name: str) -> torch.device:
+    """The torch device of a name ("auto" is the CPU unless a CUDA GPU is there).
+
+    Raises:
+        UserError: no such device here.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name.split(":")[0] not in ("cpu", "cuda"):
+        raise UserError(f"--device: expected auto, cpu or cuda, got '{name}'.")
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise UserError(f"--device {name}: torch {torch.__version__} sees no CUDA GPU here; use --device cpu.")
+    return torch.device(name)
+
+
+def _processor() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text().splitlines():
+            if line.startswith("model name"):
+                return f"{line.split(':', 1)[1].strip()}, {os.cpu_count()} cores"
+    return f"{platform.processor()}, {os.cpu_count()} cores"
