@@ -1,0 +1,275 @@
+"""A skinned, animated glTF file as an `AnimatedAnimal`.
+
+Read: triangle primitives with skins, flat colours, vertex colours and base colour textures; unskinned meshes that hang
+from a joint, directly or through other nodes; node animation. Not read: morph targets, transparency, static scenery.
+"""
+
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pygltflib
+from numpy.typing import NDArray
+
+from rewild4d.datasets.animal import AnimatedAnimal, Surface
+from rewild4d.datasets.gltf import Document, Floats
+from rewild4d.errors import unknown_name
+
+TRIANGLES, STRIP, FAN = 4, 5, 6
+MIRRORED, CLAMPED = 33648, 33071
+
+
+def clips(path: Path) -> list[str]:
+    """Names of the animations of a rig file, in the file's order; unnamed ones are called clip_<index>.
+
+    Raises:
+        UserError: the file is missing or is no glTF.
+    """
+    return _clip_names(Document(path))
+
+
+def load_rig(path: Path, clip: str, frames: int = 24) -> AnimatedAnimal:
+    """Read one animation of a rig.
+
+    Args:
+        path: a .glb or .gltf file.
+        clip: which animation, one of `clips(path)`.
+        frames: how many moments to sample, evenly over [start, end): a looping clip does not repeat its first pose.
+
+    Returns:
+        The animal in the file's own world (metres by the specification, +y up).
+
+    Raises:
+        UserError: the file is missing or no glTF, holds no skinned mesh, or has no such clip.
+    """
+    document = Document(path)
+    names = _clip_names(document)
+    visible = document.scene_nodes()
+    skinned = [
+        i for i in visible if document.tree.nodes[i].mesh is not None and document.tree.nodes[i].skin is not None
+    ]
+    if not skinned:
+        raise document.error("expected a skinned mesh, but the file has none")
+    if clip not in names:
+        raise document.error(str(unknown_name("clip", clip, names)).removesuffix("."))
+    animation = names.index(clip)
+    start, end = document.clip_range(animation)
+    times = start + (end - start) * np.arange(frames) / frames
+    skeleton = _Skeleton(document, animation)
+    surfaces = [surface for index in skinned for surface in _skinned_surfaces(document, skeleton, index)]
+    for index in visible:
+        if document.tree.nodes[index].mesh is not None and document.tree.nodes[index].skin is None:
+            surfaces += _attached_surfaces(document, skeleton, index)
+    bones = document.global_matrices(document.local_matrices(animation, times))[:, skeleton.nodes]
+    return skeleton.sorted(
+        AnimatedAnimal(
+            name=_folder_name(path.stem),
+            species=path.stem,
+            licence=(document.tree.asset.copyright or "see the rig file"),
+            surfaces=tuple(surfaces),
+            bone_names=tuple(document.tree.nodes[i].name or f"node_{i}" for i in skeleton.nodes),
+            parents=skeleton.parents(),
+            bones_rest=np.stack(skeleton.rest),
+            bones=bones,
+            fps=frames / (end - start) if end > start else 24.0,
+            motion=_folder_name(clip),
+            up=np.array([0.0, 1.0, 0.0]),
+        )
+    )
+
+
+def _clip_names(document: Document) -> list[str]:
+    return [clip.name or f"clip_{index}" for index, clip in enumerate(document.tree.animations)]
+
+
+def _folder_name(name: str) -> str:
+    """The name with everything that a folder or a space-separated list cannot hold replaced."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("._") or "unnamed"
+
+
+@dataclass
+class _Skeleton:
+    """Bones as they are gathered from skins and attached parts: bone b is node nodes[b] with rest[b]."""
+
+    document: Document
+    animation: int
+    nodes: list[int] = field(default_factory=list)
+    rest: list[Floats] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.local = self.document.local_matrices(None, np.zeros(1))[0]
+        self.default = self.document.global_matrices(self.local[None])[0]
+        self.animated = self.document.animated_nodes(self.animation)
+
+    def add(self, node: int, rest: Floats) -> int:
+        """Index of the bone of a node with this rest matrix, new where there is none.
+
+        Two skins may bind one joint differently; then it becomes two bones, and the skinning stays exact.
+        """
+        for bone, (known, matrix) in enumerate(zip(self.nodes, self.rest, strict=True)):
+            if known == node and np.allclose(matrix, rest, rtol=1e-4, atol=1e-5 * np.abs(rest[:3]).max()):
+                return bone
+        self.nodes.append(node)
+        self.rest.append(rest)
+        return len(self.nodes) - 1
+
+    def parents(self) -> NDArray[np.int64]:
+        """Nearest ancestor that is a bone, -1 for a root, [J]."""
+        first = {node: bone for bone, node in reversed(list(enumerate(self.nodes)))}
+        return np.array([next((first[n] for n in self.ancestors(node) if n in first), -1) for node in self.nodes])
+
+    def ancestors(self, node: int) -> list[int]:
+        """Ancestors of a node, the nearest first."""
+        line = []
+        while (node := self.document.parents[node]) >= 0:
+            line.append(node)
+        return line
+
+    def sorted(self, animal: AnimatedAnimal) -> AnimatedAnimal:
+        """The same animal with parents before children (Artemis wants a root in row 0)."""
+        depth = {node: len(self.ancestors(node)) for node in self.nodes}
+        order = np.array(sorted(range(len(self.nodes)), key=lambda bone: depth[self.nodes[bone]]))
+        rank = np.argsort(order)
+        old = animal.parents[order]
+        surfaces = tuple(replace(s, bone_indices=rank[s.bone_indices]) for s in animal.surfaces)
+        return replace(
+            animal,
+            surfaces=surfaces,
+            bone_names=tuple(animal.bone_names[bone] for bone in order),
+            parents=np.where(old < 0, -1, rank[old]),
+            bones_rest=animal.bones_rest[order],
+            bones=animal.bones[:, order],
+        )
+
+
+def _skinned_surfaces(document: Document, skeleton: _Skeleton, node: int) -> list[Surface]:
+    skin = document.tree.skins[document.tree.nodes[node].skin]
+    joints: list[int] = skin.joints
+    if skin.inverseBindMatrices is None:
+        inverse_bind = np.tile(np.eye(4), (len(joints), 1, 1))
+    else:
+        inverse_bind = document.floats(skin.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1)
+    if len(inverse_bind) < len(joints) or (np.abs(np.linalg.det(inverse_bind)) == 0).any():
+        raise document.error(f"expected {len(joints)} invertible inverse bind matrices, but a skin has others")
+    root = next(k for k, joint in enumerate(joints) if not set(skeleton.ancestors(joint)) & set(joints))
+    to_world = skeleton.default[joints[root]] @ inverse_bind[root]  # mesh space -> the rest pose in the world
+    bones = np.array([skeleton.add(j, to_world @ np.linalg.inv(m)) for j, m in zip(joints, inverse_bind, strict=False)])
+    surfaces = []
+    for primitive in document.tree.meshes[document.tree.nodes[node].mesh].primitives:
+        if primitive.mode in (None, TRIANGLES, STRIP, FAN):
+            indices, weights = _influences(document, primitive)
+            if indices.max(initial=0) >= len(bones):
+                raise document.error(f"expected joint indices below {len(bones)}, but one is {indices.max()}")
+            surfaces.append(_surface(document, primitive, to_world, bones[indices], weights))
+    return surfaces
+
+
+def _attached_surfaces(document: Document, skeleton: _Skeleton, node: int) -> list[Surface]:
+    """Parts that hang from a joint without a skin: rigid. Parts that hang from none are scenery and give nothing."""
+    line = [node, *skeleton.ancestors(node)]
+    above = next((k for k, n in enumerate(line) if n in skeleton.nodes), None)
+    if above is None:
+        return []
+    between = np.eye(4)
+    for link in reversed(line[:above]):
+        between = between @ skeleton.local[link]
+    bone = skeleton.nodes.index(line[above])
+    to_world = skeleton.rest[bone] @ between
+    if skeleton.animated & set(line[:above]):  # it moves against the joint, so it is a bone of its own
+        bone = skeleton.add(node, to_world)
+    surfaces = []
+    for primitive in document.tree.meshes[document.tree.nodes[node].mesh].primitives:
+        if primitive.mode in (None, TRIANGLES, STRIP, FAN):
+            count = document.tree.accessors[primitive.attributes.POSITION].count
+            indices, weights = np.full((count, 1), bone), np.ones((count, 1))
+            surfaces.append(_surface(document, primitive, to_world, indices, weights))
+    return surfaces
+
+
+def _influences(document: Document, primitive: pygltflib.Primitive) -> tuple[NDArray[np.int64], Floats]:
+    """Joint numbers within the skin and weights that sum to one, both [n, 4 k]."""
+    sets = range(4)
+    indices = [getattr(primitive.attributes, f"JOINTS_{k}", None) for k in sets]
+    weights = [getattr(primitive.attributes, f"WEIGHTS_{k}", None) for k in sets]
+    if indices[0] is None or weights[0] is None:
+        raise document.error("expected JOINTS_0 and WEIGHTS_0 in a skinned mesh, but a primitive lacks them")
+    joints = np.concatenate([document.accessor(i).astype(np.int64) for i in indices if i is not None], axis=1)
+    shares = np.concatenate([document.floats(i) for i in weights if i is not None], axis=1)
+    total = shares.sum(1, keepdims=True)
+    shares[:, :1] = np.where(total <= 0, 1.0, shares[:, :1])  # a vertex without weights follows its first joint
+    return np.where(shares > 0, joints, joints[:, :1]), shares / np.where(total <= 0, 1.0, total)
+
+
+def _surface(
+    document: Document, primitive: pygltflib.Primitive, to_world: Floats, indices: NDArray[np.int64], weights: Floats
+) -> Surface:
+    positions = document.floats(primitive.attributes.POSITION)
+    material = document.tree.materials[primitive.material] if primitive.material is not None else None
+    pbr = material.pbrMetallicRoughness if material else None
+    color = np.tile(np.array((pbr.baseColorFactor if pbr else None) or (1.0, 1.0, 1.0, 1.0))[:3], (len(positions), 1))
+    if primitive.attributes.COLOR_0 is not None:
+        color = color * document.floats(primitive.attributes.COLOR_0)[:, :3]
+    uv, texture = None, None
+    if pbr and pbr.baseColorTexture is not None:
+        uv, texture = _texture(document, primitive, pbr.baseColorTexture)
+    return Surface(
+        vertices=positions @ to_world[:3, :3].T + to_world[:3, 3],
+        faces=_faces(document, primitive, len(positions)),
+        bone_indices=indices,
+        bone_weights=weights,
+        colors=linear_to_srgb(color),
+        uv=uv,
+        texture=texture,
+    )
+
+
+def _faces(document: Document, primitive: pygltflib.Primitive, count: int) -> NDArray[np.int64]:
+    """Triangles, [f, 3], of lists, strips and fans, indexed or not."""
+    if primitive.indices is None:
+        corners = np.arange(count)
+    else:
+        corners = document.accessor(primitive.indices)[:, 0].astype(np.int64)
+    if corners.max(initial=0) >= count:
+        raise document.error(f"expected vertex indices below {count}, but one is {corners.max()}")
+    if primitive.mode == STRIP:
+        faces = np.stack((corners[:-2], corners[1:-1], corners[2:]), axis=1)
+        faces[1::2] = faces[1::2, [1, 0, 2]]
+        return faces
+    if primitive.mode == FAN:
+        return np.stack((corners[1:-1], corners[2:], np.full(len(corners) - 2, corners[0])), axis=1)
+    return corners[: len(corners) // 3 * 3].reshape(-1, 3)
+
+
+def _texture(
+    document: Document, primitive: pygltflib.Primitive, info: pygltflib.TextureInfo
+) -> tuple[Floats, NDArray[np.uint8]]:
+    """Texture coordinates and an image that may be repeated, whatever the file's wrap modes are."""
+    extension = (info.extensions or {}).get("KHR_texture_transform", {})
+    channel = extension.get("texCoord", info.texCoord or 0)
+    accessor = getattr(primitive.attributes, f"TEXCOORD_{channel}", None)
+    if accessor is None:
+        raise document.error(f"expected TEXCOORD_{channel} in a textured mesh, but a primitive lacks it")
+    angle = extension.get("rotation", 0.0)
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    uv = document.floats(accessor) * extension.get("scale", (1.0, 1.0)) @ turn.T + extension.get("offset", (0.0, 0.0))
+    texture = document.tree.textures[info.index]
+    webp = (texture.extensions or {}).get("EXT_texture_webp", {})
+    image = document.image(webp.get("source", texture.source))
+    sampler = document.tree.samplers[texture.sampler] if texture.sampler is not None else None
+    for axis, mode in enumerate((sampler.wrapS, sampler.wrapT) if sampler else ()):
+        if mode == MIRRORED:
+            image = np.concatenate((image, np.flip(image, 1 - axis)), axis=1 - axis)
+            uv[:, axis] /= 2
+        elif mode == CLAMPED:
+            pad = [(0, 0), (0, 0), (0, 0)]
+            pad[1 - axis] = (image.shape[1 - axis],) * 2
+            image = np.pad(image, pad, mode="edge")
+            uv[:, axis] = (np.clip(uv[:, axis], -1.0, 2.0) + 1.0) / 3
+    return uv, np.ascontiguousarray(image)
+
+
+def linear_to_srgb(linear: Floats) -> Floats:
+    """Encode linear light in [0, 1] as sRGB (IEC 61966-2-1)."""
+    linear = np.clip(linear, 0.0, 1.0)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
