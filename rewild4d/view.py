@@ -52,8 +52,8 @@ def comparison(reconstruction: Reconstruction, clip: Clip, truth: Truth) -> Tens
             other = truth.held_out[held[(len(held) // 3 + row * len(held) // (2 * ROWS)) % len(held)]]
             images += [other.over(1.0), _shot(reconstruction, other)]
         panels.append(torch.cat([_widen(image) for image in images], dim=2))
-    titles = ["input", "render", "held-out truth", "held-out render"][: panels[0].shape[2] // _widen(images[0]).shape[2]]
-    return torch.cat([_header(titles, panels[0].shape[2]), *panels], dim=1)
+    titles = ["input", "render", "held-out truth", "held-out render"]
+    return torch.cat([_header(titles[: len(images)], panels[0].shape[2]), *panels], dim=1)
 
 
 def orbit(reconstruction: Reconstruction, clip: Clip) -> list[Tensor]:
@@ -76,9 +76,9 @@ def orbit(reconstruction: Reconstruction, clip: Clip) -> list[Tensor]:
 
 
 def canonical(splats: Splats, weights: Tensor) -> Tensor:
-    """Canonical Gaussians from the side, obliquely, the front and above, each part in a colour of its own, [3, H, W]."""
-    hues = [cv2.cvtColor(np.uint8([[[(j * 97) % 180, 200, 235]]]), cv2.COLOR_HSV2RGB)[0, 0] for j in range(weights.shape[1])]
-    palette = torch.from_numpy(np.stack(hues)).float() / 255
+    """Canonical Gaussians from the side, obliquely, the front and above, each part in its own colour, [3, H, W]."""
+    hues = np.array([[((part * 97) % 180, 200, 235) for part in range(weights.shape[1])]], np.uint8)
+    palette = torch.from_numpy(cv2.cvtColor(hues, cv2.COLOR_HSV2RGB)[0]).float() / 255
     colored = Splats(splats.means, splats.quats, splats.scales, splats.opacities, (weights @ palette)[:, None])
     center = splats.means.double().median(0).values
     up, ahead = torch.tensor((0.0, 1.0, 0.0)).double(), torch.tensor((0.0, 0.0, 1.0)).double()
@@ -138,7 +138,8 @@ def _beside(left: Tensor, right: Tensor) -> Tensor:
 def _header(titles: list[str], width: int) -> Tensor:
     strip = np.full((24, width, 3), 255, np.uint8)
     for i, title in enumerate(titles):
-        cv2.putText(strip, title, (i * width // len(titles) + 6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (40, 40, 40), 1, cv2.LINE_AA)
+        corner = (i * width // len(titles) + 6, 17)
+        cv2.putText(strip, title, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (40, 40, 40), 1, cv2.LINE_AA)
     return torch.from_numpy(strip).permute(2, 0, 1).float() / 255
 
 

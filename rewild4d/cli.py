@@ -1,0 +1,49 @@
+"""The command line: a thin skin over callables. Results go to standard output, everything else to standard error."""
+
+import sys
+from collections.abc import Callable
+
+from rewild4d import __version__
+from rewild4d.commands import check, evaluate, make, overview, run, table
+from rewild4d.errors import UserError, unknown_name
+
+COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {
+    "run": (run.main, "fit a method on a data set and score it on views it never saw"),
+    "evaluate": (evaluate.main, "score a saved reconstruction again"),
+    "table": (table.main, "print a table of what was found"),
+    "list": (overview.main, "methods, data sets, protocols and presets"),
+    "check": (check.main, "verify a data set's folder, or that a method keeps the contract"),
+    "make": (make.main, "render a rigged, animated glTF as a data set with exact truth"),
+}
+
+
+def usage() -> str:
+    """The overview that `--help` prints."""
+    rows = "\n".join(f"  {name:<10} {text}" for name, (_, text) in COMMANDS.items())
+    return (
+        f"rewild4d-bench {__version__}: a benchmark for 4D animals from one monocular video\n\n"
+        f"usage: rewild4d-bench COMMAND [options]      (COMMAND --help tells its options)\n\n{rows}\n\n"
+        "first run: rewild4d-bench run --method ours --dataset artemis"
+    )
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point. Exit status: 0 done, 1 a run failed, 2 bad input."""
+    words = sys.argv[1:] if arguments is None else arguments
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(usage())
+        sys.exit(0 if words else 2)
+    if words[0] == "--version":
+        print(__version__)
+        sys.exit(0)
+    try:
+        if words[0] not in COMMANDS:
+            raise unknown_name("command", words[0], COMMANDS)
+        status = COMMANDS[words[0]][0](words[1:])
+    except UserError as error:
+        print(f"rewild4d-bench: {error}", file=sys.stderr)
+        status = 2
+    except KeyboardInterrupt:
+        print("rewild4d-bench: stopped; the same command goes on where this one was.", file=sys.stderr)
+        status = 130
+    sys.exit(status)

@@ -1,0 +1,76 @@
+"""`evaluate`: score a saved reconstruction again, by the protocol it was fitted for."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import tyro
+
+from rewild4d.config import parse_flags
+from rewild4d.errors import UserError
+from rewild4d.leaderboard.records import FILE, RunRecord, read_record, to_json, write_record
+from rewild4d.leaderboard.tables import markdown
+from rewild4d.machine import code_version, machine, pick_device
+from rewild4d.protocol import evaluate, find_protocol
+from rewild4d.registry import load_dataset, load_method
+from rewild4d.runner import Progress
+from rewild4d.view import save_pictures
+
+DESCRIPTION = """Score saved reconstructions again, with the protocol that they were fitted for (another one could hold out
+what the method has seen), draw their pictures again and write their records anew."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Flags of `evaluate`.
+
+    Attributes:
+        runs: folders of single runs, each with a record.json and a reconstruction.
+        data: where the data is now, if it was moved since.
+        device: auto, cpu or cuda.
+        json: print the records as a JSON array, and nothing else, to standard output.
+    """
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    data: Path | None = None
+    device: str = "auto"
+    json: bool = False
+
+
+def main(arguments: list[str]) -> int:
+    options = parse_flags(Options, arguments, prog="rewild4d-bench evaluate", description=DESCRIPTION)
+    if not options.runs:
+        raise UserError("evaluate: expected the folder of at least one run, got none.")
+    records = [score_again(folder, options) for folder in options.runs]
+    print("[" + ",\n".join(map(to_json, records)) + "]" if options.json else markdown(records))
+    return 0
+
+
+def score_again(folder: Path, options: Options) -> RunRecord:
+    """Load a run's reconstruction, score it and rewrite its record.
+
+    Raises:
+        UserError: no record, no reconstruction, or data that has changed since the fit.
+    """
+    record = read_record(folder / FILE)
+    saved = folder / "reconstruction"
+    if not saved.is_dir():
+        raise UserError(f"{saved}: expected a saved reconstruction, but there is no such folder.")
+    protocol = find_protocol(record.dataset, record.protocol["name"])
+    root = options.data or Path(record.data["root"])
+    clip, truth = load_dataset(record.dataset)(root).load(record.case, protocol.selection)
+    for name, now in (("clip", clip.digest), ("truth", truth.digest)):
+        if now != record.data[name]:
+            raise UserError(f"{root}: the {name} of {record.case} is not the one that {folder} was fitted to.")
+    reconstruction = load_method(record.method).load(saved, pick_device(options.device))
+    progress = Progress(f"{record.case}: evaluate")
+    scores, items = evaluate(reconstruction, truth, protocol, progress)
+    progress.close()
+    pictures = save_pictures(reconstruction, clip, truth, folder)
+    settings = {"digest": protocol.digest, **msgspec.to_builtins(protocol)}
+    renewed = msgspec.structs.replace(
+        record, status="ok", error="", scores=scores, items=items, pictures=pictures, protocol=settings,
+        code=code_version(), machine=machine(),
+    )  # fmt: skip
+    write_record(renewed, folder)
+    return renewed

@@ -1,0 +1,31 @@
+"""`list`: methods, data sets, protocols and presets."""
+
+from dataclasses import dataclass
+
+from rewild4d.config import parse_flags, preset_names
+from rewild4d.protocol import load_protocols
+from rewild4d.registry import BUILTIN, load_dataset, load_method, names
+
+
+@dataclass(frozen=True)
+class Options:
+    """`list` has no flags."""
+
+
+def main(arguments: list[str]) -> int:
+    parse_flags(Options, arguments, prog="rewild4d-bench list", description="List all that can be named in a run.")
+    print("methods")
+    for name in names("methods"):
+        info = load_method(name).info
+        presets = ", ".join(preset_names(name))
+        print(f"  {name:<12} {info.title}" + (f" ({info.paper})" if info.paper else "") + f"; licence {info.licence}")
+        if presets:
+            print(f"  {'':<12} presets: {presets}")
+    print("data sets")
+    for name in names("datasets"):
+        made = "; built-in animals are made where --data is left out" if name in BUILTIN else ""
+        print(f"  {name:<12} {(load_dataset(name).__doc__ or '').strip().splitlines()[0]}{made}")
+    print("protocols")
+    for name, protocol in load_protocols().items():
+        print(f"  {name:<24} {protocol.title}" + (" (default)" if protocol.default else ""))
+    return 0

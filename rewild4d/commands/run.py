@@ -1,0 +1,147 @@
+"""`run`: fit a method on a data set and score it on views it never saw."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from rewild4d.config import load_preset, parse_flags, preset_names, with_method_flags
+from rewild4d.contracts import DatasetReader
+from rewild4d.errors import UserError
+from rewild4d.leaderboard.records import RunRecord, to_json
+from rewild4d.leaderboard.tables import markdown
+from rewild4d.machine import pick_device
+from rewild4d.priors.choose import PriorChoice
+from rewild4d.priors.config import PRESETS as PRIOR_PRESETS
+from rewild4d.priors.config import STANDARD
+from rewild4d.protocol import find_protocol
+from rewild4d.registry import load_builtin, load_dataset, load_method
+from rewild4d.runner import Entry, Plan, Progress, choose_cases, execute
+
+DESCRIPTION = """Fit a method on every case of a data set and score it on the views that it never saw.
+Finished runs are skipped and a killed one resumes. Without --data the built-in animals are made on first use."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Flags of `run`.
+
+    Attributes:
+        method: which method (see `list`).
+        dataset: which data set's layout (see `list`).
+        data: one animal's folder or a folder of animals; the built-in animals where it is left out.
+        case: names or patterns of cases ("wolf/Run", "wolf/*"); all where it is left out.
+        protocol: what is held out and measured (see `list`); the data set's default where it is left out.
+        preset: size of the effort: quick, standard or paper.
+        seeds: one run for each.
+        prior: "template" (fitted to the clip), "coarse:<noise>" (from the truth plus noise, for studies only) or an npz file.
+        device: auto, cpu or cuda.
+        out: folder for runs.
+        json: print the records as a JSON array, and nothing else, to standard output.
+    """
+
+    method: str = "ours"
+    dataset: str = "artemis"
+    data: Path | None = None
+    case: tuple[str, ...] = ()
+    protocol: str | None = None
+    preset: str = "quick"
+    seeds: tuple[int, ...] = (0,)
+    prior: str = "template"
+    device: str = "auto"
+    out: Path = Path("runs")
+    json: bool = False
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command; 0 where every run has scores, 1 where one failed."""
+    wanted = _peek(arguments, "--method") or Options.method
+    preset = _peek(arguments, "--preset") or Options.preset
+    method = load_method(wanted)
+    options_type = with_method_flags(Options, load_preset(wanted, method.Config, preset))
+    options = parse_flags(options_type, arguments, prog="rewild4d-bench run", description=DESCRIPTION)
+    records = execute(make_plan(options, options.config))
+    if options.json:
+        print("[" + ",\n".join(to_json(record) for record in records) + "]")
+    else:
+        print(markdown(records))
+        _print_pictures(records, options)
+    return 0 if all(record.status == "ok" for record in records) else 1
+
+
+def make_plan(options: Options, config: msgspec.Struct) -> Plan:
+    """Resolve names, folders and settings into a plan.
+
+    Raises:
+        UserError: an unknown name, a folder that is not there or cannot be written.
+    """
+    device = pick_device(options.device)
+    protocol = find_protocol(options.dataset, options.protocol)
+    if not options.seeds:
+        raise UserError("--seeds: expected at least one number, got none.")
+    require_writable(options.out)
+    root, reader = open_dataset(options.dataset, options.data)
+    cases = choose_cases(reader.cases(protocol.selection), options.case)
+    floors = [_floor(name) for name in protocol.floors if name != options.method]
+    entry = Entry(options.method, options.preset, config, tuple(dict.fromkeys(options.seeds)))
+    prior = PriorChoice(options.prior, PRIOR_PRESETS.get(options.preset, STANDARD))
+    return Plan(
+        options.dataset, reader, root, cases, protocol, (*floors, entry), prior, device, options.out.absolute()
+    )
+
+
+def open_dataset(dataset: str, data: Path | None) -> tuple[Path, DatasetReader]:
+    """The folder and a reader on it; without a folder the built-in data, made where it is not there yet."""
+    reader = load_dataset(dataset)
+    if data is not None:
+        return data.absolute(), reader(data.absolute())
+    make_builtin = load_builtin(dataset)
+    if make_builtin is None:
+        raise UserError(f"--data: the data set '{dataset}' has no built-in data; name its folder.")
+    progress = Progress("built-in animals")
+    root = make_builtin(progress)
+    progress.close()
+    return root, reader(root)
+
+
+def require_writable(folder: Path) -> None:
+    """Fail before hours of work, not after."""
+    probe = folder / ".writable"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise UserError(f"--out {folder}: expected a folder that can be written, but: {error.strerror}.") from error
+
+
+def _floor(name: str) -> Entry:
+    presets = preset_names(name)
+    config_type = load_method(name).Config
+    return Entry(name, "default", load_preset(name, config_type, presets[0]) if presets else config_type(), (0,))
+
+
+def _peek(arguments: list[str], flag: str) -> str | None:
+    """The value of a flag before the flags are parsed: the method and the preset decide which flags there are."""
+    for i, word in enumerate(arguments):
+        if word == flag and i + 1 < len(arguments):
+            return arguments[i + 1]
+        if word.startswith(f"{flag}="):
+            return word.partition("=")[2]
+    return None
+
+
+def _print_pictures(records: list[RunRecord], options: Options) -> None:
+    print()
+    for record in records:
+        if record.pictures and record.method == options.method:
+            folder = record_folder(options.out, record)
+            print(f"{record.case}, seed {record.seed}:", *(folder / name for name in record.pictures), sep="\n  ")
+    print(f"\nrecords: {options.out}", file=sys.stderr)
+
+
+def record_folder(out: Path, record: RunRecord) -> Path:
+    """Where the runner put a record."""
+    run = f"{record.method}-{record.preset}-seed{record.seed}-{record.run_id[:8]}"
+    return out / record.protocol["name"] / record.case.replace("/", "__") / run

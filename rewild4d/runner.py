@@ -1,0 +1,228 @@
+"""From a plan to records: load, prior, fit, evaluate, write; finished runs are skipped, killed ones resume."""
+
+import json
+import os
+import shutil
+import sys
+import time
+import traceback
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import torch
+from tqdm import tqdm
+
+from rewild4d.contracts import DatasetReader, Reconstruction
+from rewild4d.coverage import coverage
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.files import write_text
+from rewild4d.leaderboard.records import FILE, SCHEMA, RunRecord, Timing, make_run_id, read_record, write_record
+from rewild4d.machine import code_version, machine, peak_memory_mib
+from rewild4d.priors.choose import PriorChoice, make_prior
+from rewild4d.protocol import Protocol, evaluate
+from rewild4d.registry import load_method
+from rewild4d.types import Case, Clip, Truth
+from rewild4d.view import save_pictures
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row of a plan: a method with its settings, and the seeds to run it with."""
+
+    method: str
+    preset: str
+    config: msgspec.Struct
+    seeds: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that decides what is run; the same plan gives the same run ids."""
+
+    dataset: str
+    reader: DatasetReader
+    root: Path
+    cases: tuple[str, ...]
+    protocol: Protocol
+    entries: tuple[Entry, ...]
+    prior: PriorChoice
+    device: torch.device
+    out: Path
+
+
+class Progress:
+    """A contracts.Log that shows a bar on standard error and appends every line to a file."""
+
+    def __init__(self, title: str, path: Path | None = None):
+        self.bar: tqdm | None = None
+        self.title, self.path = title, path
+
+    def __call__(self, step: int, total: int, values: Mapping[str, float]) -> None:
+        if self.bar is None:
+            self.bar = tqdm(desc=self.title, total=total, file=sys.stderr, mininterval=0.5, dynamic_ncols=True)
+        self.bar.total = total
+        self.bar.update(step - self.bar.n)
+        if values:
+            self.bar.set_postfix({key: f"{value:.4g}" for key, value in values.items()}, refresh=False)
+            if self.path is not None:
+                with self.path.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps({"step": step, **values}) + "\n")
+
+    def close(self) -> None:
+        if self.bar is not None:
+            self.bar.close()
+
+
+def choose_cases(names: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]:
+    """The cases that any of the wanted names or patterns ("wolf/*") names; all where none is given.
+
+    Raises:
+        UserError: a name that fits no case.
+    """
+    for pattern in wanted:
+        if not any(fnmatchcase(name, pattern) for name in names):
+            raise unknown_name("case", pattern, names)
+    return tuple(name for name in names if not wanted or any(fnmatchcase(name, pattern) for pattern in wanted))
+
+
+def execute(plan: Plan) -> list[RunRecord]:
+    """Run all that the plan lists and has no finished record; give every record, in the plan's order.
+
+    A run that fails leaves a record with its message and does not stop the others.
+
+    Raises:
+        UserError: data that cannot be read, before anything is fitted.
+    """
+    plan.out.mkdir(parents=True, exist_ok=True)
+    for name in plan.cases:
+        plan.reader.load(name, plan.protocol.selection)
+    return [record for name in plan.cases for record in _run_case(plan, name)]
+
+
+def _run_case(plan: Plan, name: str) -> list[RunRecord]:
+    clip, truth = plan.reader.load(name, plan.protocol.selection)
+    prior_id = plan.prior.identity(clip, truth)
+    folder = plan.out / plan.protocol.name / name.replace("/", "__")
+    jobs = [_Job(plan, entry, seed, clip, truth, prior_id, folder) for entry in plan.entries for seed in entry.seeds]
+    if all(job.finished() for job in jobs):
+        return [read_record(job.folder / FILE) for job in jobs]
+    progress = Progress(f"{name}: prior")
+    try:
+        prior = make_prior(plan.prior, clip, truth, plan.out / "priors" / f"{prior_id}.npz", progress)
+    except UserError as error:
+        return [job.fail(str(error)) for job in jobs]
+    finally:
+        progress.close()
+    case = Case(clip, prior, truth)
+    seen = coverage(clip, truth)
+    return [read_record(job.folder / FILE) if job.finished() else job.run(case, seen) for job in jobs]
+
+
+class _Job:
+    """One method on one case with one seed."""
+
+    def __init__(self, plan: Plan, entry: Entry, seed: int, clip: Clip, truth: Truth, prior_id: str, folder: Path):
+        self.plan, self.entry, self.seed, self.clip, self.truth = plan, entry, seed, clip, truth
+        self.run_id = make_run_id(
+            method=entry.method, config=entry.config, clip=clip.digest, truth=truth.digest, prior=prior_id,
+            protocol=plan.protocol.digest, seed=seed, code=code_version(), device=plan.device.type,
+        )  # fmt: skip
+        self.folder = folder / f"{entry.method}-{entry.preset}-seed{seed}-{self.run_id[:8]}"
+        self.title = f"{clip.name}: {entry.method}"
+        self.started = datetime.now(UTC).isoformat(timespec="seconds")
+
+    def finished(self) -> bool:
+        """Whether a good record is there; a failed one is tried again."""
+        path = self.folder / FILE
+        return path.is_file() and read_record(path).status == "ok"
+
+    def run(self, case: Case, seen: dict[str, float]) -> RunRecord:
+        """Fit, evaluate, draw, record."""
+        try:
+            reconstruction, fit_seconds = self._fit(case)
+            begin = time.perf_counter()
+            progress = Progress(f"{self.title}: evaluate")
+            scores, items = evaluate(reconstruction, case.truth, self.plan.protocol, progress)
+            progress.close()
+            seconds = time.perf_counter() - begin
+            pictures = save_pictures(reconstruction, case.clip, case.truth, self.folder)
+        except UserError as error:
+            return self.fail(str(error), case)
+        except Exception as error:  # a bug or a diverged fit: the record keeps the message, the terminal the traceback
+            traceback.print_exc(file=sys.stderr)
+            return self.fail(f"{type(error).__name__}: {error}", case)
+        record = self._record(case, "ok", "", scores=scores, items=items, coverage=seen, pictures=pictures,
+                              diagnostics=_diagnostics(reconstruction),
+                              timing=self._timing(fit_seconds, seconds))  # fmt: skip
+        write_record(record, self.folder)
+        shutil.rmtree(self.folder / "work", ignore_errors=True)
+        return record
+
+    def fail(self, message: str, case: Case | None = None) -> RunRecord:
+        """Record a failure: it is a finding too."""
+        print(f"{self.title}: failed: {message}", file=sys.stderr)
+        record = self._record(case, "failed", message, timing=self._timing(0.0, 0.0))
+        write_record(record, self.folder)
+        return record
+
+    def _fit(self, case: Case) -> tuple[Reconstruction, float]:
+        """The reconstruction, saved; a run killed while scoring reads it back instead of fitting again."""
+        method = load_method(self.entry.method)
+        saved, stamp = self.folder / "reconstruction", self.folder / "fit.json"
+        if not (saved.is_dir() and stamp.is_file()):
+            work = self.folder / "work"
+            work.mkdir(parents=True, exist_ok=True)
+            progress = Progress(f"{self.title}: fit", self.folder / "log.jsonl")
+            begin = time.perf_counter()
+            reconstruction = method.fit(
+                case.clip, case.prior, config=self.entry.config, seed=self.seed, device=self.plan.device,
+                log=progress, workdir=work,
+            )  # fmt: skip
+            progress.close()
+            save_reconstruction(reconstruction, saved)
+            write_text(stamp, json.dumps({"seconds_since_last_start": time.perf_counter() - begin}) + "\n")
+        return method.load(saved, self.plan.device), json.loads(stamp.read_text())["seconds_since_last_start"]
+
+    def _timing(self, fit: float, evaluation: float) -> Timing:
+        return Timing(self.started, round(fit, 2), round(evaluation, 2), round(peak_memory_mib(), 1))
+
+    def _record(self, case: Case | None, status: str, error: str, **found: Any) -> RunRecord:
+        plan, prior = self.plan, case.prior if case else None
+        fields: dict[str, Any] = {
+            "schema": SCHEMA, "run_id": self.run_id, "method": self.entry.method, "dataset": plan.dataset,
+            "case": self.clip.name, "seed": self.seed, "preset": self.entry.preset, "status": status, "error": error,
+            "scores": {}, "coverage": {}, "items": [], "pictures": [], "diagnostics": {},
+            "config": msgspec.to_builtins(self.entry.config),
+            "data": {"root": str(plan.root), "licence": self.clip.licence, "clip": self.clip.digest,
+                     "truth": self.truth.digest},
+            "prior": {"name": prior.name, "provenance": prior.provenance, "digest": prior.digest,
+                      "quality": prior.quality} if prior else {"name": plan.prior.name},
+            "protocol": {"digest": plan.protocol.digest, **msgspec.to_builtins(plan.protocol)},
+            "code": code_version(), "machine": machine(),
+        }  # fmt: skip
+        return RunRecord(**{**fields, **found})
+
+
+def save_reconstruction(reconstruction: Reconstruction, folder: Path) -> None:
+    """Save into a folder that appears only when it is complete."""
+    building = folder.with_name(f".{folder.name}.{os.getpid()}")
+    shutil.rmtree(building, ignore_errors=True)
+    try:
+        building.mkdir(parents=True)
+        reconstruction.save(building)
+        shutil.rmtree(folder, ignore_errors=True)
+        building.rename(folder)
+    except OSError as error:
+        raise UserError(f"{folder}: the reconstruction could not be written: {error.strerror or error}.") from error
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+
+
+def _diagnostics(reconstruction: Reconstruction) -> dict[str, Any]:
+    describe = getattr(reconstruction, "diagnostics", None)
+    return describe() if describe else {}
