@@ -1,5 +1,205 @@
-"""Artemis / DFA folders: the writer (the reader follows)."""
+"""Reads Artemis / DFA folders into clips and truths (the format: `artemis_files`, `artemis_volume`).
 
+Choices that the format leaves open: RGB files hold straight colour, so premultiplying by the matte is ours; a motion
+plays at 30 frames a second unless its name says otherwise; no world axis is assumed to point up.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import overload
+
+import numpy as np
+import torch
+
+from rewild4d.contracts import Finding, Selection
+from rewild4d.datasets.artemis_check import check_animal
+from rewild4d.datasets.artemis_files import (
+    frames_per_second,
+    list_frames,
+    list_images,
+    list_motions,
+    read_cameras,
+    read_intrinsics,
+    read_licence,
+)
+from rewild4d.datasets.artemis_volume import Surface, read_pose, read_surface, surface_over_time
 from rewild4d.datasets.artemis_writer import ArtemisWriter
+from rewild4d.datasets.images import Decoded, decode
+from rewild4d.datasets.selection import held_out, kept_frames, placed_view, selected_views
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.files import digest
+from rewild4d.types import Camera, Clip, Frame, Truth
 
-__all__ = ["ArtemisWriter"]
+__all__ = ["Artemis", "ArtemisWriter"]
+
+
+class Artemis:
+    """Reader of one animal's folder, or of a folder of animals (contracts.DatasetReader).
+
+    A case is "<animal>/<motion>", with "@side", "@oblique" or "@frontal" behind it where a fixed camera has placements.
+
+    Raises:
+        UserError: no such folder, or neither an animal nor a folder of animals.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = Path(root)
+        if not self.root.is_dir():
+            raise UserError(f"{self.root}: expected an animal's folder or a folder of animals, got no such folder.")
+        folders = [self.root] if _is_animal(self.root) else sorted(filter(_is_animal, self.root.iterdir()))
+        if not folders:
+            raise UserError(
+                f"{self.root / 'CamPose.inf'}: expected this file of an animal's folder (or a folder of such folders), "
+                "got neither."
+            )
+        self._animals = {Path(os.path.abspath(folder)).name: folder for folder in folders}
+
+    @property
+    def licence(self) -> str:
+        """Licences of all animals, each once."""
+        return "; ".join(sorted({read_licence(folder) for folder in self._animals.values()}))
+
+    def cases(self, selection: Selection) -> list[str]:
+        """Names of all cases; reads the text files only, no image.
+
+        Raises:
+            UserError: cameras, intrinsics or the list of motions of an animal cannot be used.
+        """
+        return list(self._table(selection))
+
+    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
+        """Decode one case: the clip holds the selected view of each kept frame, the truth all other views of them.
+
+        Raises:
+            UserError: no such case, or files of it that cannot be used.
+        """
+        known = self._table(selection)
+        if case not in known:
+            raise unknown_name("case", case, known)
+        animal, motion, placement = known[case]
+        return _Motion(self._animals[animal], motion, selection).split(case, animal, placement)
+
+    def check(self) -> list[Finding]:
+        """Verify layout and contents of every animal, each file decoded; all faults, not only the first."""
+        return [finding for folder in self._animals.values() for finding in check_animal(folder)]
+
+    def _table(self, selection: Selection) -> dict[str, tuple[str, str, str]]:
+        """Case name -> animal, motion, placement ("" for none)."""
+        placements = selection.placements if selection.cameras == "fixed" else ()
+        table = {}
+        for animal, folder in self._animals.items():
+            read_intrinsics(folder / "Intrinsic.inf", len(read_cameras(folder / "CamPose.inf")))
+            for motion in list_motions(folder):
+                for placement in placements or ("",):
+                    suffix = f"@{placement}" if placement else ""
+                    table[f"{animal}/{motion}{suffix}"] = (animal, motion, placement)
+        return table
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """The kept frames of one motion."""
+
+    folder: Path
+    motion: str
+    selection: Selection
+
+    @cached_property
+    def frames(self) -> list[int]:
+        return kept_frames(list_motions(self.folder)[self.motion], self.selection)
+
+    @cached_property
+    def camera_to_world(self) -> np.ndarray:
+        return read_cameras(self.folder / "CamPose.inf")
+
+    @cached_property
+    def fps(self) -> float:
+        return frames_per_second(self.motion) / self.selection.stride
+
+    def split(self, case: str, species: str, placement: str) -> tuple[Clip, Truth]:
+        """The clip and the truth of a case."""
+        views = len(self.camera_to_world)
+        surface, poses = self._geometry()
+        fixed_view = self._fixed_view(placement, surface, poses)
+        selected = selected_views(len(self.frames), views, self.selection, fixed_view)
+        folders = list_frames(self.folder / "img" / self.motion)
+        pairs = [list_images(folders[number], views) for number in self.frames]
+        decoded = decode(pairs, self.selection, case)
+        for index, view in enumerate(selected):
+            if not decoded.rgba[index, view, ..., 3].any():
+                raise UserError(f"{pairs[index][view].alpha}: expected a matte with an animal in it, got an empty one.")
+        shown = _Frames(decoded, self._cameras(decoded), list(enumerate(selected)), self.fps)
+        hidden = _Frames(decoded, shown.cameras, held_out(selected, views), self.fps)
+        clip = Clip(case, species, tuple(shown), self.fps, read_licence(self.folder), shown.digest())
+        if surface is None:
+            return clip, Truth(hidden, None, hidden.digest())
+        at = surface_over_time(surface, poses, self.fps)
+        return clip, Truth(hidden, at, digest(hidden.digest(), *map(at, clip.times)))
+
+    def _geometry(self) -> tuple[Surface | None, list[np.ndarray]]:
+        """Surface points at rest and the bones of each kept frame."""
+        surface = read_surface(self.folder)
+        if surface is None:
+            return None, []
+        bones = len(surface.bones_rest)
+        return surface, [read_pose(self.folder, self.motion, frame, bones) for frame in self.frames]
+
+    def _fixed_view(self, placement: str, surface: Surface | None, poses: list[np.ndarray]) -> int:
+        """The camera at a placement relative to the animal as it stands at the first frame; view 0 without one."""
+        if not placement:
+            return 0
+        if surface is None:
+            raise UserError(
+                f"{self.folder / 'volumes'}: expected the animal's voxels, which tell its {placement}, got none."
+            )
+        return placed_view(placement, surface.posed(poses[0]), self.camera_to_world)
+
+    def _cameras(self, decoded: Decoded) -> list[Camera]:
+        """World camera of each view for the decoded images."""
+        intrinsics = read_intrinsics(self.folder / "Intrinsic.inf", len(self.camera_to_world))
+        height, width = decoded.rgba.shape[2:4]
+        cameras = []
+        for pose, matrix, window in zip(self.camera_to_world, intrinsics, decoded.windows, strict=True):
+            full = Camera(torch.from_numpy(np.linalg.inv(pose)), torch.from_numpy(matrix.copy()), *decoded.source)
+            cameras.append(window.camera(full, width, height))
+        return cameras
+
+
+class _Frames(Sequence[Frame]):
+    """Frames read from the memory map on access."""
+
+    def __init__(self, decoded: Decoded, cameras: list[Camera], pairs: list[tuple[int, int]], fps: float) -> None:
+        self.cameras = cameras
+        self._rgba = decoded.rgba
+        self._pairs = pairs
+        self._fps = fps
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Frame]: ...
+    def __getitem__(self, index: int | slice) -> Frame | Sequence[Frame]:
+        if isinstance(index, slice):
+            return [self[item] for item in range(*index.indices(len(self)))]
+        frame, view = self._pairs[index]
+        rgba = torch.from_numpy(self._rgba[frame, view].astype(np.float32) / 255).permute(2, 0, 1).contiguous()
+        return Frame(frame / self._fps, self.cameras[view], rgba[:3], rgba[3:], view)
+
+    def digest(self) -> str:
+        """SHA-256 over times, cameras and pixels."""
+        parts: list[str | torch.Tensor | np.ndarray] = [repr(self._fps)]
+        for frame, view in self._pairs:
+            camera = self.cameras[view]
+            parts += [f"{frame} {view}", camera.world_to_camera, camera.intrinsics, self._rgba[frame, view]]
+        return digest(*parts)
+
+
+def _is_animal(folder: Path) -> bool:
+    """Whether a folder is meant as an animal's; one that a killed writer left behind starts with a dot."""
+    return not folder.name.startswith(".") and ((folder / "CamPose.inf").is_file() or (folder / "img").is_dir())

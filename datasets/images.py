@@ -1,0 +1,252 @@
+"""From image files to small premultiplied RGBA on disk: decode, cut a window, average down, keep.
+
+A framing is one window of the source image per view; the window may reach over the border, where it is transparent.
+So "full", "letterbox" and "crop" share one path, and `Window.camera` moves the camera with the pixels.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from rewild4d.contracts import Selection
+from rewild4d.datasets.artemis_files import ImagePair
+from rewild4d.errors import UserError
+from rewild4d.files import atomic, cache_folder, digest
+from rewild4d.types import Camera
+
+BOX_ALPHA = 25
+"""Mattes above a tenth make the box of a crop, so that noise in a matte does not widen it."""
+CROP_PADDING = 1.15
+_THREADS = 2
+_CACHE_VERSION = "1"
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of the source image in whole pixels; it may reach over the border."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    def camera(self, camera: Camera, width: int, height: int) -> Camera:
+        """The camera of the window once resized to width x height."""
+        return camera.shifted(self.left, self.top, self.width, self.height).resized(width, height)
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """The decoded images of a motion.
+
+    Attributes:
+        rgba: premultiplied, uint8 memory map, [frames, views, h, w, 4].
+        windows: one a view.
+        source: width and height of the image files.
+    """
+
+    rgba: np.ndarray
+    windows: tuple[Window, ...]
+    source: tuple[int, int]
+
+
+def read_rgb(path: Path) -> np.ndarray:
+    """Colour image, uint8 [h, w, 3]; an alpha channel inside the file is ignored.
+
+    Raises:
+        UserError: the file cannot be read, or is cut off or damaged.
+    """
+    return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+def read_alpha(path: Path) -> np.ndarray:
+    """Matte of any PNG mode as luminance, uint8 [h, w].
+
+    Raises:
+        UserError: the file cannot be read, or is cut off or damaged.
+    """
+    return _decode(path, cv2.IMREAD_GRAYSCALE)
+
+
+def read_pair(pair: ImagePair, source: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Colour and matte of one view.
+
+    Args:
+        pair: the files.
+        source: width and height that both must have; None: any, but the same.
+
+    Raises:
+        UserError: as `read_rgb`, or a size that differs.
+    """
+    rgb = read_rgb(pair.rgb)
+    _expect_size(pair.rgb, rgb, source, "the other images")
+    alpha = read_alpha(pair.alpha)
+    _expect_size(pair.alpha, alpha, (rgb.shape[1], rgb.shape[0]), pair.rgb.name)
+    return rgb, alpha
+
+
+def target_size(source: tuple[int, int], selection: Selection) -> tuple[int, int]:
+    """Width and height of the images that a selection asks for."""
+    if selection.framing != "full":
+        return selection.size, selection.size
+    scale = selection.size / max(source)
+    return max(1, round(source[0] * scale)), max(1, round(source[1] * scale))
+
+
+def place(rgb: np.ndarray, alpha: np.ndarray, window: Window, size: tuple[int, int]) -> np.ndarray:
+    """Cut a window out of an image and average it down to ``size``, colour weighted by the matte, uint8 [h, w, 4]."""
+    height, width = alpha.shape
+    left, top = max(window.left, 0), max(window.top, 0)
+    right, bottom = min(window.left + window.width, width), min(window.top + window.height, height)
+    canvas = np.zeros((window.height, window.width, 4), dtype=np.float32)
+    inside = canvas[top - window.top : bottom - window.top, left - window.left : right - window.left]
+    matte = alpha[top:bottom, left:right].astype(np.float32)
+    inside[..., 3] = matte
+    np.multiply(rgb[top:bottom, left:right], matte[..., None] / 255, out=inside[..., :3])
+    shrinks = size[0] < window.width
+    small = cv2.resize(canvas, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    return np.clip(np.rint(small), 0, 255).astype(np.uint8)
+
+
+def decode(pairs: Sequence[Sequence[ImagePair]], selection: Selection, title: str) -> Decoded:
+    """Decode the images of a motion, or take them from the cache.
+
+    Args:
+        pairs: the files, [frames][views].
+        selection: gives size and framing; "crop" takes a view's window from all the frames given here.
+        title: for the progress bar.
+
+    Raises:
+        UserError: a damaged file, images of differing sizes, a matte of another size, a cache that cannot be written.
+    """
+    folder = cache_folder() / "artemis" / _key(pairs, selection)
+    images, windows = folder / "rgba.npy", folder / "windows.npy"
+    if not images.is_file():
+        _fill_cache(pairs, selection, title, images, windows)
+    source_and_windows = np.load(windows)
+    return Decoded(
+        rgba=np.load(images, mmap_mode="r"),
+        windows=tuple(Window(*map(int, row)) for row in source_and_windows[1:]),
+        source=(int(source_and_windows[0, 2]), int(source_and_windows[0, 3])),
+    )
+
+
+def _fill_cache(
+    pairs: Sequence[Sequence[ImagePair]], selection: Selection, title: str, images: Path, windows: Path
+) -> None:
+    first = read_rgb(pairs[0][0].rgb)
+    source = (first.shape[1], first.shape[0])
+    framed = _windows(pairs, selection, source, title)
+    with atomic(windows) as temporary, temporary.open("wb") as file:
+        rows = [(0, 0, *source), *((w.left, w.top, w.width, w.height) for w in framed)]
+        np.save(file, np.array(rows, dtype=np.int64))
+    size = target_size(source, selection)
+    jobs = [(pair, window) for frame in pairs for pair, window in zip(frame, framed, strict=True)]
+
+    def work(job: tuple[ImagePair, Window]) -> np.ndarray:
+        return place(*read_pair(job[0], source), job[1], size)
+
+    header = {"descr": "|u1", "fortran_order": False, "shape": (len(pairs), len(framed), size[1], size[0], 4)}
+    # Written last: its presence says that the cache is complete.
+    with atomic(images) as temporary, temporary.open("wb") as file, ThreadPoolExecutor(_THREADS) as pool:
+        np.lib.format.write_array_header_1_0(file, header)
+        for small in tqdm(pool.map(work, jobs), total=len(jobs), desc=f"decoding {title}", disable=None, leave=False):
+            file.write(small.tobytes())
+
+
+def _windows(
+    pairs: Sequence[Sequence[ImagePair]], selection: Selection, source: tuple[int, int], title: str
+) -> list[Window]:
+    """The window of each view."""
+    views = list(zip(*pairs, strict=True))
+    whole = Window(0, 0, *source)
+    if selection.framing == "full":
+        return [whole] * len(views)
+    if selection.framing == "letterbox":
+        return [_square(whole, max(source))] * len(views)
+    progress = tqdm(views, desc=f"framing {title}", disable=None, leave=False)
+    with ThreadPoolExecutor(_THREADS) as pool:
+        boxes = [_box(pool.map(lambda pair: read_alpha(pair.alpha), view)) for view in progress]
+    return [
+        _square(box, round(CROP_PADDING * max(box.width, box.height))) if box else _square(whole, max(source))
+        for box in boxes
+    ]
+
+
+def _square(box: Window, side: int) -> Window:
+    """The square of a given side around the centre of a box."""
+    return Window(box.left + (box.width - side) // 2, box.top + (box.height - side) // 2, side, side)
+
+
+def _box(mattes: Iterable[np.ndarray]) -> Window | None:
+    """The rectangle that holds the animal in all mattes, or None where there is no animal."""
+    corners = []
+    for matte in mattes:
+        left, top, width, height = cv2.boundingRect((matte > BOX_ALPHA).astype(np.uint8))
+        if width:
+            corners.append((left, top, left + width, top + height))
+    if not corners:
+        return None
+    lower, upper = np.min(corners, axis=0), np.max(corners, axis=0)
+    return Window(int(lower[0]), int(lower[1]), int(upper[2] - lower[0]), int(upper[3] - lower[1]))
+
+
+def _key(pairs: Sequence[Sequence[ImagePair]], selection: Selection) -> str:
+    """Digest of the source files (path, size, time of change), the framing and the size."""
+    parts = [_CACHE_VERSION, selection.framing, str(selection.size), str(len(pairs))]
+    for frame in pairs:
+        for pair in frame:
+            for path in (pair.rgb, pair.alpha):
+                state = path.stat()
+                parts.append(f"{path.resolve()} {state.st_size} {state.st_mtime_ns}")
+    return digest(*parts)[:32]
+
+
+def _expect_size(path: Path, image: np.ndarray, size: tuple[int, int] | None, other: str) -> None:
+    if size and (image.shape[1], image.shape[0]) != size:
+        raise UserError(
+            f"{path}: expected {size[0]}x{size[1]} pixels like {other}, got {image.shape[1]}x{image.shape[0]}."
+        )
+
+
+def _decode(path: Path, mode: int) -> np.ndarray:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: expected an image that can be read, but: {error.strerror}.") from error
+    fault = _png_fault(data) if data.startswith(_PNG) else _jpeg_fault(data)
+    # Cameras know nothing of EXIF, so an orientation tag must not turn the image.
+    image = None if fault else cv2.imdecode(np.frombuffer(data, dtype=np.uint8), mode | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise UserError(f"{path}: expected a whole image, got {fault or 'a damaged one'}.")
+    return image
+
+
+def _png_fault(data: bytes) -> str:
+    """What is wrong with a PNG file, or "": OpenCV returns half an image where a file is cut off."""
+    position = len(_PNG)
+    while position + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, position)
+        end = position + 12 + length
+        if end > len(data):
+            break
+        if zlib.crc32(memoryview(data)[position + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+            return f"a PNG with a damaged {kind.decode('latin-1')} chunk"
+        if kind == b"IEND":
+            return ""
+        position = end
+    return f"a PNG that is cut off after {len(data)} bytes"
+
+
+def _jpeg_fault(data: bytes) -> str:
+    if not data.startswith(b"\xff\xd8"):
+        return "a file that is neither PNG nor JPEG" if data else "an empty file"
+    return "" if b"\xff\xd9" in data[-1024:] else f"a JPEG that is cut off after {len(data)} bytes"
