@@ -1,11 +1,12 @@
 """The one entry point: checks the input and hands it to a backend."""
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from rewild4d.rasterizer import reference
+from rewild4d.rasterizer import cpu, reference
 from rewild4d.rasterizer.conventions import RasterInfo
 
 BACKENDS = ("auto", "reference", "numba")
@@ -79,10 +80,13 @@ def rasterize(
     )  # fmt: skip
 
 
-def _choose(backend: str, means: Tensor):  # noqa: ANN202
+def _choose(backend: str, means: Tensor) -> Callable[..., tuple[Tensor, Tensor, RasterInfo]]:
     if backend not in BACKENDS:
         raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got '{backend}'.")
-    return reference.rasterize
+    fits = means.dtype == torch.float32 and means.device.type == "cpu"
+    if backend == "numba" and not fits:
+        raise ValueError(f"backend 'numba': expected float32 on the CPU, got {means.dtype} on {means.device}.")
+    return reference.rasterize if backend == "reference" or not fits else cpu.rasterize
 
 
 def _check_gaussians(named: dict[str, Tensor]) -> None:

@@ -1,0 +1,193 @@
+"""Which Gaussian touches which tile, front to back.
+
+Three steps: sort the visible Gaussians of each view by depth; mark, for every (Gaussian, tile) pair of the bounding
+rectangles, which of the tile's sixteen 4 x 4 blocks the ellipse reaches; counting-sort the pairs into tiles. A pair's
+place before that last sort (Gaussian by Gaussian) is its `slot`: the backward pass leaves its sums there.
+"""
+
+import numpy as np
+
+from rewild4d.rasterizer.compiling import kernel
+from rewild4d.rasterizer.projection import (
+    CENTER_X,
+    CENTER_Y,
+    EXTENT_X,
+    EXTENT_Y,
+    LOG2_MIN_ALPHA,
+    LOG_OPACITY,
+    XX,
+    XY,
+    YY,
+)
+from rewild4d.rasterizer.simd import bits_gt, fma, load, maximum, minimum, splat
+
+TILE, BLOCK, BLOCKS = 16, 4, 16
+"""A tile is 16 x 16 pixels: sixteen blocks of 4 x 4, numbered row by row."""
+
+BLOCK_LEFT = np.array([BLOCK * (block % 4) for block in range(BLOCKS)], np.float32)
+BLOCK_TOP = np.array([BLOCK * (block // 4) for block in range(BLOCKS)], np.float32)
+
+SLACK = np.float32(1e-3)
+"""Added to the reach in exponent units, so that rounding never drops a block that the blend would draw into."""
+
+RADIX_BITS = 11
+RADIX = 1 << RADIX_BITS
+
+
+@kernel
+def _tile_rectangle(records: np.ndarray, view: int, n: int, tiles_x: int, tiles_y: int) -> tuple:
+    """First and one past the last tile column and row that hold a pixel centre of the bounding rectangle."""
+    x, y = np.float64(records[view, n, CENTER_X]), np.float64(records[view, n, CENTER_Y])
+    wide, high = np.float64(records[view, n, EXTENT_X]) * 1.0001, np.float64(records[view, n, EXTENT_Y]) * 1.0001
+    limit_x, limit_y = float(tiles_x * TILE), float(tiles_y * TILE)
+    left, right = max(np.ceil(x - wide - 0.5), 0.0), min(np.floor(x + wide - 0.5), limit_x - 1)
+    top, bottom = max(np.ceil(y - high - 0.5), 0.0), min(np.floor(y + high - 0.5), limit_y - 1)
+    if right < left or bottom < top:
+        return 0, 0, 0, 0
+    return int(left) // TILE, int(right) // TILE + 1, int(top) // TILE, int(bottom) // TILE + 1
+
+
+@kernel
+def sort_by_depth(
+    view: int, radii: np.ndarray, depths: np.ndarray, order: np.ndarray, keys: np.ndarray, spare: np.ndarray
+) -> int:
+    """Write the visible Gaussians of one view, nearest first (ties by index), to order[view]; give their number.
+
+    ``keys`` and ``spare`` are int64 scratch of length N: depth bits above, index below.
+    """
+    bits = depths.view(np.int32)
+    histogram = np.zeros((3, RADIX), np.int64)
+    count = 0
+    for n in range(radii.shape[1]):
+        if radii[view, n] > 0:
+            key = np.int64(bits[view, n])
+            keys[count] = (key << 32) | n
+            histogram[0, key & (RADIX - 1)] += 1
+            histogram[1, (key >> RADIX_BITS) & (RADIX - 1)] += 1
+            histogram[2, key >> (2 * RADIX_BITS)] += 1
+            count += 1
+    for digit in range(3):
+        total = 0
+        for value in range(RADIX):
+            here = histogram[digit, value]
+            histogram[digit, value] = total
+            total += here
+        shift = 32 + digit * RADIX_BITS
+        for k in range(count):
+            value = (keys[k] >> shift) & (RADIX - 1)
+            spare[histogram[digit, value]] = keys[k]
+            histogram[digit, value] += 1
+        keys, spare = spare, keys
+    for k in range(count):
+        order[view, k] = keys[k] & 0xFFFFFFFF
+    return count
+
+
+@kernel
+def count_slots(
+    view: int,
+    count: int,
+    first: int,
+    order: np.ndarray,
+    records: np.ndarray,
+    tiles_x: int,
+    tiles_y: int,
+    slots: np.ndarray,
+) -> int:
+    """Number the pairs of one view's bounding rectangles from ``first``: slots[view, k] .. slots[view, k + 1]."""
+    for k in range(count):
+        slots[view, k] = first
+        left, right, top, bottom = _tile_rectangle(records, view, order[view, k], tiles_x, tiles_y)
+        first += (right - left) * (bottom - top)
+    slots[view, count] = first
+    return first
+
+
+@kernel
+def _reached_blocks(record: np.ndarray, left: int, top: int, block_left: np.ndarray, block_top: np.ndarray) -> int:
+    """Bits of the blocks in which the exponent at some point between pixel centres exceeds log2(1/255).
+
+    The maximum over a rectangle lies on one of the two sides that face the centre, at the clamped one-dimensional
+    optimum; all sixteen blocks are tested at once.
+    """
+    zero, span = splat(np.float32(0)), splat(np.float32(BLOCK - 1))
+    xx, xy, yy = record[XX], record[XY], record[YY]
+    low_x = load(block_left, 0) + splat(np.float32(left + 0.5 - record[CENTER_X]))
+    low_y = load(block_top, 0) + splat(np.float32(top + 0.5 - record[CENTER_Y]))
+    high_x, high_y = low_x + span, low_y + span
+    near_x, near_y = minimum(maximum(zero, low_x), high_x), minimum(maximum(zero, low_y), high_y)
+    best_y = minimum(maximum(near_x * splat(np.float32(-0.5) * xy / yy), low_y), high_y)
+    best_x = minimum(maximum(near_y * splat(np.float32(-0.5) * xy / xx), low_x), high_x)
+    a, b, c = splat(xx), splat(xy), splat(yy)
+    on_column = fma(near_x, fma(a, near_x, b * best_y), c * (best_y * best_y))
+    on_row = fma(best_x, fma(a, best_x, b * near_y), c * (near_y * near_y))
+    needed = np.float32(LOG2_MIN_ALPHA) - record[LOG_OPACITY]
+    return bits_gt(maximum(on_column, on_row), splat(needed * np.float32(1.0001) - SLACK))
+
+
+@kernel
+def mark_pairs(
+    view: int,
+    begin: int,
+    end: int,
+    order: np.ndarray,
+    records: np.ndarray,
+    slots: np.ndarray,
+    tiles_x: int,
+    tiles_y: int,
+    block_left: np.ndarray,
+    block_top: np.ndarray,
+    pair_tile: np.ndarray,
+    pair_bits: np.ndarray,
+    histogram: np.ndarray,
+) -> None:
+    """Fill tile and block bits of the pairs of sorted Gaussians begin..end, and count them per tile."""
+    for k in range(begin, end):
+        n, slot = order[view, k], slots[view, k]
+        left, right, top, bottom = _tile_rectangle(records, view, n, tiles_x, tiles_y)
+        for tile_y in range(top, bottom):
+            for tile_x in range(left, right):
+                bits = _reached_blocks(records[view, n], tile_x * TILE, tile_y * TILE, block_left, block_top)
+                tile = (view * tiles_y + tile_y) * tiles_x + tile_x
+                pair_tile[slot] = tile
+                pair_bits[slot] = bits
+                histogram[tile] += bits != 0
+                slot += 1
+
+
+@kernel
+def start_tiles(histograms: np.ndarray, starts: np.ndarray) -> int:
+    """Turn per-chunk counts [chunks, tiles] into where each chunk writes; starts [tiles + 1]; give the longest list."""
+    total, longest = 0, 0
+    for tile in range(histograms.shape[1]):
+        starts[tile] = total
+        for chunk in range(histograms.shape[0]):
+            here = histograms[chunk, tile]
+            histograms[chunk, tile] = total
+            total += here
+        longest = max(longest, total - starts[tile])
+    starts[histograms.shape[1]] = total
+    return longest
+
+
+@kernel
+def scatter_pairs(
+    view: int,
+    begin: int,
+    end: int,
+    order: np.ndarray,
+    slots: np.ndarray,
+    pair_tile: np.ndarray,
+    pair_bits: np.ndarray,
+    cursor: np.ndarray,
+    entry_gaussian: np.ndarray,
+    entry_slot: np.ndarray,
+) -> None:
+    """Write the pairs of sorted Gaussians begin..end into their tiles' lists, in depth order."""
+    for k in range(begin, end):
+        for slot in range(slots[view, k], slots[view, k + 1]):
+            if pair_bits[slot] != 0:
+                place = cursor[pair_tile[slot]]
+                cursor[pair_tile[slot]] = place + 1
+                entry_gaussian[place] = order[view, k]
+                entry_slot[place] = slot

@@ -1,0 +1,37 @@
+"""How the CPU kernels are compiled and cached."""
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+
+from rewild4d.files import cache_folder
+
+
+def _source_digest() -> str:
+    # numba looks at the time stamp of one function's own file; helpers and constants live in others.
+    sha = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        sha.update(path.read_bytes())
+    return sha.hexdigest()[:16]
+
+
+_CACHE = Path(numba.config.CACHE_DIR or cache_folder() / "kernels") / _source_digest()
+
+
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function on its first call, without the GIL, and keep the machine code in the cache folder.
+
+    Where no cache folder can be written the kernel is compiled anew in every process.
+    """
+    options = {"nogil": True, "error_model": "numpy"}
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(_CACHE)
+    try:
+        return numba.njit(cache=True, **options)(function)
+    except (RuntimeError, OSError):
+        return numba.njit(**options)(function)
+    finally:
+        numba.config.CACHE_DIR = before

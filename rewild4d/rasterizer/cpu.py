@@ -1,0 +1,233 @@
+"""The CPU backend: numba kernels behind two autograd functions, projection and blending.
+
+Between them stand the projected centres, a tensor of their own, so that densification can read its gradient.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from rewild4d.rasterizer.binning import (
+    BLOCK_LEFT,
+    BLOCK_TOP,
+    TILE,
+    count_slots,
+    mark_pairs,
+    scatter_pairs,
+    sort_by_depth,
+    start_tiles,
+)
+from rewild4d.rasterizer.blending import blend, blend_backward, gather_slots, slot_width
+from rewild4d.rasterizer.conventions import RasterInfo
+from rewild4d.rasterizer.projection import CHUNK, RECORD, project, project_backward
+from rewild4d.rasterizer.threads import run, spans, thread_count
+
+SERIAL_BELOW = 512
+"""Gaussians for which waking a second thread costs more than it saves."""
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    world_to_camera: Tensor,
+    intrinsics: Tensor,
+    width: int,
+    height: int,
+    background: Tensor | None,
+    eps2d: float,
+    antialias: bool,
+    near: float,
+) -> tuple[Tensor, Tensor, RasterInfo]:
+    """Same as `rewild4d.rasterizer.rasterize`, on checked float32 CPU input; ``background`` is [V, C]."""
+    options = (width, height, eps2d, antialias, near)
+    means2d, records, radii, depths = _Project.apply(
+        means, quats, scales, opacities, world_to_camera, intrinsics, options
+    )
+    if means2d.requires_grad:
+        means2d.retain_grad()
+    if background is None:
+        background = features.new_zeros(world_to_camera.shape[0], features.shape[1])
+    image, alpha = _Blend.apply(means2d, records, features, background, radii, depths, width, height)
+    return image, alpha, RasterInfo(radii, means2d)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
+
+
+class _Project(torch.autograd.Function):
+    """World to image: centres [V, N, 2], records [V, N, 8], and without gradients radii and depths [V, N]."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        world_to_camera: Tensor,
+        intrinsics: Tensor,
+        options: tuple[int, int, float, bool, float],
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        views, count = world_to_camera.shape[0], means.shape[0]
+        means2d, records = means.new_empty(views, count, 2), means.new_empty(views, count, RECORD)
+        radii, depths = means.new_empty(views, count), means.new_empty(views, count)
+        gaussians = tuple(_array(tensor) for tensor in (means, quats, scales, opacities))
+        cameras = _array(world_to_camera.double()), _array(intrinsics.double())
+        outputs = tuple(_array(tensor) for tensor in (means2d, records, radii, depths))
+        parts = thread_count() if count * views > SERIAL_BELOW else 1
+        run(project, [(*span, *gaussians, *cameras, *options, *outputs) for span in spans(count, parts)])
+        ctx.save_for_backward(means, quats, scales, opacities, world_to_camera, intrinsics, radii)
+        ctx.options = options
+        ctx.mark_non_differentiable(radii, depths)
+        ctx.set_materialize_grads(True)
+        return means2d, records, radii, depths
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_means2d: Tensor, g_records: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        *inputs, radii = ctx.saved_tensors
+        world_to_camera, intrinsics = inputs[4:]
+        views, count = radii.shape
+        arrays = tuple(_array(tensor) for tensor in inputs[:4])
+        cameras = _array(world_to_camera.double()), _array(intrinsics.double())
+        gradients = [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in inputs[:4]]
+        outputs = tuple(_array(tensor) for tensor in gradients)
+        chunks = max(1, -(-count // CHUNK))
+        v_cameras, v_pinholes = np.zeros((chunks, views, 3, 4)), np.zeros((chunks, views, 4))
+        shared = (radii.numpy(), _array(g_means2d), _array(g_records))
+
+        def work(first: int, last: int) -> None:
+            for chunk in range(first, last):
+                project_backward(
+                    chunk * CHUNK, min((chunk + 1) * CHUNK, count), *arrays, *cameras, *ctx.options[:4], *shared, *outputs,
+                    v_cameras[chunk], v_pinholes[chunk],
+                )  # fmt: skip
+
+        run(work, spans(chunks, thread_count()))
+        v_world_to_camera, v_intrinsics = torch.zeros_like(world_to_camera), torch.zeros_like(intrinsics)
+        v_world_to_camera[:, :3] = torch.from_numpy(v_cameras.sum(axis=0)).to(world_to_camera)
+        summed = torch.from_numpy(v_pinholes.sum(axis=0)).to(intrinsics)
+        v_intrinsics[:, (0, 1, 0, 1), (0, 1, 2, 2)] = summed
+        return *gradients, v_world_to_camera, v_intrinsics, None
+
+
+@dataclass(frozen=True)
+class _Lists:
+    """The tiles' Gaussians, front to back, of one call (see binning.py)."""
+
+    tiles: tuple[int, int]
+    order: np.ndarray
+    counts: list[int]
+    slots: np.ndarray
+    pair_bits: np.ndarray
+    starts: np.ndarray
+    entry_gaussian: np.ndarray
+    entry_slot: np.ndarray
+
+    def spans(self) -> list[tuple[int, int, int]]:
+        """Pieces (view, begin, end) of the sorted Gaussians, one group of `thread_count` pieces per view."""
+        parts = thread_count() if sum(self.counts) > SERIAL_BELOW else 1
+        return [(view, *span) for view, count in enumerate(self.counts) for span in spans(count, parts)]
+
+
+def _bin(records: np.ndarray, radii: np.ndarray, depths: np.ndarray, width: int, height: int) -> _Lists:
+    views, count = radii.shape
+    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+    order, slots = np.empty((views, count), np.int32), np.empty((views, count + 1), np.int64)
+    keys, spare = np.empty(count, np.int64), np.empty(count, np.int64)
+    counts, pairs = [], 0
+    for view in range(views):
+        counts.append(sort_by_depth(view, radii, depths, order, keys, spare))
+        pairs = count_slots(view, counts[view], pairs, order, records, tiles_x, tiles_y, slots)
+    pair_tile, pair_bits = np.empty(pairs, np.int32), np.empty(pairs, np.uint16)
+    parts = thread_count() if sum(counts) > SERIAL_BELOW else 1
+    pieces = [(view, *span) for view in range(views) for span in spans(counts[view], parts)]
+    histograms = np.zeros((max(1, len(pieces)), views * tiles_x * tiles_y), np.int32)
+    grid = (tiles_x, tiles_y, BLOCK_LEFT, BLOCK_TOP)
+    _run_pieces(
+        mark_pairs,
+        [(*piece, order, records, slots, *grid, pair_tile, pair_bits, histograms[i]) for i, piece in enumerate(pieces)],
+    )
+    starts = np.empty(histograms.shape[1] + 1, np.int64)
+    start_tiles(histograms, starts)
+    entry_gaussian, entry_slot = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int32)
+    _run_pieces(
+        scatter_pairs,
+        [
+            (*piece, order, slots, pair_tile, pair_bits, histograms[i], entry_gaussian, entry_slot)
+            for i, piece in enumerate(pieces)
+        ],
+    )
+    return _Lists((tiles_x, tiles_y), order, counts, slots, pair_bits, starts, entry_gaussian, entry_slot)
+
+
+def _run_pieces(function: Any, calls: list[tuple[Any, ...]]) -> None:
+    width = thread_count()
+    for first in range(0, len(calls), width):
+        run(function, calls[first : first + width])
+
+
+class _Blend(torch.autograd.Function):
+    """Image-space Gaussians to features [V, C, h, w] and alpha [V, 1, h, w]."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means2d: Tensor,
+        records: Tensor,
+        features: Tensor,
+        background: Tensor,
+        radii: Tensor,
+        depths: Tensor,
+        width: int,
+        height: int,
+    ) -> tuple[Tensor, Tensor]:
+        views, channels = radii.shape[0], features.shape[1]
+        lists = _bin(records.numpy(), radii.numpy(), depths.numpy(), width, height)
+        image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
+        call = (
+            np.zeros(1, np.int64), *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.pair_bits,
+            records.numpy(), _array(features), _array(background), image.numpy(), alpha.numpy(),
+        )  # fmt: skip
+        run(blend, [call] * _blend_threads(lists))
+        ctx.save_for_backward(records, features, background, image, alpha)
+        ctx.lists = lists
+        return image, alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_image: Tensor, g_alpha: Tensor) -> tuple[Tensor | None, ...]:
+        records, features, background, image, alpha = ctx.saved_tensors
+        lists: _Lists = ctx.lists
+        channels = features.shape[1]
+        width = slot_width(channels)
+        sums = np.empty(len(lists.pair_bits) * width, np.float32)
+        call = (
+            np.zeros(1, np.int64), *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.pair_bits,
+            records.numpy(), _array(features), image.numpy(), alpha.numpy(), _array(g_image), _array(g_alpha), sums,
+        )  # fmt: skip
+        run(blend_backward, [call] * _blend_threads(lists))
+        v_means2d = torch.zeros(*records.shape[:2], 2)
+        v_records = torch.zeros_like(records)
+        v_features = torch.zeros(features.shape)
+        outputs = (v_means2d.numpy(), v_records.numpy(), v_features.numpy())
+        given = (lists.order, lists.slots, lists.pair_bits, records.numpy(), sums, width)
+        for view in range(records.shape[0]):
+            pieces = [piece for piece in lists.spans() if piece[0] == view]
+            run(gather_slots, [(*piece, *given, *outputs) for piece in pieces])
+        v_background = None
+        if ctx.needs_input_grad[3]:
+            v_background = (g_image * (1 - alpha)).sum(dim=(2, 3))
+        return v_means2d, v_records, v_features, v_background, None, None, None, None
+
+
+def _blend_threads(lists: _Lists) -> int:
+    return thread_count() if len(lists.entry_slot) > SERIAL_BELOW else 1

@@ -1,0 +1,292 @@
+"""EWA projection and its gradient: one Gaussian at a time, in double precision, as a record that the blend reads.
+
+A record holds, per view and Gaussian, what one pixel's alpha takes: alpha = 2 ** (exponent), with d = pixel - centre,
+exponent = LOG_OPACITY + XX dx^2 + XY dx dy + YY dy^2. Invisible Gaussians have extent 0.
+"""
+
+import math
+
+import numpy as np
+
+from rewild4d.rasterizer.compiling import kernel
+from rewild4d.rasterizer.conventions import FRUSTUM_MARGIN, MIN_ALPHA, MIN_COMPENSATION
+
+# Columns of a record.
+CENTER_X, CENTER_Y, XX, XY, YY, LOG_OPACITY, EXTENT_X, EXTENT_Y, RECORD = 0, 1, 2, 3, 4, 5, 6, 7, 8
+
+CHUNK = 1024
+"""Gaussians a unit of work holds; the camera's gradient is summed over these, whatever the number of threads."""
+
+HALF_LOG2_E = 0.5 / math.log(2.0)
+LOG2_MIN_ALPHA = math.log2(MIN_ALPHA)
+
+
+@kernel
+def _dot(a: tuple, b: tuple) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel
+def _mix(x: float, a: tuple, y: float, b: tuple) -> tuple:
+    return x * a[0] + y * b[0], x * a[1] + y * b[1], x * a[2] + y * b[2]
+
+
+@kernel
+def _row(matrix: np.ndarray, view: int, row: int) -> tuple:
+    return matrix[view, row, 0], matrix[view, row, 1], matrix[view, row, 2]
+
+
+@kernel
+def _unit_quat(quats: np.ndarray, n: int) -> tuple:
+    w, x, y, z = np.float64(quats[n, 0]), np.float64(quats[n, 1]), np.float64(quats[n, 2]), np.float64(quats[n, 3])
+    inverse = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+
+
+@kernel
+def _axes(w: float, x: float, y: float, z: float) -> tuple:
+    """Columns of the rotation matrix."""
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@kernel
+def _tangent(ratio: float, focal: float, center: float, size: int) -> float:
+    """Where the Jacobian is taken: the ratio x / z, clamped to a little outside the frame."""
+    margin = FRUSTUM_MARGIN * 0.5 * size / focal
+    return min(max(ratio, -center / focal - margin), (size - center) / focal + margin)
+
+
+@kernel
+def _image_axes(linear_x: tuple, linear_y: tuple, axes: tuple, scales: np.ndarray, n: int) -> tuple:
+    """The Gaussian's half axes in the image, two rows of three: covariance = rows times their transpose."""
+    a, b, c = np.float64(scales[n, 0]), np.float64(scales[n, 1]), np.float64(scales[n, 2])
+    row_x = _dot(linear_x, axes[0]) * a, _dot(linear_x, axes[1]) * b, _dot(linear_x, axes[2]) * c
+    row_y = _dot(linear_y, axes[0]) * a, _dot(linear_y, axes[1]) * b, _dot(linear_y, axes[2]) * c
+    return row_x, row_y
+
+
+@kernel
+def project(
+    begin: int,
+    end: int,
+    means: np.ndarray,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    opacities: np.ndarray,
+    world_to_camera: np.ndarray,
+    intrinsics: np.ndarray,
+    width: int,
+    height: int,
+    eps2d: float,
+    antialias: bool,
+    near: float,
+    means2d: np.ndarray,
+    records: np.ndarray,
+    radii: np.ndarray,
+    depths: np.ndarray,
+) -> None:
+    """Fill means2d [V, N, 2], records [V, N, 8], radii [V, N] and depths [V, N] for Gaussians begin..end."""
+    for view in range(world_to_camera.shape[0]):
+        row_x, row_y, row_z = (
+            _row(world_to_camera, view, 0),
+            _row(world_to_camera, view, 1),
+            _row(world_to_camera, view, 2),
+        )
+        move = world_to_camera[view, 0, 3], world_to_camera[view, 1, 3], world_to_camera[view, 2, 3]
+        fx, fy, cx, cy = intrinsics[view, 0, 0], intrinsics[view, 1, 1], intrinsics[view, 0, 2], intrinsics[view, 1, 2]
+        for n in range(begin, end):
+            means2d[view, n, :] = 0
+            records[view, n, :] = 0
+            radii[view, n] = 0
+            depths[view, n] = 0
+            mean = np.float64(means[n, 0]), np.float64(means[n, 1]), np.float64(means[n, 2])
+            z = _dot(row_z, mean) + move[2]
+            if not z > near:
+                continue
+            slope_x, slope_y = (_dot(row_x, mean) + move[0]) / z, (_dot(row_y, mean) + move[1]) / z
+            u, v = fx * slope_x + cx, fy * slope_y + cy
+            means2d[view, n, 0], means2d[view, n, 1] = u, v
+            linear_x = _mix(fx / z, row_x, -fx / z * _tangent(slope_x, fx, cx, width), row_z)
+            linear_y = _mix(fy / z, row_y, -fy / z * _tangent(slope_y, fy, cy, height), row_z)
+            qw, qx, qy, qz, _ = _unit_quat(quats, n)
+            half_x, half_y = _image_axes(linear_x, linear_y, _axes(qw, qx, qy, qz), scales, n)
+            raw_xx, xy, raw_yy = _dot(half_x, half_x), _dot(half_x, half_y), _dot(half_y, half_y)
+            xx, yy = raw_xx + eps2d, raw_yy + eps2d
+            det = xx * yy - xy * xy
+            opacity = np.float64(opacities[n])
+            if antialias and det > 0:
+                opacity *= math.sqrt(max((raw_xx * raw_yy - xy * xy) / det, MIN_COMPENSATION))
+            if not (opacity > MIN_ALPHA and det > 0):
+                continue
+            reach = 2 * math.log(opacity / MIN_ALPHA)
+            extent_x, extent_y = math.sqrt(reach * xx), math.sqrt(reach * yy)
+            if not (u + extent_x > 0 and u - extent_x < width and v + extent_y > 0 and v - extent_y < height):
+                continue
+            spread = 0.5 * (xx - yy)
+            radii[view, n] = math.sqrt(reach * (0.5 * (xx + yy) + math.sqrt(spread * spread + xy * xy)))
+            depths[view, n] = z
+            records[view, n, CENTER_X], records[view, n, CENTER_Y] = u, v
+            records[view, n, XX], records[view, n, YY] = -HALF_LOG2_E * yy / det, -HALF_LOG2_E * xx / det
+            records[view, n, XY] = 2 * HALF_LOG2_E * xy / det
+            records[view, n, LOG_OPACITY] = math.log2(opacity)
+            records[view, n, EXTENT_X], records[view, n, EXTENT_Y] = extent_x, extent_y
+
+
+@kernel
+def _covariance_gradient(
+    raw_xx: float,
+    xy: float,
+    raw_yy: float,
+    eps2d: float,
+    antialias: bool,
+    g_xx: float,
+    g_xy: float,
+    g_yy: float,
+    g_log: float,
+) -> tuple:
+    """Gradient of the projected covariance (xx, xy, yy) from that of a record's four coefficients."""
+    xx, yy = raw_xx + eps2d, raw_yy + eps2d
+    det = xx * yy - xy * xy
+    k = HALF_LOG2_E / (det * det)
+    v_xx = k * (g_xx * yy * yy - 2 * g_xy * xy * yy + g_yy * xy * xy)
+    v_xy = 2 * k * (-g_xx * xy * yy + g_xy * (xx * yy + xy * xy) - g_yy * xx * xy)
+    v_yy = k * (g_xx * xy * xy - 2 * g_xy * xx * xy + g_yy * xx * xx)
+    raw_det = raw_xx * raw_yy - xy * xy
+    if antialias and raw_det > MIN_COMPENSATION * det:
+        h = HALF_LOG2_E * g_log
+        v_xx += h * (raw_yy / raw_det - yy / det)
+        v_xy += h * 2 * (xy / det - xy / raw_det)
+        v_yy += h * (raw_xx / raw_det - xx / det)
+    return v_xx, v_xy, v_yy
+
+
+@kernel
+def _rotation_gradient(w: float, x: float, y: float, z: float, inverse: float, a: tuple, b: tuple, c: tuple) -> tuple:
+    """Gradient of the raw quaternion from that of the rotation's three columns."""
+    v_w = 2 * (z * (a[1] - b[0]) + y * (c[0] - a[2]) + x * (b[2] - c[1]))
+    v_x = 2 * (y * (a[1] + b[0]) + z * (a[2] + c[0]) + w * (b[2] - c[1]) - 2 * x * (b[1] + c[2]))
+    v_y = 2 * (x * (a[1] + b[0]) + z * (b[2] + c[1]) + w * (c[0] - a[2]) - 2 * y * (a[0] + c[2]))
+    v_z = 2 * (x * (a[2] + c[0]) + y * (b[2] + c[1]) + w * (a[1] - b[0]) - 2 * z * (a[0] + b[1]))
+    along = w * v_w + x * v_x + y * v_y + z * v_z
+    return (
+        (v_w - along * w) * inverse,
+        (v_x - along * x) * inverse,
+        (v_y - along * y) * inverse,
+        (v_z - along * z) * inverse,
+    )
+
+
+@kernel
+def _pinhole_gradient(
+    slope: float, z: float, focal: float, center: float, size: int, g_center: float, g_direct: float, g_depth: float
+) -> tuple:
+    """One image axis: gradients of (x / z slope, z, focal) from those of the centre and the Jacobian's two entries."""
+    tangent = _tangent(slope, focal, center, size)
+    g_slope = g_center * focal
+    if tangent == slope:
+        g_slope -= g_depth * focal / z
+    g_z = (g_depth * tangent - g_direct) * focal / (z * z)
+    g_focal = g_center * slope + (g_direct - g_depth * tangent) / z
+    return g_slope, g_z, g_focal
+
+
+@kernel
+def project_backward(
+    begin: int,
+    end: int,
+    means: np.ndarray,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    opacities: np.ndarray,
+    world_to_camera: np.ndarray,
+    intrinsics: np.ndarray,
+    width: int,
+    height: int,
+    eps2d: float,
+    antialias: bool,
+    radii: np.ndarray,
+    g_means2d: np.ndarray,
+    g_records: np.ndarray,
+    v_means: np.ndarray,
+    v_quats: np.ndarray,
+    v_scales: np.ndarray,
+    v_opacities: np.ndarray,
+    v_cameras: np.ndarray,
+    v_pinholes: np.ndarray,
+) -> None:
+    """Add the gradients of Gaussians begin..end to the zeroed v_ arrays; v_cameras and v_pinholes are this chunk's own.
+
+    v_cameras is [V, 3, 4] and v_pinholes [V, 4] (fx, fy, cx, cy), double precision.
+    """
+    for view in range(world_to_camera.shape[0]):
+        row_x, row_y, row_z = (
+            _row(world_to_camera, view, 0),
+            _row(world_to_camera, view, 1),
+            _row(world_to_camera, view, 2),
+        )
+        move = world_to_camera[view, 0, 3], world_to_camera[view, 1, 3], world_to_camera[view, 2, 3]
+        fx, fy, cx, cy = intrinsics[view, 0, 0], intrinsics[view, 1, 1], intrinsics[view, 0, 2], intrinsics[view, 1, 2]
+        for n in range(begin, end):
+            if radii[view, n] == 0:
+                continue
+            mean = np.float64(means[n, 0]), np.float64(means[n, 1]), np.float64(means[n, 2])
+            z = _dot(row_z, mean) + move[2]
+            slope_x, slope_y = (_dot(row_x, mean) + move[0]) / z, (_dot(row_y, mean) + move[1]) / z
+            direct_x, depth_x = fx / z, -fx / z * _tangent(slope_x, fx, cx, width)
+            direct_y, depth_y = fy / z, -fy / z * _tangent(slope_y, fy, cy, height)
+            linear_x, linear_y = _mix(direct_x, row_x, depth_x, row_z), _mix(direct_y, row_y, depth_y, row_z)
+            qw, qx, qy, qz, inverse = _unit_quat(quats, n)
+            axes = _axes(qw, qx, qy, qz)
+            half_x, half_y = _image_axes(linear_x, linear_y, axes, scales, n)
+            g_log = np.float64(g_records[view, n, LOG_OPACITY])
+            v_xx, v_xy, v_yy = _covariance_gradient(
+                _dot(half_x, half_x), _dot(half_x, half_y), _dot(half_y, half_y), eps2d, antialias,
+                g_records[view, n, XX], g_records[view, n, XY], g_records[view, n, YY], g_log,
+            )  # fmt: skip
+            v_opacities[n] += 2 * HALF_LOG2_E * g_log / opacities[n]
+            v_half_x, v_half_y = _mix(2 * v_xx, half_x, v_xy, half_y), _mix(v_xy, half_x, 2 * v_yy, half_y)
+
+            # Column k of (rotation x scales) has gradient linear_x v_half_x[k] + linear_y v_half_y[k].
+            a, b, c = np.float64(scales[n, 0]), np.float64(scales[n, 1]), np.float64(scales[n, 2])
+            column_a = _mix(v_half_x[0], linear_x, v_half_y[0], linear_y)
+            column_b = _mix(v_half_x[1], linear_x, v_half_y[1], linear_y)
+            column_c = _mix(v_half_x[2], linear_x, v_half_y[2], linear_y)
+            v_scales[n, 0] += _dot(column_a, axes[0])
+            v_scales[n, 1] += _dot(column_b, axes[1])
+            v_scales[n, 2] += _dot(column_c, axes[2])
+            v_w, v_x, v_y, v_z = _rotation_gradient(
+                qw, qx, qy, qz, inverse, _mix(a, column_a, 0.0, column_a), _mix(b, column_b, 0.0, column_b),
+                _mix(c, column_c, 0.0, column_c),
+            )  # fmt: skip
+            v_quats[n, 0] += v_w
+            v_quats[n, 1] += v_x
+            v_quats[n, 2] += v_y
+            v_quats[n, 3] += v_z
+
+            v_linear_x = _mix(1.0, _mix(v_half_x[0] * a, axes[0], v_half_x[1] * b, axes[1]), v_half_x[2] * c, axes[2])
+            v_linear_y = _mix(1.0, _mix(v_half_y[0] * a, axes[0], v_half_y[1] * b, axes[1]), v_half_y[2] * c, axes[2])
+            g_u, g_v = np.float64(g_means2d[view, n, 0]), np.float64(g_means2d[view, n, 1])
+            v_slope_x, v_z_x, v_fx = _pinhole_gradient(
+                slope_x, z, fx, cx, width, g_u, _dot(v_linear_x, row_x), _dot(v_linear_x, row_z)
+            )
+            v_slope_y, v_z_y, v_fy = _pinhole_gradient(
+                slope_y, z, fy, cy, height, g_v, _dot(v_linear_y, row_y), _dot(v_linear_y, row_z)
+            )
+            local_x, local_y = v_slope_x / z, v_slope_y / z
+            local_z = v_z_x + v_z_y - (v_slope_x * slope_x + v_slope_y * slope_y) / z
+            for i in range(3):
+                v_means[n, i] += local_x * row_x[i] + local_y * row_y[i] + local_z * row_z[i]
+                v_cameras[view, 0, i] += local_x * mean[i] + direct_x * v_linear_x[i]
+                v_cameras[view, 1, i] += local_y * mean[i] + direct_y * v_linear_y[i]
+                v_cameras[view, 2, i] += local_z * mean[i] + depth_x * v_linear_x[i] + depth_y * v_linear_y[i]
+            v_cameras[view, 0, 3] += local_x
+            v_cameras[view, 1, 3] += local_y
+            v_cameras[view, 2, 3] += local_z
+            v_pinholes[view, 0] += v_fx
+            v_pinholes[view, 1] += v_fy
+            v_pinholes[view, 2] += g_u
+            v_pinholes[view, 3] += g_v

@@ -1,0 +1,80 @@
+"""A small thread pool for kernels that release the GIL: survives fork, nests in any thread, follows torch's setting."""
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from queue import SimpleQueue
+from typing import Any
+
+import torch
+
+_Job = tuple[Callable[..., Any], tuple[Any, ...], "_Outcome"]
+
+
+class _Outcome:
+    def __init__(self) -> None:
+        self.done = threading.Lock()
+        self.done.acquire()
+        self.error: BaseException | None = None
+
+
+_jobs: SimpleQueue[_Job] = SimpleQueue()
+_workers = 0
+_growing = threading.Lock()
+
+
+def _forget_workers() -> None:
+    # A forked child inherits the queue but none of the threads.
+    global _jobs, _workers, _growing
+    _jobs, _workers, _growing = SimpleQueue(), 0, threading.Lock()
+
+
+os.register_at_fork(after_in_child=_forget_workers)
+
+
+def _work(jobs: "SimpleQueue[_Job]") -> None:
+    while True:
+        function, args, outcome = jobs.get()
+        try:
+            function(*args)
+        except BaseException as error:  # handed to the caller, who raises it
+            outcome.error = error
+        outcome.done.release()
+
+
+def thread_count() -> int:
+    """How many threads to use: torch's own number, so that one setting governs everything."""
+    return torch.get_num_threads()
+
+
+def run(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> None:
+    """Call a function once per argument tuple, all at the same time; raise the first error.
+
+    The caller's thread takes the first call. Pass at most `thread_count` calls: each further one takes a thread.
+    """
+    global _workers
+    if len(calls) > 1 and _workers < len(calls) - 1:
+        with _growing:
+            while _workers < len(calls) - 1:
+                threading.Thread(target=_work, args=(_jobs,), daemon=True, name="rewild4d-raster").start()
+                _workers += 1
+    outcomes = []
+    for args in calls[1:]:
+        outcome = _Outcome()
+        outcomes.append(outcome)
+        _jobs.put((function, args, outcome))
+    try:
+        if calls:
+            function(*calls[0])
+    finally:
+        for outcome in outcomes:
+            outcome.done.acquire()
+    for outcome in outcomes:
+        if outcome.error is not None:
+            raise outcome.error
+
+
+def spans(total: int, parts: int) -> list[tuple[int, int]]:
+    """Cut range(total) into at most ``parts`` pieces of nearly equal length, none empty."""
+    parts = min(parts, total)
+    return [(total * i // parts, total * (i + 1) // parts) for i in range(parts)]
