@@ -9,8 +9,8 @@ from rewild4d.conformance import check_method
 from rewild4d.contracts import Finding
 from rewild4d.errors import UserError
 
-DESCRIPTION = """Verify a data set's folder (every fault named, not only the first), or that a method keeps the contract:
-same seed same result, save and load same pixels, resume, a clear error on an empty mask."""
+DESCRIPTION = """Verify a data set's folder (every fault named, not only the first), or that a method keeps its
+contract: same seed same result, save and load same pixels, resume, a clear error on an empty mask."""
 SIGNS = {"ok": "ok     ", "warning": "warning", "error": "ERROR  "}
 
 

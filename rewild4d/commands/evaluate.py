@@ -16,8 +16,8 @@ from rewild4d.registry import load_dataset, load_method
 from rewild4d.runner import Progress
 from rewild4d.view import save_pictures
 
-DESCRIPTION = """Score saved reconstructions again, with the protocol that they were fitted for (another one could hold out
-what the method has seen), draw their pictures again and write their records anew."""
+DESCRIPTION = """Score saved reconstructions again, with the protocol that they were fitted for (another one could hold
+out what the method has seen), draw their pictures again and write their records anew."""
 
 
 @dataclass(frozen=True)

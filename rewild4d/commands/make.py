@@ -9,8 +9,8 @@ from rewild4d.datasets.studio import make_artemis
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.runner import Progress
 
-DESCRIPTION = """Render a skinned, animated glTF from a ring of cameras and write it as an Artemis folder: images, mattes,
-cameras, bones and the voxel volume with its skinning weights."""
+DESCRIPTION = """Render a skinned, animated glTF from a ring of cameras and write it as an Artemis folder: images,
+mattes, cameras, bones and the voxel volume with its skinning weights."""
 
 
 @dataclass(frozen=True)

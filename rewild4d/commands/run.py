@@ -35,7 +35,7 @@ class Options:
         protocol: what is held out and measured (see `list`); the data set's default where it is left out.
         preset: size of the effort: quick, standard or paper.
         seeds: one run for each.
-        prior: "template" (fitted to the clip), "coarse:<noise>" (from the truth plus noise, for studies only) or an npz file.
+        prior: "template" (fitted to the clip), "coarse:<noise>" (from the truth plus noise: for studies) or a file.
         device: auto, cpu or cuda.
         out: folder for runs.
         json: print the records as a JSON array, and nothing else, to standard output.
