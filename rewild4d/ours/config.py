@@ -1,0 +1,244 @@
+"""The whole configuration of `ours`: one tree of frozen structs.
+
+Section numbers are the design's method notes. "fraction" means a share of `Config.iterations`, so that presets of every
+length follow one schedule. Lengths without a unit are in the object frame, whose rest diagonal is 5.
+"""
+
+import msgspec
+
+
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Base of the tree: frozen, keyword-only, unknown keys are errors."""
+
+
+class Canonical(Section):
+    """The canonical Gaussians (section 3)."""
+
+    samples: int = 15_000
+    """Gaussians at the start: area-uniform samples of the prior's rest surface."""
+    thickness: float = 0.5
+    """Scale along the normal over the scale in the surface: flat enough to have a normal, thick enough to be seen edge-on."""
+    opacity: float = 0.9
+    """At the start; 0.1 leaves the silhouette too weak when the pose loss begins."""
+    max_scale: float = 0.05
+    """Largest standard deviation, times the rest diagonal: one huge Gaussian hides a wrong pose."""
+
+
+class Skinning(Section):
+    """The learnable skinning field (section 3)."""
+
+    resolution: int = 32
+    """Voxels along each axis of the cubic field (paper)."""
+    margin: float = 1.2
+    """Half-size of the cube over half the longest side of the rest shape, so that points can leave the surface."""
+    neighbours: int = 30
+    """Vertices averaged by inverse distance to fill a voxel."""
+    sweeps: int = 30
+    """Neighbour averages that carry weights into empty voxels."""
+    keep: float = 0.7
+    """Share of itself that a voxel keeps in a sweep."""
+    floor: float = 1e-3
+    """Added before the logarithm, so that every part can still gain any voxel."""
+    tied: bool = False
+    """Average the logits with their mirror image (left and right exchanged)."""
+    learn: bool = True
+    """False freezes the field (the paper's "fixed skinning" ablation)."""
+
+
+class Pose(Section):
+    """Part anchors and the pose network (section 4)."""
+
+    anchor_size: int = 8
+    """Length of a part anchor (paper)."""
+    anchor_std: float = 1.0
+    """At 0.1 all joints turn alike for ever; 1 tells them apart."""
+    frequencies: int = 4
+    """Octaves of the time code; 4 fitted better than 6 in the measured prototype."""
+    explicit_group: bool = False
+    """Append the group sign m to the code."""
+    width: int = 128
+    """Width of a token: a per-video network needs less than an animal-general one (256)."""
+    blocks: int = 2
+    """Pre-norm self-attention blocks."""
+    heads: int = 4
+    """Attention heads."""
+    reach: float = 0.1
+    """Translation of a joint per unit of the head's output, times the rest diagonal."""
+    time_noise: float = 0.1
+    """Standard deviation of the time jitter in frames, falling linearly to zero."""
+    time_noise_until: float = 0.5
+    """Fraction at which the jitter ends."""
+    tied: bool = False
+    """Pose of a flipped image = mirror image of the pose of the image, instead of one of its own."""
+
+
+class Deform(Section):
+    """Part-conditioned deformation (section 5)."""
+
+    enabled: bool = True
+    """False is the paper's "w/o Deform" ablation."""
+    width: int = 128
+    """Hidden width; the dearest network of the method, its cost grows with the square."""
+    heads: int = 4
+    """Attention heads over the parts."""
+    frequencies: int = 6
+    """Octaves of the position code."""
+    reach: float = 0.1
+    """Displacement per unit of output."""
+    max_log_scale: float = 1.0
+    """Bound on the change of log scale (tanh): unbounded offsets make points fly off."""
+    ramp_start: float = 0.05
+    """Fraction at which the deformation starts to fade in: the pose explains the motion first."""
+    ramp_end: float = 0.15
+    """Fraction at which it acts in full."""
+    detach_features: bool = False
+    """Keep the appearance losses out of the part features too (the strict reading of gradient isolation)."""
+
+
+class PriorUse(Section):
+    """What the prior's poses do after the start (section 4)."""
+
+    blend: bool = False
+    """Blend the prior's poses into the network's (the paper's schedule; off on Artemis, and after a warm-up it only undoes it)."""
+    blend_until: float = 0.35
+    """Fraction at which the blend reaches zero (7k of 20k)."""
+    pull: float = 1.0
+    """Weight of the squared distance to the prior's poses while `pull_until` lasts."""
+    pull_until: float = 0.2
+    """Fraction at which the pull ends (4k of 20k)."""
+
+
+class WarmUp(Section):
+    """The pose warm-up: poses from blurred silhouettes, Gaussians frozen (section 11.3)."""
+
+    iterations: int = 1000
+    """Steps on silhouettes; 0 leaves the stage out (an ablation)."""
+    regress: int = 300
+    """Steps before those that only copy the prior's poses into the network."""
+    views: int = 4
+    """Images a step."""
+    samples: int = 2500
+    """Gaussians that stand for the body: silhouettes need few."""
+    size: int = 160
+    """Longest image side."""
+    blur: float = 0.06
+    """Blur at the start, times the side of the animal's box, falling linearly to zero: reaches limbs that do not overlap yet."""
+    rate: float = 2e-3
+    """Learning rate of the pose network."""
+    pull: float = 0.3
+    """Weight of the pull to the prior's poses, falling linearly to zero."""
+
+
+class Loss(Section):
+    """Image losses of the two branches (section 6)."""
+
+    pose_silhouette: float = 0.2
+    """BCE + Dice of the pose branch (paper)."""
+    l1: float = 0.8
+    """Colour of the deformed branch (paper)."""
+    ssim: float = 0.2
+    """One minus SSIM, deformed branch (paper)."""
+    silhouette: float = 0.1
+    """BCE + Dice of the deformed branch (paper)."""
+    random_background: bool = True
+    """One random colour a step behind render and target: floaters cannot hide in a known background."""
+
+
+class Geometry(Section):
+    """Regularisers: the paper's three, and a skeleton's (sections 6, 9, 11.6)."""
+
+    until: float = 0.5
+    """Fraction at which the paper's three end (10k of 20k)."""
+    tv: float = 10.0
+    """Total variation of the skinning probabilities (paper)."""
+    tv_delta: float = 0.05
+    """Where the Huber function turns linear (paper)."""
+    tv_every: int = 1
+    """Steps between evaluations, weight multiplied accordingly."""
+    compact: float = 0.1
+    """Compactness of the parts (paper)."""
+    compact_power: float = 2.0
+    """Exponent on the weights: a squared weight leaves less torso in every part."""
+    smooth: float = 0.1
+    """Smoothness of rendered normals (paper)."""
+    smooth_every: int = 2
+    """Steps between evaluations, weight multiplied accordingly."""
+    smooth_size: int = 256
+    """Side of the square image of normals."""
+    limit: float = 1.0
+    """Pose: penalty on turning more than `limit_degrees` against the parent."""
+    limit_degrees: float = 70.0
+    """Wider than any joint of a quadruped needs between two bones of the template."""
+    attach: float = 1.0
+    """Pose: squared gap between a joint and its parent there, over the squared diagonal."""
+    temporal: float = 0.0
+    """Pose: squared second difference over neighbouring frames."""
+    rigid: float = 0.0
+    """Deformed branch: change of distance between canonical neighbours (as isometric as possible)."""
+    rigid_neighbours: int = 5
+    """Neighbours a Gaussian is compared with."""
+
+
+class Rates(Section):
+    """Learning rates (section 6, Schedule); pairs fall exponentially from the first to the second."""
+
+    means: tuple[float, float] = (8e-4, 8e-6)
+    """Positions: 1.6e-4 and 1.6e-6 at a scene size of 5."""
+    quats: float = 1e-3
+    """Orientations."""
+    log_scales: float = 5e-3
+    """Scales."""
+    logit_opacities: float = 1e-2
+    """5e-2 makes moving legs transparent within 200 iterations, before the pose has moved."""
+    colors: float = 2.5e-3
+    """Colours."""
+    skinning: tuple[float, float] = (1e-3, 1e-4)
+    """Logits of the field."""
+    pose: tuple[float, float] = (5e-4, 5e-6)
+    """Anchors and pose network; a restart at the warm-up's rate undoes the warm-up."""
+    deform: tuple[float, float] = (8e-4, 1.6e-6)
+    """Deformation network."""
+    clip: float = 1.0
+    """Bound on the gradient norm of the networks."""
+
+
+class Density(Section):
+    """Densification with a cap (section 6)."""
+
+    start: float = 0.025
+    """Fraction of the first round (500 of 20k)."""
+    end: float = 0.5
+    """Fraction of the last: unregularised points appear once the geometric losses stop."""
+    every: float = 0.005
+    """Fraction between rounds (100 of 20k)."""
+    gradient: float = 4e-4
+    """Mean image gradient above which a Gaussian is refined, in half sides of the animal's box."""
+    split_scale: float = 0.01
+    """Split above this scale (times the rest diagonal), clone below."""
+    prune_opacity: float = 0.01
+    """Gaussians below this opacity are removed."""
+    prune_radius: float = 0.2
+    """Gaussians that cover more than this share of the image's longest side are removed."""
+    cap: int = 40_000
+    """Most Gaussians: memory, and the speed of every later step."""
+
+
+class Config(Section):
+    """`ours`; the defaults are the paper's profile, presets change them."""
+
+    image_size: int = 512
+    """Longest image side it trains at; larger clips are reduced."""
+    iterations: int = 20_000
+    """Steps of the main stage (paper)."""
+    checkpoint_every: int = 500
+    """Steps between checkpoints, where a work folder is given."""
+    canonical: Canonical = Canonical()
+    skinning: Skinning = Skinning()
+    pose: Pose = Pose()
+    deform: Deform = Deform()
+    prior: PriorUse = PriorUse()
+    warmup: WarmUp = WarmUp()
+    loss: Loss = Loss()
+    geometry: Geometry = Geometry()
+    rates: Rates = Rates()
+    density: Density = Density()

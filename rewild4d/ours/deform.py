@@ -1,0 +1,84 @@
+"""The part-conditioned deformation: every Gaussian asks the parts, by cross-attention, how to move beyond skinning."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from rewild4d.ours.config import Deform as DeformConfig
+from rewild4d.ours.pose import seed_linears
+from rewild4d.transforms import quat_multiply
+from rewild4d.types import OBJECT_DIAGONAL
+
+
+class Posed(NamedTuple):
+    """Geometry of Gaussians after skinning or deformation: [n, 3], [n, 4] (unit), log scales [n, 3]."""
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+
+
+class DeformNetwork(nn.Module):
+    """Query: part mixture, place, orientation and size of a Gaussian; keys and values: the parts' features.
+
+    The output layer starts at zero, so the deformed Gaussians start as the skinned ones. Query and output projections
+    of the attention are folded into the few keys and values, so a Gaussian costs two small matrix products.
+    """
+
+    def __init__(self, anchor_size: int, features: int, config: DeformConfig, generator: torch.Generator) -> None:
+        super().__init__()
+        self.config = config
+        self.inputs = anchor_size + 3 * (1 + 2 * config.frequencies) + 4 + 3
+        width = config.width
+        self.query, self.skip = nn.Linear(self.inputs, width), nn.Linear(self.inputs, width)
+        self.key, self.value = nn.Linear(features, width), nn.Linear(features, width)
+        self.project = nn.Linear(width, width)
+        self.up, self.down, self.out = nn.Linear(width, width), nn.Linear(width, width), nn.Linear(width, 9)
+        seed_linears(self, generator)
+        nn.init.zeros_(self.out.weight)
+
+    def forward(self, features: Tensor, parts: Tensor, posed: Posed, strength: float) -> Posed:
+        """Deform skinned Gaussians.
+
+        Args:
+            features: part features F_J, [J, K].
+            parts: part mixture of each Gaussian, weights times anchors, [n, D].
+            posed: skinned Gaussians; gradients pass through to them, but not through the query.
+            strength: the ramp, in [0, 1].
+
+        Returns:
+            Deformed Gaussians.
+        """
+        query = torch.cat((parts, self._place(posed)), dim=-1)
+        hidden = self._attend(query, features) + self.skip(query)
+        hidden = hidden + self.down(torch.relu(self.up(torch.relu(hidden))))
+        out = strength * self.out(torch.relu(hidden))
+        turn = torch.cat((torch.ones_like(out[:, :1]), out[:, 3:6]), dim=-1)
+        return Posed(
+            posed.means + self.config.reach * out[:, :3],
+            quat_multiply(posed.quats, nn.functional.normalize(turn, dim=-1)),
+            posed.log_scales + self.config.max_log_scale * out[:, 6:].tanh(),
+        )
+
+    def _place(self, posed: Posed) -> Tensor:
+        """Position code, orientation (w >= 0) and log scale, detached, [n, 46]."""
+        means, quats, log_scales = (tensor.detach() for tensor in posed)
+        place = means * (2 / OBJECT_DIAGONAL)
+        octaves = 2.0 ** torch.arange(self.config.frequencies, dtype=place.dtype, device=place.device)
+        angles = (place[:, None] * octaves[:, None]).flatten(1)
+        upright = torch.where(quats[:, :1] < 0, -quats, quats)
+        return torch.cat((place, angles.sin(), angles.cos(), upright, log_scales), dim=-1)
+
+    def _attend(self, query: Tensor, features: Tensor) -> Tensor:
+        """Multi-head cross-attention over the parts, [n, inputs] and [J, K] -> [n, width]."""
+        heads, width = self.config.heads, self.config.width
+        size = width // heads
+        key = self.key(features).view(-1, heads, size).permute(1, 2, 0)
+        value = self.value(features).view(-1, heads, size).transpose(0, 1)
+        ask = self.query.weight.view(heads, size, -1)
+        scores_matrix = torch.einsum("hsi,hsj->ihj", ask, key).flatten(1)
+        scores_bias = torch.einsum("hs,hsj->hj", self.query.bias.view(heads, size), key).flatten()
+        scores = torch.addmm(scores_bias, query, scores_matrix).view(len(query), heads, -1) * size**-0.5
+        mixed = torch.einsum("hjs,whs->hjw", value, self.project.weight.view(width, heads, size)).flatten(0, 1)
+        return torch.addmm(self.project.bias, scores.softmax(dim=-1).flatten(1), mixed)

@@ -1,0 +1,292 @@
+"""The training loop: warm-up, then the stage-aware losses of METHOD section 6; one object holds all state."""
+
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from rewild4d.contracts import Log
+from rewild4d.ours.canonical import NAMES
+from rewild4d.ours.checkpoint import fit_digest, load_checkpoint, save_checkpoint
+from rewild4d.ours.coloring import initial_colors
+from rewild4d.ours.config import Config
+from rewild4d.ours.deform import Posed
+from rewild4d.ours.density import DensityControl
+from rewild4d.ours.geometry_losses import compact_loss, neighbours, rigid_loss, smooth_loss, tv_loss
+from rewild4d.ours.losses import WINDOW, colour_losses, silhouette_loss, union_window
+from rewild4d.ours.model import Model, build_model
+from rewild4d.ours.pose import blend_poses, pose_distance
+from rewild4d.ours.schedule import exponential, fade, ramp
+from rewild4d.ours.skeleton import neighbour_keys, skeleton_losses
+from rewild4d.ours.symmetry import Key, Supervision, Target
+from rewild4d.ours.warmup import WarmUp
+from rewild4d.rasterizer import RasterInfo, rasterize
+from rewild4d.types import Clip, Prior
+
+logger = logging.getLogger(__name__)
+LOG_EVERY = 20
+
+
+class Training:
+    """The main stage.
+
+    Attributes:
+        model: everything that learns.
+        gaussian_optimizer: one group per attribute, in the order of `canonical.NAMES`.
+        network_optimizer: groups skinning, pose, deform.
+    """
+
+    def __init__(self, model: Model, supervision: Supervision, config: Config, generator: torch.Generator) -> None:
+        self.model, self.supervision, self.config, self.generator = model, supervision, config, generator
+        own, rates = model.gaussians, config.rates
+        self.gaussian_optimizer = torch.optim.Adam(
+            [{"params": [getattr(own, name)], "lr": 0.0 if name == "means" else getattr(rates, name)} for name in NAMES],
+            eps=1e-15, fused=True,
+        )  # fmt: skip
+        self.groups = {
+            "skinning": list(model.field.parameters()),
+            "pose": list(model.network.parameters()),
+            "deform": list(model.deform.parameters()),
+        }
+        model.field.logits.requires_grad_(config.skinning.learn)
+        self.network_optimizer = torch.optim.Adam(
+            [{"params": group} for group in self.groups.values()], eps=1e-8, fused=True
+        )
+        self.density = DensityControl(config.density, len(own), own.means.device)
+        self.near: Tensor | None = None
+
+    def step(self, index: int) -> dict[str, float]:
+        """One iteration; returns the figures for the log."""
+        progress = index / self.config.iterations
+        self._set_rates(progress)
+        key = self.supervision.draw(self.generator)
+        target = self.supervision.target(key)
+        losses, info = self.losses(key, target, index)
+        loss = torch.stack(list(losses.values())).sum()
+        if not torch.isfinite(loss):
+            bad = next(name for name, value in losses.items() if not torch.isfinite(value))
+            raise FloatingPointError(f"iteration {index}: loss '{bad}' is not finite")
+        self.gaussian_optimizer.zero_grad(set_to_none=True)
+        self.network_optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self._check_gradients(index)
+        if info is not None and progress < self.config.density.end:
+            self.density.observe(info, target.side, max(target.camera.width, target.camera.height))
+        self.gaussian_optimizer.step()
+        self.network_optimizer.step()
+        self._densify(index)
+        return {"loss": float(loss.detach()), "gaussians": len(self.model.gaussians)} | {
+            name: float(value.detach()) for name, value in losses.items()
+        }
+
+    def losses(self, key: Key, target: Target, index: int) -> tuple[dict[str, Tensor], RasterInfo | None]:
+        """All weighted losses of one view.
+
+        Args:
+            key: the view.
+            target: its image.
+            index: the iteration.
+
+        Returns:
+            Scalars by name, and the render info of the deformed branch.
+        """
+        config, model = self.config, self.model
+        progress = index / config.iterations
+        keys, own = neighbour_keys([key], self.supervision.frames, config.geometry.temporal > 0)
+        poses = model.pose(self._times(keys, progress), keys)
+        prior_pose = self.supervision.prior_pose(keys)
+        network_pose = poses
+        if config.prior.blend:
+            poses = blend_poses(poses, *prior_pose, fade(progress, config.prior.blend_until))
+        pose = poses[own[0]]
+        probabilities = model.field.probabilities()
+        weights = model.field.sample(probabilities, model.gaussians.means)
+        opacities = model.gaussians.opacities()
+
+        transforms = model.transforms(poses)
+        live = model.skin(weights, pose.quats[0], transforms[own[0]])
+        _, pose_alpha, _ = self._render(
+            live, opacities.detach(), opacities.new_zeros(len(opacities), 1), target, detach_scales=True
+        )
+        strength = ramp(progress, config.deform.ramp_start, config.deform.ramp_end)
+        posed, deformed = model.deformed(pose, weights, strength)
+        rgb, alpha, info = self._render(deformed, opacities, model.gaussians.rgb(), target)
+
+        losses = self._image_losses(pose_alpha, rgb, alpha, target)
+        if config.prior.pull and progress < config.prior.pull_until:
+            losses["prior"] = (
+                config.prior.pull * fade(progress, config.prior.pull_until) * pose_distance(network_pose, *prior_pose)
+            )
+        losses["skeleton"] = skeleton_losses(model, poses, transforms, config.geometry)
+        losses |= self._geometry_losses(index, probabilities, weights, opacities, posed, deformed)
+        return losses, info
+
+    def _times(self, keys: list[Key], progress: float) -> Tensor:
+        """(i + 1) / T, jittered by a share of a frame early on; neighbours share the jitter."""
+        frames, pose = self.supervision.frames, self.config.pose
+        noise = torch.randn((), generator=self.generator) * pose.time_noise * fade(progress, pose.time_noise_until)
+        return (torch.tensor([key.frame + 1.0 for key in keys]) + noise) / frames
+
+    def _render(
+        self, posed: Posed, opacities: Tensor, features: Tensor, target: Target, detach_scales: bool = False
+    ) -> tuple[Tensor, Tensor, RasterInfo]:
+        camera = target.camera
+        log_scales = posed.log_scales.detach() if detach_scales else posed.log_scales
+        image, alpha, info = rasterize(
+            posed.means, posed.quats, log_scales.exp(), opacities, features,
+            camera.world_to_camera[None], camera.intrinsics[None], camera.width, camera.height,
+        )  # fmt: skip
+        return image[0], alpha[0], info
+
+    def _image_losses(self, pose_alpha: Tensor, rgb: Tensor, alpha: Tensor, target: Target) -> dict[str, Tensor]:
+        """L_pose and L_deform of one view."""
+        weights = self.config.loss
+        window = union_window([pose_alpha, alpha, target.mask], WINDOW - 1)
+        background = torch.rand(3, generator=self.generator).to(rgb) if weights.random_background else rgb.new_ones(3)
+        l1, dissimilarity = colour_losses(rgb, alpha, target, background, window)
+        return {
+            "pose_silhouette": weights.pose_silhouette * silhouette_loss(pose_alpha, target, window),
+            "l1": weights.l1 * l1,
+            "ssim": weights.ssim * dissimilarity,
+            "silhouette": weights.silhouette * silhouette_loss(alpha, target, window),
+        }
+
+    def _geometry_losses(
+        self, index: int, probabilities: Tensor, weights: Tensor, opacities: Tensor, posed: Posed, deformed: Posed
+    ) -> dict[str, Tensor]:
+        """The paper's three while they last, and neighbour rigidity."""
+        config, own = self.config.geometry, self.model.gaussians
+        losses: dict[str, Tensor] = {}
+        if index < config.until * self.config.iterations:
+            if config.tv and index % config.tv_every == 0 and self.config.skinning.learn:
+                field = self.model.field
+                losses["tv"] = config.tv * config.tv_every * tv_loss(probabilities, field.resolution, config.tv_delta)
+            if config.compact:
+                both = [
+                    compact_loss(points, weights, opacities, config.compact_power)
+                    for points in (own.means, posed.means)
+                ]
+                losses["compact"] = config.compact * torch.stack(both).mean()
+            if config.smooth and index % config.smooth_every == 0:
+                smooth = smooth_loss(deformed, opacities, config.smooth_size, self.generator)
+                losses["smooth"] = config.smooth * config.smooth_every * smooth
+        if config.rigid:
+            if self.near is None:
+                self.near = neighbours(own.means, config.rigid_neighbours)
+            losses["rigid"] = config.rigid * rigid_loss(own.means, deformed.means, self.near)
+        return losses
+
+    def _set_rates(self, progress: float) -> None:
+        rates = self.config.rates
+        self.gaussian_optimizer.param_groups[NAMES.index("means")]["lr"] = exponential(*rates.means, progress)
+        for group, pair in zip(
+            self.network_optimizer.param_groups, (rates.skinning, rates.pose, rates.deform), strict=True
+        ):
+            group["lr"] = exponential(*pair, progress)
+
+    def _check_gradients(self, index: int) -> None:
+        """Bound the networks' gradients; a value that is not finite stops the fit with its name."""
+        norms = [nn.utils.clip_grad_norm_(self.groups[name], self.config.rates.clip) for name in ("pose", "deform")]
+        sums = [parameter.grad.sum() for parameter in self.model.gaussians.parameters() if parameter.grad is not None]
+        if torch.isfinite(torch.stack(norms + sums)).all():
+            return
+        for name, parameter in self.model.named_parameters():
+            if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
+                raise FloatingPointError(f"iteration {index}: the gradient of '{name}' is not finite")
+
+    def _densify(self, index: int) -> None:
+        config, total = self.config.density, self.config.iterations
+        every = max(1, round(config.every * total))
+        if config.start * total <= index < config.end * total and (index + 1) % every == 0:
+            self.density.round(self.model.gaussians, self.gaussian_optimizer, self.generator)
+            self.near = None
+
+    def state(self) -> dict[str, Any]:
+        """Everything that a resumed run needs beside the generator."""
+        return {
+            "model": self.model.state_dict(),
+            "gaussian_optimizer": self.gaussian_optimizer.state_dict(),
+            "network_optimizer": self.network_optimizer.state_dict(),
+            "density": [self.density.gradient, self.density.seen, self.density.radius],
+            "near": self.near,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state`; the number of Gaussians may differ from the present one."""
+        saved = {name: state["model"][f"gaussians.{name}"] for name in NAMES}
+        for group, name in zip(self.gaussian_optimizer.param_groups, NAMES, strict=True):
+            parameter = nn.Parameter(saved[name].to(self.model.pivots.device).clone())
+            setattr(self.model.gaussians, name, parameter)
+            group["params"] = [parameter]
+        self.model.load_state_dict(state["model"])
+        self.gaussian_optimizer.load_state_dict(state["gaussian_optimizer"])
+        self.network_optimizer.load_state_dict(state["network_optimizer"])
+        device = self.model.pivots.device
+        self.density.gradient, self.density.seen, self.density.radius = (
+            part.to(device).clone() for part in state["density"]
+        )
+        self.near = state["near"]
+
+
+def train(
+    clip: Clip, prior: Prior, config: Config, seed: int, device: torch.device, log: Log, workdir: Path | None
+) -> Model:
+    """Fit the model to a clip.
+
+    Args:
+        clip: the frames.
+        prior: a start.
+        config: every choice.
+        seed: of the one generator.
+        device: where to compute.
+        log: progress over both stages.
+        workdir: where checkpoints go; a checkpoint of the same fit there is continued.
+
+    Returns:
+        The trained model.
+
+    Raises:
+        UserError: the clip or the prior cannot be used.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    supervision = Supervision(clip, prior, config.image_size, device)
+    small = Supervision(clip, prior, min(config.image_size, config.warmup.size), device)
+    model = build_model(config, prior, generator).to(device)
+    warmup = WarmUp(model, small, prior, config, generator)
+    main = Training(model, supervision, config, generator)
+    identity = fit_digest(config, clip, prior, seed)
+    saved = _resume(workdir, identity)
+    start = 0
+    if saved is not None:
+        start = saved["step"]
+        main.restore(saved["main"])
+        warmup.optimizer.load_state_dict(saved["warmup"])
+        generator.set_state(saved["generator"])
+    total = warmup.total + config.iterations
+    for index in range(start, total):
+        if index == warmup.total:
+            model.gaussians.colors.data = initial_colors(model, supervision)
+        step: Callable[[], dict[str, float]] = (
+            (lambda i=index: warmup.step(i)) if index < warmup.total else (lambda i=index: main.step(i - warmup.total))
+        )
+        figures = step()
+        if index % LOG_EVERY == 0 or index + 1 == total:
+            log(index + 1, total, figures)
+        if workdir is not None and (index + 1) % config.checkpoint_every == 0 and index + 1 < total:
+            state = {
+                "step": index + 1, "main": main.state(), "warmup": warmup.optimizer.state_dict(), "generator": generator.get_state(),
+            }  # fmt: skip
+            save_checkpoint(workdir, identity, state)
+    return model
+
+
+def _resume(workdir: Path | None, identity: str) -> dict[str, Any] | None:
+    if workdir is None:
+        return None
+    saved, message = load_checkpoint(workdir, identity)
+    if message:
+        logger.warning(message)
+    return saved

@@ -1,0 +1,159 @@
+"""Regularisers: total variation of the skinning field, compact parts, smooth normals, and a skeleton's own."""
+
+import math
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn.functional import huber_loss, normalize
+
+from rewild4d.ours.deform import Posed
+from rewild4d.ours.pose import Pose, aligned
+from rewild4d.rasterizer import rasterize
+from rewild4d.transforms import look_at, quat_multiply, quat_to_matrix
+from rewild4d.types import OBJECT_DIAGONAL
+
+
+def tv_loss(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
+    """L_tv: mean over the axes of the mean Huber function of forward differences.
+
+    Args:
+        probabilities: of the field, x slowest, [R^3, J].
+        resolution: R.
+        delta: x^2 / 2 inside, delta (|x| - delta / 2) outside.
+    """
+    grid = probabilities.view(resolution, resolution, resolution, -1)
+    terms = [
+        huber_loss(grid.narrow(axis, 1, resolution - 1), grid.narrow(axis, 0, resolution - 1), delta=delta)
+        for axis in range(3)
+    ]
+    return torch.stack(terms).mean()
+
+
+def compact_loss(points: Tensor, weights: Tensor, opacities: Tensor, power: float) -> Tensor:
+    """L_compact: mean over parts of the two smaller eigenvalues of a part's covariance.
+
+    They are tr C - v^T C v with v the top eigenvector of the detached C: exactly the eigenvalues' gradient, and defined
+    where the two coincide. Parts of mass below 1 are skipped; weights and opacities are taken as given, otherwise the
+    weights would move to cut the loss.
+
+    Args:
+        points: [n, 3].
+        weights: skinning weights, [n, J].
+        opacities: [n].
+        power: exponent on the weights.
+    """
+    mass = weights.detach() ** power * opacities.detach()[:, None]
+    total = mass.sum(0)
+    mass, total = mass[:, total >= 1], total[total >= 1]
+    if len(total) == 0:
+        return points.sum() * 0.0
+    share = mass / total
+    center = share.T @ points
+    outer = (points[:, :, None] * points[:, None, :]).flatten(1)
+    covariance = (share.T @ outer).view(-1, 3, 3) - center[:, :, None] * center[:, None, :]
+    top = torch.linalg.eigh(covariance.detach())[1][..., -1]
+    trace = covariance.diagonal(dim1=1, dim2=2).sum(-1)
+    return (trace - torch.einsum("ja,jab,jb->j", top, covariance, top)).mean()
+
+
+def smooth_loss(posed: Posed, opacities: Tensor, size: int, generator: torch.Generator) -> Tensor:
+    """L_smooth: neighbouring pixels of a rendered normal map agree, from a random viewpoint around the animal.
+
+    A Gaussian's normal is the axis of its smallest scale, turned towards the camera before blending. Only the normals
+    get gradients; the blending weights and the mattes are constants.
+
+    Args:
+        posed: deformed Gaussians.
+        opacities: [n].
+        size: side of the image, pixels.
+        generator: draws azimuth in [0, 360) and elevation in [-10, 60) degrees.
+    """
+    means = posed.means.detach()
+    azimuth, elevation = torch.rand(2, generator=generator).tolist()
+    azimuth, elevation = 2 * math.pi * azimuth, math.radians(-10 + 70 * elevation)
+    direction = (math.cos(elevation) * math.sin(azimuth), math.sin(elevation), math.cos(elevation) * math.cos(azimuth))
+    center = means.mean(0)
+    # Focal length 2 sides and a distance of 2.4 diagonals show the whole animal from every side.
+    eye = center + 2.4 * OBJECT_DIAGONAL * means.new_tensor(direction)
+    world_to_camera = look_at(eye, center, means.new_tensor((0.0, 1.0, 0.0)))
+    focal = means.new_tensor(((2.0 * size, 0, size / 2), (0, 2.0 * size, size / 2), (0, 0, 1)))
+    normals = quat_to_matrix(posed.quats).gather(
+        -1, posed.log_scales.detach().argmin(-1)[:, None, None].expand(-1, 3, 1)
+    )[..., 0]
+    towards = ((eye - means) * normals.detach()).sum(-1, keepdim=True)
+    normals = torch.where(towards < 0, -normals, normals)
+    image, alpha, _ = rasterize(
+        means, posed.quats.detach(), posed.log_scales.detach().exp(), opacities.detach(), normals,
+        world_to_camera[None], focal[None], size, size,
+    )  # fmt: skip
+    field, matte = normalize(image[0], dim=0), alpha[0, 0].detach()
+    total, mass = means.new_zeros(()), means.new_zeros(())
+    for axis in (0, 1):
+        length = size - 1
+        agree = (field.narrow(axis + 1, 1, length) * field.narrow(axis + 1, 0, length)).sum(0).abs()
+        both = matte.narrow(axis, 1, length) * matte.narrow(axis, 0, length)
+        total, mass = total + (both * (1 - agree)).sum(), mass + both.sum()
+    return total / mass.clamp_min(1.0)
+
+
+def limit_loss(pose: Pose, parents: Tensor, degrees: float) -> Tensor:
+    """Mean squared excess of cos(half the angle between a bone and its parent) below that of ``degrees``."""
+    has_parent = parents >= 0
+    own, above = pose.quats[:, has_parent], pose.quats[:, parents[has_parent]]
+    relative = (own * above).sum(-1).abs()
+    return (math.cos(math.radians(degrees) / 2) - relative).clamp_min(0).square().mean()
+
+
+def attach_loss(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
+    """Mean squared gap between a joint and its parent's copy of it, over the squared diagonal.
+
+    Args:
+        transforms: rest -> posed, [B, J, 4, 4].
+        pivots: [J, 3].
+        parents: -1 for a root, [J].
+    """
+    has_parent = parents >= 0
+    pivot = torch.nn.functional.pad(pivots[has_parent], (0, 1), value=1.0)[..., None]
+    own, above = transforms[:, has_parent] @ pivot, transforms[:, parents[has_parent]] @ pivot
+    return (own - above).square().sum((-1, -2)).mean() / OBJECT_DIAGONAL**2
+
+
+def temporal_loss(pose: Pose) -> Tensor:
+    """Mean squared second difference of rotations and shifts over triples of neighbouring frames, batch of 3 k poses."""
+    quats, shifts = pose.quats.unflatten(0, (-1, 3)), pose.shifts.unflatten(0, (-1, 3))
+    middle = quats[:, 1]
+    bend = aligned(quats[:, 0], middle) + aligned(quats[:, 2], middle) - 2 * middle
+    swerve = (shifts[:, 0] + shifts[:, 2] - 2 * shifts[:, 1]) / OBJECT_DIAGONAL
+    return bend.square().sum(-1).mean() + swerve.square().sum(-1).mean()
+
+
+def neighbours(points: Tensor, count: int) -> Tensor:
+    """Indices of the nearest other points, [n, 3] -> [n, count]."""
+    place = points.detach().cpu().double().numpy()
+    _, index = cKDTree(place).query(place, k=count + 1)
+    return torch.from_numpy(np.ascontiguousarray(index[:, 1:]))
+
+
+def rigid_loss(canonical: Tensor, deformed: Tensor, near: Tensor) -> Tensor:
+    """As isometric as possible: mean change of distance between canonical neighbours.
+
+    Args:
+        canonical: [n, 3], a constant here.
+        deformed: [n, 3].
+        near: from `neighbours`, [n, k].
+    """
+    rest = (canonical.detach()[:, None] - canonical.detach()[near]).norm(dim=-1)
+    moved = ((deformed[:, None] - deformed[near]).square().sum(-1) + 1e-12).sqrt()
+    return (moved - rest).abs().mean()
+
+
+def relative_turn(quats: Tensor, parents: Tensor) -> Tensor:
+    """Rotation of each bone against its parent in degrees (against rest for a root), [..., J, 4] -> [..., J]."""
+    conjugate = quats * quats.new_tensor((1.0, -1.0, -1.0, -1.0))
+    above = torch.where(
+        (parents >= 0)[:, None], conjugate[..., parents.clamp_min(0), :], quats.new_tensor((1.0, 0, 0, 0))
+    )
+    relative = quat_multiply(above, quats)
+    return torch.rad2deg(2 * torch.atan2(relative[..., 1:].norm(dim=-1), relative[..., 0].abs()))

@@ -1,0 +1,103 @@
+"""Image losses of one view, each a sum over pixels divided by the area of the animal's box.
+
+Outside the union of both silhouettes render and target are the same background, so everything is computed on a crop and
+is exactly what the whole frame would give.
+"""
+
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from rewild4d.ours.symmetry import Target
+
+WINDOW, SIGMA = 11, 1.5
+"""SSIM's Gaussian window (pixels)."""
+C1, C2 = 0.01**2, 0.03**2
+"""SSIM's constants for images in [0, 1]."""
+
+Window = tuple[slice, slice]
+
+
+def union_window(alphas: list[Tensor], margin: int) -> Window:
+    """Rows and columns that hold every pixel where any matte is above zero, and a margin, clipped to the image.
+
+    Args:
+        alphas: mattes of one size, [1, h, w].
+        margin: pixels.
+    """
+    with torch.no_grad():
+        union = torch.stack([alpha[0] for alpha in alphas]).amax(0) > 0
+    slices = []
+    for axis in (1, 0):
+        line = union.any(dim=axis).nonzero()
+        first, last = (int(line[0]), int(line[-1])) if len(line) else (0, 0)
+        slices.append(slice(max(0, first - margin), min(union.shape[1 - axis], last + 1 + margin)))
+    return slices[0], slices[1]
+
+
+def silhouette_loss(alpha: Tensor, target: Target, window: Window) -> Tensor:
+    """BCE + Dice of a rendered matte, alpha [1, h, w] clamped at 1e-5, Dice smoothing 1; scalar."""
+    rendered, truth = alpha[:, *window], target.mask[:, *window]
+    inside = rendered.clamp(1e-5, 1 - 1e-5)
+    bce = -(truth * inside.log() + (1 - truth) * (1 - inside).log()).sum() / target.side**2
+    dice = 1 - (2 * (rendered * truth).sum() + 1) / (rendered.sum() + truth.sum() + 1)
+    return bce + dice
+
+
+def colour_losses(
+    rgb: Tensor, alpha: Tensor, target: Target, background: Tensor, window: Window
+) -> tuple[Tensor, Tensor]:
+    """L1 and 1 - SSIM of render and target over one background colour.
+
+    Args:
+        rgb: rendered colour, premultiplied, [3, h, w].
+        alpha: rendered matte, [1, h, w].
+        target: the image.
+        background: RGB, [3].
+        window: holds both silhouettes with a margin of at least 10 pixels, where the image has room.
+
+    Returns:
+        Two scalars.
+    """
+    behind = background[:, None, None]
+    x = rgb[:, *window] + (1 - alpha[:, *window]) * behind
+    y = target.rgb[:, *window] + (1 - target.mask[:, *window]) * behind
+    area = 3 * target.side**2
+    return (x - y).abs().sum() / area, (1 - ssim_map(x, y)[:, *_inner(window, alpha)]).sum() / area
+
+
+def _inner(window: Window, alpha: Tensor) -> Window:
+    """The part of a window where SSIM sees no false border: five pixels in, but to the image's own edge."""
+    half = WINDOW // 2
+    inner = []
+    for part, length in zip(window, alpha.shape[1:], strict=True):
+        low = half if part.start > 0 else 0
+        high = (part.stop - part.start) - (half if part.stop < length else 0)
+        inner.append(slice(low, high))
+    return inner[0], inner[1]
+
+
+def ssim_map(x: Tensor, y: Tensor) -> Tensor:
+    """SSIM per pixel with zero padding, window 11, sigma 1.5 (3DGS's loss), [c, h, w] each.
+
+    The window is separable, so the five means are products with two banded matrices.
+    """
+    channels, height, width = x.shape
+    stacked = torch.cat((x, y, x * x, y * y, x * y))
+    blurred = (
+        blur_matrix(height, SIGMA, WINDOW // 2, x.device) @ stacked @ blur_matrix(width, SIGMA, WINDOW // 2, x.device).T
+    )
+    mean_x, mean_y, xx, yy, xy = blurred.split(channels)
+    product, squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
+    return ((2 * product + C1) * (2 * (xy - product) + C2)) / ((squares + C1) * (xx + yy - squares + C2))
+
+
+@cache
+def blur_matrix(size: int, sigma: float, radius: int, device: torch.device) -> Tensor:
+    """Banded matrix that convolves a column of ``size`` pixels with a normalised Gaussian, zero padding, [size, size]."""
+    place = torch.arange(size, dtype=torch.float64)
+    offset = place[:, None] - place
+    kernel = torch.exp(-(torch.arange(-radius, radius + 1, dtype=torch.float64) ** 2) / (2 * sigma**2)).sum()
+    band = torch.exp(-(offset**2) / (2 * sigma**2)) * (offset.abs() <= radius) / kernel
+    return band.float().to(device)

@@ -1,0 +1,40 @@
+"""`ours` as a competitor: the contract around the fit."""
+
+from pathlib import Path
+from typing import ClassVar
+
+import torch
+
+from rewild4d.contracts import Log, MethodInfo
+from rewild4d.ours.config import Config
+from rewild4d.ours.fit import train
+from rewild4d.ours.reconstruction import OursReconstruction, from_fit, load_reconstruction
+from rewild4d.ours.symmetry import match_times
+from rewild4d.types import Clip, Prior
+
+
+class Ours:
+    """Part-aware canonical Gaussians with mirrored supervision (contracts.Method)."""
+
+    info: ClassVar[MethodInfo] = MethodInfo(title="Ours", paper="this project's design", licence="MIT")
+    Config: ClassVar[type[Config]] = Config
+
+    def fit(
+        self,
+        clip: Clip,
+        prior: Prior,
+        *,
+        config: Config,
+        seed: int,
+        device: torch.device,
+        log: Log,
+        workdir: Path | None,
+    ) -> OursReconstruction:
+        """Reconstruct from the clip and the prior; see contracts.Method."""
+        rows = match_times(clip, prior)
+        model = train(clip, prior, config, seed, device, log, workdir)
+        return from_fit(model, config, clip, prior, rows)
+
+    def load(self, folder: Path, device: torch.device) -> OursReconstruction:
+        """Read back a saved reconstruction."""
+        return load_reconstruction(folder, device)

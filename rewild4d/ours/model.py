@@ -1,0 +1,106 @@
+"""Everything that learns, in one module, and the two branches that use it."""
+
+import torch
+from torch import Tensor, nn
+
+from rewild4d.ours.canonical import Gaussians, initial_gaussians
+from rewild4d.ours.config import Config
+from rewild4d.ours.deform import DeformNetwork, Posed
+from rewild4d.ours.pose import Pose, PoseNetwork, joint_transforms, time_code
+from rewild4d.ours.skinning import SkinningField, build_field
+from rewild4d.ours.symmetry import Key
+from rewild4d.transforms import skin_points, skin_quats
+from rewild4d.types import Prior
+
+
+class Model(nn.Module):
+    """Canonical Gaussians, skinning field, pose network and deformation network, in the object frame.
+
+    Attributes:
+        pivots: inner end of each bone at rest, [J, 3].
+        mirror: bone on the other side, [J].
+        parents: -1 for a root, [J].
+    """
+
+    pivots: Tensor
+    mirror: Tensor
+    parents: Tensor
+
+    def __init__(
+        self,
+        config: Config,
+        gaussians: Gaussians,
+        field: SkinningField,
+        pivots: Tensor,
+        parents: Tensor,
+        mirror: Tensor,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.gaussians, self.field = gaussians, field
+        self.network = PoseNetwork(len(parents), config.pose, generator)
+        self.deform = DeformNetwork(config.pose.anchor_size, config.pose.width, config.deform, generator)
+        self.register_buffer("pivots", pivots)
+        self.register_buffer("mirror", mirror)
+        self.register_buffer("parents", parents)
+
+    def pose(self, times: Tensor, keys: list[Key]) -> Pose:
+        """Poses of views at (possibly jittered) times (i + 1) / T, [B]; mirror images of one pose where tied."""
+        pose_config = self.config.pose
+        view = torch.tensor([float(key.view) for key in keys])
+        group = torch.tensor([float(key.group) for key in keys])
+        if not pose_config.tied:
+            return self.network(
+                time_code(times, group, view, pose_config.frequencies, pose_config.explicit_group).to(self.pivots)
+            )
+        ones = torch.ones_like(view)
+        pose = self.network(
+            time_code(times, ones, ones, pose_config.frequencies, pose_config.explicit_group).to(self.pivots)
+        )
+        flipped = pose.mirrored(self.mirror)
+        pick = (view > 0).to(self.pivots.device)[:, None, None]
+        return Pose(*(torch.where(pick, plain, other) for plain, other in zip(pose, flipped, strict=True)))
+
+    def transforms(self, pose: Pose) -> Tensor:
+        """Rest -> posed transforms of a batch of poses, [B, J, 4, 4]."""
+        return joint_transforms(pose.quats, pose.shifts, self.pivots)
+
+    def skin(self, weights: Tensor, quats: Tensor, transforms: Tensor) -> Posed:
+        """Blended skinning of the canonical Gaussians.
+
+        Args:
+            weights: of each Gaussian, [n, J].
+            quats: rotation of each joint, [J, 4].
+            transforms: rest -> posed, [J, 4, 4].
+        """
+        own = self.gaussians
+        rest = nn.functional.normalize(own.quats, dim=-1)
+        return Posed(skin_points(own.means, weights, transforms), skin_quats(rest, weights, quats), own.scales_log())
+
+    def deformed(self, pose: Pose, weights: Tensor, strength: float) -> tuple[Posed, Posed]:
+        """The appearance branch: skinned by a detached pose, then deformed.
+
+        Args:
+            pose: of one code.
+            weights: of each Gaussian, [n, J].
+            strength: of the deformation, in [0, 1].
+
+        Returns:
+            Skinned and deformed Gaussians.
+        """
+        quats, shifts = pose.quats[0].detach(), pose.shifts[0].detach()
+        posed = self.skin(weights, quats, joint_transforms(quats, shifts, self.pivots))
+        if strength == 0 or not self.config.deform.enabled:
+            return posed, posed
+        features = pose.features[0].detach() if self.config.deform.detach_features else pose.features[0]
+        return posed, self.deform(features, weights.detach() @ self.network.anchors, posed, strength)
+
+
+def build_model(config: Config, prior: Prior, generator: torch.Generator) -> Model:
+    """The model at its start: Gaussians on the prior's rest surface, the field filled from its weights."""
+    vertices, faces = prior.vertices.float(), prior.faces.long()
+    values = initial_gaussians(vertices, faces, config.canonical.samples, config.canonical, generator)
+    field = build_field(vertices, prior.weights.float(), prior.mirror.long(), config.skinning)
+    skeleton = (prior.bones[:, 0].float(), prior.parents.long(), prior.mirror.long())
+    return Model(config, Gaussians(values, config.canonical.max_scale), field, *skeleton, generator)

@@ -1,0 +1,161 @@
+"""Part anchors, the symmetry-aware time code and the pose network."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from rewild4d.ours.config import Pose as PoseConfig
+from rewild4d.transforms import mirror_points, mirror_quats, quat_to_matrix, rigid
+from rewild4d.types import OBJECT_DIAGONAL
+
+
+class Pose(NamedTuple):
+    """Poses of a batch of codes.
+
+    Attributes:
+        quats: unit rotation of each joint about its pivot, w >= 0 is not guaranteed, [B, J, 4].
+        shifts: translation of each joint in the object frame, [B, J, 3].
+        features: part features F_J for the deformation network, [B, J, K].
+    """
+
+    quats: Tensor
+    shifts: Tensor
+    features: Tensor
+
+    def __getitem__(self, index: int | slice) -> "Pose":  # type: ignore[override]
+        index = slice(index, index + 1) if isinstance(index, int) else index
+        return Pose(*(tensor[index] for tensor in (self.quats, self.shifts, self.features)))
+
+    def mirrored(self, mirror: Tensor) -> "Pose":
+        """The same poses with left and right exchanged."""
+        return Pose(
+            mirror_quats(self.quats[:, mirror]), mirror_points(self.shifts[:, mirror]), self.features[:, mirror]
+        )
+
+
+def time_code(time: Tensor, group: Tensor, view: Tensor, frequencies: int, explicit_group: bool = False) -> Tensor:
+    """The symmetry-aware code emb(t m) + v (METHOD section 4): [tau, sin 2^k tau, cos 2^k tau] of tau = t m, then v.
+
+    Args:
+        time: (i + 1) / T for frame i, never zero, because both groups would get one code there, [B].
+        group: m, +1 for the sequence and -1 for its flip, [B].
+        view: v, +1 for an image and -1 for its mirror image, [B].
+        frequencies: octaves; no factor pi, which would give both groups one code at time 1.
+        explicit_group: append m.
+
+    Returns:
+        [B, 2 + 2 frequencies (+ 1)].
+    """
+    tau = (time * group)[:, None]
+    angles = tau * 2.0 ** torch.arange(frequencies, dtype=tau.dtype, device=tau.device)
+    parts = [tau, angles.sin(), angles.cos(), view.to(tau)[:, None]]
+    return torch.cat(parts + [group.to(tau)[:, None]] * explicit_group, dim=-1)
+
+
+class PoseNetwork(nn.Module):
+    """Anchors + code -> self-attention over the parts -> one rotation and translation per joint.
+
+    The head starts at zero, so every pose starts as the rest pose.
+
+    Attributes:
+        anchors: one learnable vector per part, [J, D].
+    """
+
+    def __init__(self, joints: int, config: PoseConfig, generator: torch.Generator) -> None:
+        super().__init__()
+        self.config = config
+        code = 2 + 2 * config.frequencies + config.explicit_group
+        self.anchors = nn.Parameter(config.anchor_std * torch.randn(joints, config.anchor_size, generator=generator))
+        self.embed = nn.Linear(config.anchor_size + code, config.width)
+        self.blocks = nn.ModuleList(Block(config.width, config.heads) for _ in range(config.blocks))
+        self.norm = nn.LayerNorm(config.width)
+        self.head = nn.Linear(config.width, 7)
+        seed_linears(self, generator)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+
+    def forward(self, code: Tensor) -> Pose:
+        """Poses of a batch of codes, [B, E]."""
+        batch, joints = code.shape[0], self.anchors.shape[0]
+        tokens = torch.cat((self.anchors.expand(batch, joints, -1), code[:, None].expand(batch, joints, -1)), dim=-1)
+        hidden = self.embed(tokens)
+        for block in self.blocks:
+            hidden = block(hidden)
+        features = self.norm(hidden)
+        out = self.head(features)
+        identity = out.new_tensor((1.0, 0.0, 0.0, 0.0))
+        quats = nn.functional.normalize(identity + out[..., :4], dim=-1)
+        return Pose(quats, out[..., 4:] * (self.config.reach * OBJECT_DIAGONAL), features)
+
+
+class Block(nn.Module):
+    """Pre-norm self-attention and a two-layer perceptron."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm_attention, self.norm_mlp = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.qkv, self.project = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        self.up, self.down = nn.Linear(width, 2 * width), nn.Linear(2 * width, width)
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        """[B, J, K] -> [B, J, K]."""
+        batch, joints, width = hidden.shape
+        qkv = self.qkv(self.norm_attention(hidden)).view(batch, joints, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
+        query, key, value = qkv.unbind(0)
+        scores = (query @ key.transpose(-1, -2)) * (width / self.heads) ** -0.5
+        mixed = (scores.softmax(dim=-1) @ value).transpose(1, 2).reshape(batch, joints, width)
+        hidden = hidden + self.project(mixed)
+        return hidden + self.down(nn.functional.gelu(self.up(self.norm_mlp(hidden))))
+
+
+def seed_linears(module: nn.Module, generator: torch.Generator) -> None:
+    """Draw every linear layer's weights from one generator: uniform within 1/sqrt(inputs), biases zero."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            bound = layer.in_features**-0.5
+            with torch.no_grad():
+                layer.weight.uniform_(-bound, bound, generator=generator)
+                layer.bias.zero_()
+
+
+def joint_transforms(quats: Tensor, shifts: Tensor, pivots: Tensor) -> Tensor:
+    """Rest -> posed: P_j x = R_j (x - c_j) + c_j + d_j.
+
+    Args:
+        quats: [..., J, 4].
+        shifts: d, [..., J, 3].
+        pivots: c, [J, 3].
+
+    Returns:
+        [..., J, 4, 4].
+    """
+    rotation = quat_to_matrix(quats)
+    return rigid(rotation, pivots + shifts - (rotation @ pivots[..., None])[..., 0])
+
+
+def blend_poses(pose: Pose, quats: Tensor, shifts: Tensor, weight: float) -> Pose:
+    """(1 - weight) of a pose and weight of another, blended as rotation and translation, never as matrices.
+
+    Args:
+        pose: the network's.
+        quats: the prior's, [B, J, 4].
+        shifts: the prior's, [B, J, 3].
+        weight: of the prior, in [0, 1].
+    """
+    if weight == 0:
+        return pose
+    mixed = (1 - weight) * pose.quats + weight * aligned(quats, pose.quats)
+    return Pose(nn.functional.normalize(mixed, dim=-1), (1 - weight) * pose.shifts + weight * shifts, pose.features)
+
+
+def aligned(quats: Tensor, reference: Tensor) -> Tensor:
+    """Quaternions with the sign that puts them on the reference's side, [..., 4]."""
+    return torch.where((quats * reference).sum(-1, keepdim=True) < 0, -quats, quats)
+
+
+def pose_distance(pose: Pose, quats: Tensor, shifts: Tensor) -> Tensor:
+    """Mean over joints of |q^ - q|^2 + |d^ - d|^2 / diagonal^2: how far poses are from others, scalar."""
+    turn = (pose.quats - aligned(quats, pose.quats).detach()).square().sum(-1)
+    return (turn + (pose.shifts - shifts).square().sum(-1) / OBJECT_DIAGONAL**2).mean()

@@ -1,0 +1,140 @@
+"""What a fit leaves behind: a function from time to Gaussians in the world."""
+
+from pathlib import Path
+
+import msgspec
+import torch
+from torch import Tensor, nn
+
+from rewild4d.errors import UserError
+from rewild4d.files import atomic
+from rewild4d.ours.canonical import NAMES, Gaussians
+from rewild4d.ours.config import Config
+from rewild4d.ours.geometry_losses import relative_turn
+from rewild4d.ours.model import Model
+from rewild4d.ours.motion import frame_position, interpolate_similarity
+from rewild4d.ours.pose import Pose
+from rewild4d.ours.schedule import ramp
+from rewild4d.ours.skinning import SkinningField
+from rewild4d.ours.symmetry import Key
+from rewild4d.transforms import transform_splats
+from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Prior, Splats
+
+STATE, CONFIG = "ours.pt", "config.json"
+
+
+class OursReconstruction:
+    """A trained model with the root motion and the cameras of its clip.
+
+    Attributes:
+        model: in the object frame.
+        config: what it was trained with.
+        times: of the clip's frames in seconds, float64, [T].
+        object_to_world: similarity at each frame, float64, [T, 4, 4].
+        cameras: of the frames, in the world.
+    """
+
+    def __init__(
+        self, model: Model, config: Config, times: Tensor, object_to_world: Tensor, cameras: tuple[Camera | None, ...]
+    ) -> None:
+        self.model, self.config = model.eval().requires_grad_(False), config
+        self.times, self.object_to_world, self.cameras = times, object_to_world, cameras
+        self.weights = model.field.sample(model.field.probabilities(), model.gaussians.means)
+
+    @torch.no_grad()
+    def at(self, time: float) -> Splats:
+        """The Gaussians at a time in seconds in the world frame; between frames the networks and the root interpolate."""
+        position = frame_position(self.times, time)
+        pose = self._pose(torch.tensor([position]))
+        strength = ramp(1.0, self.config.deform.ramp_start, self.config.deform.ramp_end)
+        _, moved = self.model.deformed(pose, self.weights, strength)
+        own = self.model.gaussians
+        quats = nn.functional.normalize(moved.quats, dim=-1)
+        posed = Splats(moved.means, quats, moved.log_scales.exp(), own.opacities(), own.rgb()[:, None])
+        return transform_splats(posed, interpolate_similarity(self.object_to_world, position).to(moved.means.device))
+
+    def camera(self, time: float) -> Camera | None:
+        """The input camera of the frame nearest to a time, in the world frame."""
+        return self.cameras[round(frame_position(self.times, time))]
+
+    def canonical(self) -> Splats:
+        """The Gaussians at rest, in the object frame; `weights` [n, J] belong to the same rows."""
+        return self.model.gaussians.splats()
+
+    @torch.no_grad()
+    def diagnostics(self) -> dict[str, float | list[float]]:
+        """Figures that show silent failures: per joint, how far it turns and moves and whether that changes over time.
+
+        Returns:
+            Angles against the parent in degrees and shifts over the rest diagonal (mean and standard deviation over the
+            frames, a list over the joints), the number of Gaussians and their mean opacity.
+        """
+        pose = self._pose(torch.arange(len(self.times), dtype=torch.float32))
+        angles = relative_turn(pose.quats, self.model.parents)
+        shifts = pose.shifts.norm(dim=-1) / OBJECT_DIAGONAL
+        lists = {
+            "joint_angle_mean": angles.mean(0), "joint_angle_std": angles.std(0, correction=0),
+            "joint_shift_mean": shifts.mean(0), "joint_shift_std": shifts.std(0, correction=0),
+        }  # fmt: skip
+        figures: dict[str, float | list[float]] = {
+            name: [round(x, 4) for x in value.tolist()] for name, value in lists.items()
+        }
+        return figures | {
+            "gaussians": float(len(self.model.gaussians)),
+            "opacity_mean": float(self.model.gaussians.opacities().mean()),
+        }
+
+    def save(self, folder: Path) -> None:
+        """Write the state and the config into an existing, empty folder."""
+        cameras = [
+            None if camera is None
+            else {"world_to_camera": camera.world_to_camera, "intrinsics": camera.intrinsics, "size": [camera.width, camera.height]}
+            for camera in self.cameras
+        ]  # fmt: skip
+        state = {
+            "model": self.model.state_dict(), "times": self.times, "object_to_world": self.object_to_world, "cameras": cameras,
+        }  # fmt: skip
+        with atomic(folder / STATE) as path:
+            torch.save(state, path)
+        with atomic(folder / CONFIG) as path:
+            path.write_bytes(msgspec.json.format(msgspec.json.encode(self.config), indent=2))
+
+    def _pose(self, positions: Tensor) -> Pose:
+        times = (positions.float() + 1) / len(self.times)
+        return self.model.pose(times, [Key(1, 1, 0)] * len(positions))
+
+
+def from_fit(model: Model, config: Config, clip: Clip, prior: Prior, rows: list[int]) -> OursReconstruction:
+    """The reconstruction of a clip; ``rows`` are the prior's rows of its frames."""
+    times = torch.tensor(clip.times, dtype=torch.float64)
+    cameras = tuple(frame.camera for frame in clip.frames)
+    return OursReconstruction(model, config, times, prior.object_to_world[rows].double(), cameras)
+
+
+def load_reconstruction(folder: Path, device: torch.device) -> OursReconstruction:
+    """Read back what `OursReconstruction.save` wrote.
+
+    Raises:
+        UserError: a file is missing or is not what `save` writes.
+    """
+    for name in (STATE, CONFIG):
+        if not (folder / name).is_file():
+            raise UserError(f"{folder}: expected a reconstruction by 'ours', but it has no {name}.")
+    try:
+        config = msgspec.json.decode((folder / CONFIG).read_bytes(), type=Config)
+        state = torch.load(folder / STATE, map_location="cpu", weights_only=True)
+    except (msgspec.MsgspecError, RuntimeError, EOFError, ValueError) as error:
+        raise UserError(f"{folder}: expected a reconstruction by 'ours', but it cannot be read ({error}).") from error
+    saved = state["model"]
+    gaussians = Gaussians({name: saved[f"gaussians.{name}"] for name in NAMES}, config.canonical.max_scale)
+    field = SkinningField(
+        *(saved[f"field.{name}"] for name in ("logits", "origin", "pitch", "mirror")), config.skinning.tied
+    )
+    skeleton = (saved["pivots"], saved["parents"], saved["mirror"])
+    model = Model(config, gaussians, field, *skeleton, torch.Generator().manual_seed(0))
+    model.load_state_dict(saved)
+    cameras = tuple(
+        None if item is None else Camera(item["world_to_camera"], item["intrinsics"], *item["size"])
+        for item in state["cameras"]
+    )
+    return OursReconstruction(model.to(device), config, state["times"], state["object_to_world"], cameras)

@@ -1,0 +1,111 @@
+"""The learnable skinning field: a voxel grid of logits, sampled trilinearly as probabilities."""
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from rewild4d.ours.config import Skinning
+
+
+class SkinningField(nn.Module):
+    """Skinning weights everywhere in a cube around the rest shape (METHOD section 3).
+
+    Trilinear mixtures of points of the simplex stay on the simplex, so sampled weights always sum to one.
+
+    Attributes:
+        logits: one row per voxel, x slowest, [R^3, J].
+    """
+
+    logits: nn.Parameter
+    origin: Tensor
+    pitch: Tensor
+    flipped: Tensor
+
+    def __init__(self, logits: Tensor, origin: Tensor, pitch: Tensor, mirror: Tensor, tied: bool) -> None:
+        super().__init__()
+        self.resolution = round(logits.shape[0] ** (1 / 3))
+        self.tied = tied
+        self.logits = nn.Parameter(logits.float().contiguous())
+        self.register_buffer("origin", origin.float())
+        self.register_buffer("pitch", pitch.float())
+        self.register_buffer("mirror", mirror)
+        rows = torch.arange(self.resolution**3).view(self.resolution, -1).flip(0).reshape(-1)
+        self.register_buffer("flipped", rows, persistent=False)
+
+    mirror: Tensor
+
+    def probabilities(self) -> Tensor:
+        """Weights of every voxel, [R^3, J]."""
+        logits = self.logits
+        if self.tied:
+            logits = 0.5 * (logits + logits[self.flipped][:, self.mirror])
+        return logits.softmax(dim=-1)
+
+    def sample(self, probabilities: Tensor, points: Tensor) -> Tensor:
+        """Weights of points; outside the cube the nearest border counts.
+
+        Args:
+            probabilities: from `probabilities`, [R^3, J].
+            points: in the object frame, no gradient flows to them, [n, 3].
+
+        Returns:
+            Rows on the simplex, [n, J].
+        """
+        last = self.resolution - 1
+        place = ((points.detach() - self.origin) / self.pitch).clamp(0, last)
+        base = place.floor().clamp(max=last - 1)
+        part = place - base
+        x, y, z = (torch.stack((1 - part[:, axis], part[:, axis]), dim=-1) for axis in range(3))
+        factors = torch.einsum("na,nb,nc->nabc", x, y, z).flatten(1)
+        step = torch.tensor((self.resolution**2, self.resolution, 1), device=points.device)
+        corners = torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3)
+        rows = ((base.long()[:, None] + corners) * step).sum(-1)
+        return nn.functional.embedding_bag(rows, probabilities, per_sample_weights=factors, mode="sum")
+
+
+def build_field(vertices: Tensor, weights: Tensor, mirror: Tensor, config: Skinning) -> SkinningField:
+    """Spread the prior's skinning weights over a cube around its rest shape.
+
+    Per voxel the inverse-distance mean of the nearest vertices' weights, then sweeps of neighbour averaging.
+
+    Args:
+        vertices: rest shape, [n, 3].
+        weights: rows sum to one, [n, J].
+        mirror: the bone on the other side of each bone, [J].
+        config: resolution and fill.
+
+    Returns:
+        The field at its start.
+    """
+    low, high = vertices.amin(0), vertices.amax(0)
+    half = config.margin * 0.5 * (high - low).max()
+    center = 0.5 * (low + high)
+    # The cube is centred on the symmetry plane, so that flipping rows is exactly the mirror.
+    center = center * center.new_tensor((0.0, 1.0, 1.0))
+    half = torch.maximum(half, vertices[:, 0].abs().max())
+    size = config.resolution
+    pitch = 2 * half / (size - 1)
+    ticks = torch.arange(size, dtype=torch.float64) * pitch.double()
+    grid = torch.cartesian_prod(ticks, ticks, ticks) + (center - half).double()
+    count = min(config.neighbours, len(vertices))
+    distance, nearest = cKDTree(vertices.double().numpy()).query(grid.numpy(), k=count)
+    influence = 1.0 / np.clip(distance.reshape(-1, count), 1e-4, 1.0)
+    influence /= influence.sum(-1, keepdims=True)
+    start = np.einsum("vk,vkj->vj", influence, weights.double().numpy()[nearest.reshape(-1, count)])
+    spread = _sweep(torch.from_numpy(start).view(size, size, size, -1), config)
+    logits = (spread.reshape(size**3, -1) + config.floor).log()
+    return SkinningField(logits, center - half, pitch.expand(3), mirror, config.tied)
+
+
+def _sweep(field: Tensor, config: Skinning) -> Tensor:
+    """Average each voxel with its six neighbours (itself beyond the border), rows kept on the simplex, [R, R, R, J]."""
+    for _ in range(config.sweeps):
+        total = torch.zeros_like(field)
+        for axis in range(3):
+            ahead = torch.cat((field.narrow(axis, 1, field.shape[axis] - 1), field.narrow(axis, -1, 1)), dim=axis)
+            behind = torch.cat((field.narrow(axis, 0, 1), field.narrow(axis, 0, field.shape[axis] - 1)), dim=axis)
+            total = total + ahead + behind
+        field = config.keep * field + (1 - config.keep) / 6 * total
+        field = field / field.sum(-1, keepdim=True)
+    return field

@@ -1,0 +1,144 @@
+"""The two mirrored supervision groups: which image, camera and prior pose go with (m, v, t) (METHOD section 6)."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from rewild4d.errors import UserError
+from rewild4d.transforms import matrix_to_quat, mirror_camera
+from rewild4d.types import Camera, Clip, Prior
+
+SIGNS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+"""(m, v): group of the sequence or of its flip, image or mirror image."""
+
+
+class Key(NamedTuple):
+    """Names one supervised view: group m, image sign v, index of the frame."""
+
+    group: int
+    view: int
+    frame: int
+
+
+@dataclass(frozen=True)
+class Target:
+    """What one view is compared with.
+
+    Attributes:
+        rgb: premultiplied, [3, h, w].
+        mask: [1, h, w].
+        camera: in the object frame.
+        side: side of a padded square box around the animal, pixels; image losses are sums over this square's area,
+            so that the frame's margins do not change a weight.
+    """
+
+    rgb: Tensor
+    mask: Tensor
+    camera: Camera
+    side: float
+
+
+class Supervision:
+    """All mirrored views of a clip with the prior's poses, on one device.
+
+    Attributes:
+        frames: number of frames T.
+        prior_quats: rotation of each joint, for v = +1 and v = -1, [2, T, J, 4].
+        prior_shifts: translation about the rest pivot, [2, T, J, 3].
+    """
+
+    def __init__(self, clip: Clip, prior: Prior, size: int, device: torch.device) -> None:
+        rows = match_times(clip, prior)
+        self.frames = len(clip.frames)
+        self._targets: dict[Key, Target] = {}
+        for index, (frame, row) in enumerate(zip(clip.frames, rows, strict=True)):
+            rgb, mask = (_reduced(image, size).to(device) for image in (frame.rgb, frame.mask))
+            plain = _check_camera(prior.cameras[row], frame.mask).resized(mask.shape[2], mask.shape[1])
+            flip = _check_camera(prior.cameras_flip[row], frame.mask).resized(mask.shape[2], mask.shape[1])
+            side = animal_side(mask, clip.name, index)
+            image, mirrored = (rgb, mask), (rgb.flip(-1), mask.flip(-1))
+            choices = {
+                (1, 1): (image, plain),
+                (1, -1): (mirrored, mirror_camera(plain)),
+                (-1, 1): (image, mirror_camera(flip)),
+                (-1, -1): (mirrored, flip),
+            }
+            for (group, view), ((colour, matte), camera) in choices.items():
+                self._targets[Key(group, view, index)] = Target(colour.contiguous(), matte.contiguous(), camera, side)
+        chosen = torch.stack((prior.transforms[rows], prior.transforms_flip[rows])).float()
+        pivots = prior.bones[:, 0].float()
+        self.prior_quats = matrix_to_quat(chosen[..., :3, :3]).to(device)
+        moved = (chosen[..., :3, :3] @ pivots[..., None])[..., 0] + chosen[..., :3, 3]
+        self.prior_shifts = (moved - pivots).to(device)
+
+    def target(self, key: Key) -> Target:
+        """Image, matte and camera of one view."""
+        return self._targets[key]
+
+    def prior_pose(self, keys: list[Key]) -> tuple[Tensor, Tensor]:
+        """The prior's poses of views: P for v = +1 and P_flip for v = -1, whatever m; [B, J, 4] and [B, J, 3]."""
+        side = torch.tensor([int(key.view < 0) for key in keys])
+        frame = torch.tensor([key.frame for key in keys])
+        return self.prior_quats[side, frame], self.prior_shifts[side, frame]
+
+    def draw(self, generator: torch.Generator) -> Key:
+        """One view: the group first, then a frame of it, then one of its two images, each uniformly."""
+        group, frame, view = (int(torch.randint(count, (), generator=generator)) for count in (2, self.frames, 2))
+        return Key(1 - 2 * group, 1 - 2 * view, frame)
+
+
+def match_times(clip: Clip, prior: Prior) -> list[int]:
+    """Row of the prior for each frame of the clip.
+
+    Raises:
+        UserError: fewer than two frames, or a frame the prior does not know.
+    """
+    if len(clip.frames) < 2:
+        raise UserError(f"{clip.name}: expected a clip of at least 2 frames, got {len(clip.frames)}.")
+    rows = []
+    for index, time in enumerate(clip.times):
+        distance = (prior.times - time).abs()
+        row = int(distance.argmin())
+        if float(distance[row]) > 0.25 / clip.fps:
+            raise UserError(
+                f"{clip.name}: expected a prior that knows frame {index} at {time:.3f} s, "
+                f"but prior '{prior.name}' covers {float(prior.times.min()):.3f} to {float(prior.times.max()):.3f} s "
+                f"and comes no closer than {float(distance[row]):.3f} s."
+            )
+        rows.append(row)
+    return rows
+
+
+def animal_side(mask: Tensor, name: str, index: int) -> float:
+    """Side of the square box around the animal, padded by 15 % each way, pixels.
+
+    Raises:
+        UserError: the mask is empty.
+    """
+    rows, columns = (mask[0] > 0.5).nonzero().unbind(1)
+    if len(rows) == 0:
+        raise UserError(f"{name}: expected an animal in every frame, but the mask of frame {index} is empty.")
+    extent = max(int(rows.max() - rows.min()), int(columns.max() - columns.min())) + 1
+    return 1.3 * extent
+
+
+def _reduced(image: Tensor, size: int) -> Tensor:
+    """The image with its longest side at most ``size``, area-averaged, [c, h, w]."""
+    height, width = image.shape[1:]
+    if max(height, width) <= size:
+        return image.float()
+    scale = size / max(height, width)
+    shape = (max(1, round(height * scale)), max(1, round(width * scale)))
+    return interpolate(image[None].float(), shape, mode="area")[0]
+
+
+def _check_camera(camera: Camera, mask: Tensor) -> Camera:
+    if (camera.height, camera.width) != tuple(mask.shape[1:]):
+        raise UserError(
+            f"the prior's cameras are for images of {camera.width}x{camera.height} pixels, "
+            f"but the clip's are {mask.shape[2]}x{mask.shape[1]}."
+        )
+    return camera

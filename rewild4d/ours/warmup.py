@@ -1,0 +1,101 @@
+"""The pose warm-up: poses from blurred silhouettes while the Gaussians are frozen (METHOD section 11.3).
+
+Gaussians under a pixel give silhouette gradients that are too local to move a limb; a blur that shrinks with time does.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from rewild4d.ours.canonical import sample_surface
+from rewild4d.ours.config import Config
+from rewild4d.ours.losses import blur_matrix
+from rewild4d.ours.model import Model
+from rewild4d.ours.pose import pose_distance
+from rewild4d.ours.skeleton import neighbour_keys, skeleton_losses
+from rewild4d.ours.symmetry import Key, Supervision
+from rewild4d.rasterizer import rasterize
+from rewild4d.transforms import skin_points
+from rewild4d.types import Prior
+
+
+class WarmUp:
+    """A stage of its own: steps 0 .. regress-1 copy the prior's poses, the others follow silhouettes.
+
+    Attributes:
+        total: number of steps.
+        optimizer: Adam over the pose network alone.
+    """
+
+    def __init__(
+        self, model: Model, supervision: Supervision, prior: Prior, config: Config, generator: torch.Generator
+    ) -> None:
+        self.model, self.supervision, self.config = model, supervision, config
+        self.generator = generator
+        stage = config.warmup
+        self.total = (stage.regress + stage.iterations) if stage.iterations else 0
+        self.optimizer = torch.optim.Adam(model.network.parameters(), lr=stage.rate, fused=True)
+        vertices, faces = prior.vertices.float(), prior.faces.long()
+        self.points, _ = sample_surface(vertices, faces, stage.samples, generator)
+        a, b, c = vertices[faces].unbind(1)
+        area = 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=-1).sum()
+        self.scale = float((area / (math.pi * stage.samples)).sqrt())
+        device = model.pivots.device
+        self.points = self.points.to(device)
+        with torch.no_grad():
+            self.weights = model.field.sample(model.field.probabilities(), self.points)
+
+    def step(self, index: int) -> dict[str, float]:
+        """One update; returns the figures for the log."""
+        stage = self.config.warmup
+        progress = max(0.0, (index - stage.regress) / max(1, stage.iterations))
+        rate = stage.rate * min(1.0, 2.0 * (1.0 - progress)) + 1e-6
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        keys = [self.supervision.draw(self.generator) for _ in range(stage.views)]
+        keys, own = neighbour_keys(keys, self.supervision.frames, self.config.geometry.temporal > 0)
+        times = torch.tensor([(key.frame + 1) / self.supervision.frames for key in keys])
+        pose = self.model.pose(times, keys)
+        copied = index < stage.regress
+        distance = pose_distance(pose, *self.supervision.prior_pose(keys))
+        if copied:
+            loss, figures = distance, {}
+        else:
+            transforms = self.model.transforms(pose)
+            silhouette = torch.stack([self._silhouette(keys[row], transforms[row], progress) for row in own]).mean()
+            loss = silhouette + stage.pull * (1 - progress) * distance
+            loss = loss + skeleton_losses(self.model, pose, transforms, self.config.geometry)
+            figures = {"silhouette": float(silhouette.detach())}
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.model.network.parameters(), self.config.rates.clip, error_if_nonfinite=True)
+        self.optimizer.step()
+        return {"loss": float(loss.detach()), "prior_distance": float(distance.detach())} | figures
+
+    def _silhouette(self, key: Key, transforms: Tensor, progress: float) -> Tensor:
+        """L2 (per pixel of the animal's box) + Dice of blurred mattes."""
+        target = self.supervision.target(key)
+        camera = target.camera
+        means = skin_points(self.points, self.weights, transforms)
+        count = len(means)
+        quats = means.new_tensor((1.0, 0, 0, 0)).expand(count, 4)
+        _, alpha, _ = rasterize(
+            means, quats, means.new_full((count, 3), self.scale), means.new_full((count,), 0.9), means.new_zeros(count, 1),
+            camera.world_to_camera[None], camera.intrinsics[None], camera.width, camera.height,
+        )  # fmt: skip
+        # Steps of a twentieth keep the number of blur matrices small.
+        sigma = self.config.warmup.blur * target.side * (1 - math.floor(20 * progress) / 20)
+        rendered, truth = (_blurred(image[0], round(sigma, 1)) for image in (alpha[0], target.mask))
+        l2 = (rendered - truth).square().sum() / target.side**2
+        return l2 + 1 - (2 * (rendered * truth).sum() + 1) / (rendered.square().sum() + truth.square().sum() + 1)
+
+
+def _blurred(image: Tensor, sigma: float) -> Tensor:
+    """Gaussian blur with zero padding, [h, w]; below a third of a pixel nothing happens."""
+    if sigma < 0.3:
+        return image
+    radius = math.ceil(3 * sigma)
+    rows = blur_matrix(image.shape[0], sigma, radius, image.device)
+    columns = blur_matrix(image.shape[1], sigma, radius, image.device)
+    return rows @ image @ columns.T
