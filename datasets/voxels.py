@@ -10,7 +10,7 @@ from scipy.ndimage import binary_fill_holes
 
 from rewild4d.datasets.animal import Surface
 
-CELLS = 80
+CELLS = 96
 """Lattice cells along the longest axis: fine enough for ears and tails, a few hundred thousand cells at most."""
 
 INFLUENCES = 10
