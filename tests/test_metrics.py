@@ -13,7 +13,7 @@ from rewild4d.metrics.silhouette import mask_iou
 
 @pytest.mark.parametrize("error", [0.5, 0.1, 0.01])
 def test_psnr_of_a_constant_error(error: float) -> None:
-    target = torch.full((2, 3, 8, 9), 0.3)
+    target = torch.full((2, 3, 8, 9), 0.3, dtype=torch.float64)
     torch.testing.assert_close(psnr(target + error, target), torch.full((2,), -20 * math.log10(error)).double())
 
 

@@ -91,9 +91,7 @@ def test_mirrored_camera_gives_the_flipped_image(generator: torch.Generator) -> 
 def test_mirrored_orientation_is_the_conjugate_by_the_reflection(generator: torch.Generator) -> None:
     quats = random_quats(32, generator)
     reflect = torch.diag(torch.tensor((-1.0, 1, 1), dtype=torch.float64))
-    torch.testing.assert_close(
-        tf.quat_to_matrix(tf.mirror_quats(quats)), reflect @ tf.quat_to_matrix(quats) @ reflect
-    )
+    torch.testing.assert_close(tf.quat_to_matrix(tf.mirror_quats(quats)), reflect @ tf.quat_to_matrix(quats) @ reflect)
 
 
 def test_mirrored_pose_is_an_involution_and_moves_the_mirrored_animal(generator: torch.Generator) -> None:
@@ -128,7 +126,9 @@ def test_skinned_orientation_ignores_the_sign_of_a_quaternion(generator: torch.G
 
 def test_camera_in_object_keeps_pixels_and_stays_rigid(generator: torch.Generator) -> None:
     camera = random_camera(generator)
-    world = tf.similarity(0.4, tf.quat_to_matrix(random_quats(1, generator)[0]), torch.tensor((0.3, 1.0, -2.0)).double())
+    world = tf.similarity(
+        0.4, tf.quat_to_matrix(random_quats(1, generator)[0]), torch.tensor((0.3, 1.0, -2.0)).double()
+    )
     inside = tf.camera_in_object(camera, world)
     points = torch.randn(20, 3, dtype=torch.float64, generator=generator)
     pixels, depth = inside.project(points)

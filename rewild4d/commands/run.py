@@ -86,9 +86,7 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
     floors = [_floor(name) for name in protocol.floors if name != options.method]
     entry = Entry(options.method, options.preset, config, tuple(dict.fromkeys(options.seeds)))
     prior = PriorChoice(options.prior, PRIOR_PRESETS.get(options.preset, STANDARD))
-    return Plan(
-        options.dataset, reader, root, cases, protocol, (*floors, entry), prior, device, options.out.absolute()
-    )
+    return Plan(options.dataset, reader, root, cases, protocol, (*floors, entry), prior, device, options.out.absolute())
 
 
 def open_dataset(dataset: str, data: Path | None) -> tuple[Path, DatasetReader]:

@@ -161,4 +161,3 @@ def _nearest(pixels: Tensor, depth: Tensor, camera: Camera, cell: float = 3.0) -
     front = torch.full((width * height,), torch.inf, dtype=depth.dtype)
     front.scatter_reduce_(0, index[inside], depth[inside], "amin")
     return inside & (depth <= front[index] + 0.15)
-

@@ -1,0 +1,87 @@
+"""Records: round trip, strict reading, and tables that refuse to average what cannot be averaged."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from rewild4d.errors import UserError
+from rewild4d.leaderboard.records import RunRecord, Score, Timing, make_run_id, read_record, to_json, write_record
+from rewild4d.leaderboard.tables import markdown
+from rewild4d.protocol import summarize
+
+
+def record(**changes: Any) -> RunRecord:
+    fields: dict[str, Any] = {
+        "schema": 1, "run_id": "0" * 16, "method": "ours", "dataset": "artemis", "case": "wolf/Run", "seed": 0,
+        "preset": "quick", "status": "ok", "error": "", "scores": {"psnr": Score(20.0, "dB", "higher", 2, [19.0, 21.0])},
+        "coverage": {"foreground": 0.1}, "config": {}, "data": {}, "prior": {}, "diagnostics": {}, "items": [], "pictures": [],
+        "protocol": {"name": "p-v1", "title": "P", "scores": ["psnr"]}, "code": {}, "machine": {},
+        "timing": Timing("2026-01-01T00:00:00+00:00", 60.0, 1.0, 100.0),
+    }  # fmt: skip
+    return RunRecord(**{**fields, **changes})
+
+
+def psnr(value: float) -> dict[str, Score]:
+    return {"psnr": Score(value, "dB", "higher", 1, [value])}
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    assert read_record(write_record(record(), tmp_path)) == record()
+    assert [path.name for path in tmp_path.iterdir()] == ["record.json"]
+
+
+def test_reading_is_strict(tmp_path: Path) -> None:
+    path = tmp_path / "record.json"
+    path.write_text(to_json(record()).replace('"seed": 0', '"seed": "zero"'))
+    with pytest.raises(
+        UserError, match=r"record.json: expected a run record of schema 1, but Expected `int`, got `str`"
+    ):
+        read_record(path)
+    path.write_text(to_json(record(schema=9)))
+    with pytest.raises(UserError, match="expected a run record of schema 1, got schema 9"):
+        read_record(path)
+    path.write_text(to_json(record())[:50])
+    with pytest.raises(UserError, match="record.json: expected a run record"):
+        read_record(path)
+    with pytest.raises(UserError, match="no such file"):
+        read_record(tmp_path / "other.json")
+
+
+def test_run_id_depends_on_every_part() -> None:
+    ids = {make_run_id(seed=0, method="a"), make_run_id(seed=1, method="a"), make_run_id(seed=0, method="b")}
+    assert len(ids) == 3
+    assert make_run_id(method="a", seed=0) in ids, "the order of the parts does not count"
+
+
+def test_table_shows_mean_and_spread_over_seeds() -> None:
+    table = markdown([record(seed=seed, scores=psnr(value)) for seed, value in enumerate((19.0, 20.0, 21.0))])
+    assert "| wolf/Run | ours | 20.00 ± 1.00 | 3 | 60 |" in table
+
+
+def test_table_averages_cases_only_over_equal_sets() -> None:
+    full = [record(case=case, scores=psnr(value)) for case, value in (("a/x", 10.0), ("b/x", 30.0))]
+    assert "| **mean** | ours | 20.00 |" in markdown(full)
+    partial = [*full, record(method="gart", case="a/x", scores=psnr(12.0))]
+    assert "| **mean** | gart | not computed: no result for b/x |" in markdown(partial)
+
+
+def test_a_failure_is_a_row() -> None:
+    table = markdown([record(), record(method="gart", status="failed", error="it diverged", scores={})])
+    assert "| wolf/Run | gart | failed | 0 of 1 | - |" in table
+    assert "wolf/Run, gart: failed: it diverged" in table
+
+
+def test_a_score_without_a_value_says_why() -> None:
+    assert summarize("psnr_fg", [None, None]).note == "not computed: no held-out image in which it is defined"
+    assert summarize("psnr", []).note == "not computed: no held-out image"
+    some = summarize("psnr", [10.0, None, 100.0])
+    assert (some.value, some.count) == ((10.0 + 100.0) / 2, 2)
+    assert some.note == "1 images left out: not defined there; 1 identical images counted as 100 dB"
+
+
+def test_not_finite_is_never_written() -> None:
+    text = to_json(record(scores=psnr(float("nan"))))
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert(msgspec.json.decode(text)["scores"]["psnr"]["per_item"], list[float])
