@@ -122,7 +122,8 @@ def _check_cameras(world_to_camera: Tensor, intrinsics: Tensor, width: int, heig
             map(math.isfinite, sum(matrix, []))
         ):
             raise ValueError(
-                f"intrinsics[{view}]: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths, got {matrix}."
+                f"intrinsics[{view}]: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths, "
+                f"got {matrix}."
             )
 
 

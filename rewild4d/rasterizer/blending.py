@@ -1,8 +1,8 @@
 """Front-to-back blending of one tile at a time, and its gradient.
 
-A vector holds the sixteen pixels of a 4 x 4 block. Gaussians are the outer loop and the blocks that they reach the inner
-one, so neighbouring steps work on different pixels and need not wait for each other; a tile's state stays in the first
-cache. A closed pixel has transmittance 0 in the running state, which makes every later Gaussian vanish there.
+A vector holds the sixteen pixels of a 4 x 4 block. Gaussians are the outer loop and the blocks that they reach the
+inner one, so neighbouring steps work on different pixels and need not wait for each other; a tile's state stays in the
+first cache. A closed pixel has transmittance 0 in the running state, which makes every later Gaussian vanish there.
 
 The backward pass walks front to back too: what lies behind Gaussian i is the pixel's total minus the prefix.
 """

@@ -107,8 +107,8 @@ class _Project(torch.autograd.Function):
         def work(first: int, last: int) -> None:
             for chunk in range(first, last):
                 project_backward(
-                    chunk * CHUNK, min((chunk + 1) * CHUNK, count), *arrays, *cameras, *ctx.options[:4], *shared, *outputs,
-                    v_cameras[chunk], v_pinholes[chunk],
+                    chunk * CHUNK, min((chunk + 1) * CHUNK, count), *arrays, *cameras, *ctx.options[:4], *shared,
+                    *outputs, v_cameras[chunk], v_pinholes[chunk],
                 )  # fmt: skip
 
         run(work, spans(chunks, thread_count()))

@@ -4,7 +4,7 @@ Inside kernels ``+``, ``-`` and ``*`` work on two `Lanes`; everything else is a 
 1D float32 array and the index of the first lane.
 """
 
-# numba fixes the shape of these functions: an intrinsic takes the typing context and returns a signature and a generator.
+# numba fixes the shape of an intrinsic: it takes the typing context and gives a signature and a code generator.
 import operator
 from typing import Any
 
