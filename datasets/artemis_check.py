@@ -20,7 +20,7 @@ from rewild4d.datasets.artemis_files import (
     read_licence,
 )
 from rewild4d.datasets.artemis_volume import read_pose, read_skeleton, read_surface
-from rewild4d.datasets.images import read_pair
+from rewild4d.datasets.images import read_pair, read_rgb
 from rewild4d.errors import UserError
 
 _Arguments = ParamSpec("_Arguments")
@@ -76,18 +76,15 @@ class _Check:
         pairs = [
             pair for frame in frames for pair in self._attempt(lambda frame=frame: list_images(frame, views)) or []
         ]
-        source: tuple[int, int] | None = None
+        first = self._attempt(read_rgb, pairs[0].rgb) if pairs else None
+        source = (first.shape[1], first.shape[0]) if first is not None else None
         title = f"checking {self.animal.name}/{motion}"
         with ThreadPoolExecutor(2) as pool:
-            for result in tqdm(pool.map(_measure, pairs), total=len(pairs), desc=title, disable=None, leave=False):
-                if isinstance(result, UserError):
-                    self._fault(result)
-                    continue
-                pair, size, coverage = result
-                source = source or size
-                if size != source:
-                    self._add("error", pair.rgb, f"expected {source[0]}x{source[1]} pixels, got {size[0]}x{size[1]}")
-                if not coverage:
+            results = pool.map(lambda pair: _is_seen(pair, source), pairs)
+            for pair, seen in zip(pairs, tqdm(results, total=len(pairs), desc=title, disable=None, leave=False)):
+                if isinstance(seen, UserError):
+                    self._fault(seen)
+                elif not seen:
                     self._add("warning", pair.alpha, "the matte is empty: this image cannot be an input")
         if source and intrinsics is not None:
             self._principal_points(source, intrinsics)
@@ -136,10 +133,10 @@ class _Check:
         self.findings.append(Finding(level, str(path), message.rstrip(".")))
 
 
-def _measure(pair: ImagePair) -> tuple[ImagePair, tuple[int, int], bool] | UserError:
-    """Size of a pair of images and whether its matte holds anything."""
+def _is_seen(pair: ImagePair, source: tuple[int, int] | None) -> bool | UserError:
+    """Whether a matte holds anything, or what is wrong with the pair of images."""
     try:
-        rgb, alpha = read_pair(pair)
+        _, alpha = read_pair(pair, source)
     except UserError as error:
         return error
-    return pair, (rgb.shape[1], rgb.shape[0]), bool(alpha.any())
+    return bool(alpha.any())

@@ -4,6 +4,7 @@ A framing is one window of the source image per view; the window may reach over 
 So "full", "letterbox" and "crop" share one path, and `Window.camera` moves the camera with the pixels.
 """
 
+import math
 import struct
 import zlib
 from collections.abc import Iterable, Sequence
@@ -23,7 +24,8 @@ from rewild4d.types import Camera
 
 BOX_ALPHA = 25
 """Mattes above a tenth make the box of a crop, so that noise in a matte does not widen it."""
-CROP_PADDING = 1.15
+CROP_MARGIN = 0.075
+"""Free border on each side of a crop as a share of the animal's longer side: 15 % in all."""
 _THREADS = 2
 _CACHE_VERSION = "1"
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -175,10 +177,12 @@ def _windows(
     progress = tqdm(views, desc=f"framing {title}", disable=None, leave=False)
     with ThreadPoolExecutor(_THREADS) as pool:
         boxes = [_box(pool.map(lambda pair: read_alpha(pair.alpha), view)) for view in progress]
-    return [
-        _square(box, round(CROP_PADDING * max(box.width, box.height))) if box else _square(whole, max(source))
-        for box in boxes
-    ]
+    return [_padded(box) if box else _square(whole, max(source)) for box in boxes]
+
+
+def _padded(box: Window) -> Window:
+    side = max(box.width, box.height)
+    return _square(box, side + 2 * math.ceil(CROP_MARGIN * side))
 
 
 def _square(box: Window, side: int) -> Window:
