@@ -1,0 +1,64 @@
+"""Every choice of the template fit."""
+
+import msgspec
+
+
+class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One round of gradient descent on all hypotheses that are still in the race.
+
+    Attributes:
+        size: side of the square crops in pixels; early rounds only need the gross outline.
+        steps: of Adam.
+        blur: of both silhouettes at the first and last step, as a share of the crop: a thin leg must feel a far one.
+        keep: hypotheses that survive; the best of the opposite facing is always among them while two or more do.
+        joints: whether joints bend and the root moves over time, or the animal stands still.
+    """
+
+    size: int
+    steps: int
+    blur: tuple[float, float]
+    keep: int
+    joints: bool = True
+
+
+class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the template is fitted.
+
+    Attributes:
+        yaw_starts: facing is a local minimum, so every start turns the template by an equal share of the circle.
+        elevations: camera elevations (degrees) tried where the cameras alone do not tell which way is up.
+        stages: rounds, from all starts to one winner.
+        frames: per step; of longer clips as many are drawn anew each step, so that time does not grow with the clip.
+        learning_rate: of Adam at the start of each round, on parameters whitened by their natural spread.
+        shape_weight: of the mean squared deviation of proportions: an average animal unless the masks insist.
+        angle_weight: of the squared whitened joint angles: limbs rest, and move slowly, unless the masks insist.
+        root_weight: of the squared whitened root motion and tilt: a sweeping camera sees each moment once.
+    """
+
+    stages: tuple[Stage, ...]
+    yaw_starts: int = 12
+    elevations: tuple[float, ...] = (5.0, 20.0, 40.0)
+    frames: int = 24
+    learning_rate: float = 0.06
+    shape_weight: float = 0.02
+    angle_weight: float = 0.02
+    root_weight: float = 0.02
+
+
+STANDARD = PriorConfig(
+    stages=(
+        Stage(size=32, steps=40, blur=(0.08, 0.04), keep=6, joints=False),
+        Stage(size=48, steps=80, blur=(0.05, 0.03), keep=2),
+        Stage(size=64, steps=150, blur=(0.04, 0.015), keep=1),
+        Stage(size=80, steps=250, blur=(0.02, 0.006), keep=1),
+    )
+)
+QUICK = PriorConfig(
+    stages=(
+        Stage(size=32, steps=30, blur=(0.08, 0.04), keep=4, joints=False),
+        Stage(size=40, steps=60, blur=(0.05, 0.03), keep=2),
+        Stage(size=48, steps=60, blur=(0.04, 0.02), keep=1),
+        Stage(size=64, steps=80, blur=(0.02, 0.008), keep=1),
+    )
+)
+PRESETS = {"quick": QUICK, "standard": STANDARD}

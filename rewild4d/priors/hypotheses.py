@@ -1,0 +1,132 @@
+"""Several guesses of the animal at once: their parameters, and how they look to the cameras.
+
+All parameters are whitened: one unit is one natural spread, so that one learning rate and one penalty suit them all.
+Motion over time is a short cosine series, so that a moment seen by one camera is helped by its neighbours.
+"""
+
+import math
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from rewild4d.priors.kinematics import pose
+from rewild4d.priors.silhouettes import Targets, splat
+from rewild4d.priors.template import PARENTS, PROPORTIONS, Proportions, quadruped
+from rewild4d.transforms import axis_angle_to_matrix, rigid
+
+ANGLE_LIMIT = 1.1
+"""No joint axis turns further, in radians (Fauna: 60 degrees)."""
+SCALE_SPREAD = 0.25
+TURN_SPREAD = (0.15, 0.35, 0.10)
+SHIFT_SPREAD = 0.30
+
+
+def _angle_spreads() -> Tensor:
+    """Natural spread of every joint about the object's axes (x flexes, y turns, z rolls) in radians, [J, 3]."""
+    by_bone = {
+        0: (0.30, 0.25, 0.10), 1: (0.35, 0.25, 0.10), 2: (0.40, 0.25, 0.10), 3: (0.10, 0.08, 0.04),
+        4: (0.35, 0.35, 0.05), 5: (0.40, 0.40, 0.05), 6: (0.15, 0.10, 0.04), 7: (0.10, 0.08, 0.04),
+    }  # fmt: skip
+    for foot in (8, 11, 14, 17):
+        by_bone |= {foot: (0.45, 0.0, 0.04), foot + 1: (0.45, 0.0, 0.04), foot + 2: (0.45, 0.05, 0.10)}
+    return torch.tensor([by_bone[bone] for bone in range(len(PARENTS))])
+
+
+ANGLE_SPREADS = _angle_spreads()
+
+
+def cosine_series(count: int, terms: int) -> Tensor:
+    """The first ``terms`` cosines over ``count`` moments, damped from a period of eight moments on, [count, terms]."""
+    order = torch.arange(terms)
+    waves = torch.cos(math.pi * (torch.arange(count)[:, None] + 0.5) * order / count)
+    return waves / (1 + (4 * order / count).square())
+
+
+@dataclass
+class Hypotheses:
+    """A batch of B guesses in the working frame (y up, animal near the origin, about template size).
+
+    Attributes:
+        facing: rotation object -> working frame of each guess, fixed, [B, 3, 3].
+        path: where the masks say the animal is at each moment, fixed, [T, 3].
+        scale: whitened logarithm, [B].
+        turn: cosine series of the root's rotation, [B, K, 3].
+        shift: cosine series of the root's offset from the path, [B, K, 3].
+        shape: proportions, [B, P].
+        angles: cosine series of the joint angles, [B, L, J, 3].
+    """
+
+    facing: Tensor
+    path: Tensor
+    scale: Tensor
+    turn: Tensor
+    shift: Tensor
+    shape: Tensor
+    angles: Tensor
+
+    @staticmethod
+    def start(facing: Tensor, path: Tensor) -> "Hypotheses":
+        """Average animals at rest on the path, [B, 3, 3] and [T, 3]."""
+        batch, moments = len(facing), len(path)
+        root, joints = 1 + (moments - 1) // 4, 1 + (moments - 1) // 2
+        return Hypotheses(
+            facing,
+            path,
+            scale=torch.zeros(batch),
+            turn=torch.zeros(batch, root, 3),
+            shift=torch.zeros(batch, root, 3),
+            shape=torch.zeros(batch, len(PROPORTIONS)),
+            angles=torch.zeros(batch, joints, len(PARENTS), 3),
+        )
+
+    def select(self, rows: Tensor) -> "Hypotheses":
+        """Some of the guesses, detached."""
+        rest = {f.name: getattr(self, f.name).detach()[rows] for f in fields(self) if f.name != "path"}
+        return Hypotheses(path=self.path, **rest)
+
+    def __len__(self) -> int:
+        return len(self.facing)
+
+    def scales(self) -> Tensor:
+        """Size of the animals in working units per template unit, [B]."""
+        return torch.exp(SCALE_SPREAD * self.scale)
+
+    def roots(self) -> Tensor:
+        """Rigid root motion without the scale, [B, T, 4, 4]."""
+        series = cosine_series(len(self.path), self.turn.shape[1])
+        turns = axis_angle_to_matrix((series @ self.turn) * torch.tensor(TURN_SPREAD))
+        return rigid(self.facing[:, None] @ turns, self.path + SHIFT_SPREAD * (series @ self.shift))
+
+    def joint_angles(self) -> Tensor:
+        """Axis-angle vectors in radians, [B, T, J, 3]."""
+        series = cosine_series(len(self.path), self.angles.shape[1])
+        raw = torch.einsum("tk,bkja->btja", series, self.angles) * ANGLE_SPREADS
+        return ANGLE_LIMIT * torch.tanh(raw / ANGLE_LIMIT)
+
+    def silhouettes(self, targets: Targets, moving: bool) -> Tensor:
+        """Soft silhouettes in the targets' crops, [B, v, s, s].
+
+        Args:
+            targets: with cameras in the working frame.
+            moving: with joint angles; otherwise at rest.
+        """
+        template = quadruped(Proportions(self.shape), unit=False)
+        matrix = targets.world_to_camera @ self.roots()[:, targets.moments]
+        scale = self.scales()[:, None]
+        linear = torch.cat((matrix[..., :3] * scale[..., None, None], matrix[..., 3:]), -1)
+        if moving:
+            angles = self.joint_angles()[:, targets.moments]
+            transforms = linear[:, :, None] @ pose(angles, template.bones[:, None, :, 0], PARENTS)
+            blended = (template.blob_weights @ transforms[..., :3, :].flatten(-2)).unflatten(-1, (3, 4))
+            local = torch.einsum("bvnac,bnc->bvna", blended[..., :3], template.blobs) + blended[..., 3]
+        else:
+            local = template.blobs[:, None] @ linear[..., :3, :3].transpose(-1, -2) + linear[..., None, :3, 3]
+        sizes = (template.blob_sizes * scale)[:, None]
+        return splat(local, sizes, targets.intrinsics, targets.masks.shape[-1])
+
+    def penalties(self) -> tuple[Tensor, Tensor, Tensor]:
+        """How unusual the proportions, the joint angles and the root's motion are, each [B]."""
+        swing = self.angles.square() * (ANGLE_SPREADS > 0)
+        root = self.turn.square().sum((1, 2)) + self.shift[:, 1:].square().sum((1, 2))
+        return self.shape.square().mean(1), swing.sum(1).mean((1, 2)), root

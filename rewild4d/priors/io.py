@@ -1,0 +1,227 @@
+"""Prior files: one npz, for priors fitted here and for priors made elsewhere.
+
+Keys (T frames, J bones, n vertices, f faces; lengths in object units, the rest shape's bounding-box diagonal is 5):
+
+    name, provenance    text
+    vertices            [n, 3]           rest shape in the object frame (x its left, y up, z towards the head)
+    faces               [f, 3]           integers
+    weights             [n, J]           skinning weights, rows sum to one
+    bones               [J, 2, 3]        start (the pivot) and end of each bone at rest
+    parents             [J]              integers, -1 for a root
+    mirror              [J]              integers, the bone on the other side (an involution)
+    times               [T]              seconds, the clip's own, increasing
+    object_to_world     [T, 4, 4]        similarity, one scale
+    world_to_camera     [T, 4, 4]        rigid, object frame -> OpenCV camera, in object units
+    intrinsics          [T, 3, 3]        pixels of the clip's images, pixel centres at +0.5
+    sizes               [T, 2]           integers, image width and height
+    transforms          [T, J, 4, 4]     rest -> posed in the object frame, identity at rest
+    quality             text             JSON object of figures (optional)
+
+    world_to_camera_flip, intrinsics_flip, transforms_flip   the same for the horizontally flipped images (optional:
+                        by default the exact mirror images of the three arrays)
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rewild4d.errors import UserError
+from rewild4d.files import atomic, digest
+from rewild4d.transforms import mirror_camera, mirror_transforms
+from rewild4d.types import OBJECT_DIAGONAL, Camera, Prior
+
+SHAPES: dict[str, tuple[str | int, ...]] = {
+    "vertices": ("n", 3),
+    "faces": ("f", 3),
+    "weights": ("n", "J"),
+    "bones": ("J", 2, 3),
+    "parents": ("J",),
+    "mirror": ("J",),
+    "times": ("T",),
+    "object_to_world": ("T", 4, 4),
+    "world_to_camera": ("T", 4, 4),
+    "intrinsics": ("T", 3, 3),
+    "sizes": ("T", 2),
+    "transforms": ("T", "J", 4, 4),
+}
+FLIPPED: dict[str, tuple[str | int, ...]] = {
+    "world_to_camera_flip": ("T", 4, 4),
+    "intrinsics_flip": ("T", 3, 3),
+    "transforms_flip": ("T", "J", 4, 4),
+}
+INTEGERS = ("faces", "parents", "mirror", "sizes")
+SINGLE = ("vertices", "weights", "bones", "transforms", "transforms_flip")
+
+
+def seal(prior: Prior) -> Prior:
+    """The same prior with its digest, over everything else."""
+    cameras = [array for camera in (*prior.cameras, *prior.cameras_flip) for array in _camera_arrays(camera)]
+    quality = json.dumps(prior.quality, sort_keys=True)
+    arrays = (
+        prior.vertices, prior.faces, prior.weights, prior.bones, prior.parents, prior.mirror, prior.times,
+        prior.object_to_world, prior.transforms, prior.transforms_flip,
+    )  # fmt: skip
+    return replace(prior, digest=digest(prior.name, prior.provenance, quality, *arrays, *cameras))
+
+
+def _camera_arrays(camera: Camera) -> tuple[Tensor, Tensor, np.ndarray]:
+    return camera.world_to_camera, camera.intrinsics, np.array((camera.width, camera.height))
+
+
+def save_prior(prior: Prior, path: Path) -> None:
+    """Write a prior atomically.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    arrays = {
+        name: getattr(prior, name).detach().cpu().numpy()
+        for name in (*SHAPES, *FLIPPED)
+        if isinstance(getattr(prior, name, None), Tensor)
+    }
+    for suffix, cameras in (("", prior.cameras), ("_flip", prior.cameras_flip)):
+        arrays[f"world_to_camera{suffix}"] = torch.stack([camera.world_to_camera for camera in cameras]).numpy()
+        arrays[f"intrinsics{suffix}"] = torch.stack([camera.intrinsics for camera in cameras]).numpy()
+    arrays["sizes"] = np.array([(camera.width, camera.height) for camera in prior.cameras])
+    texts = {"name": prior.name, "provenance": prior.provenance, "quality": json.dumps(prior.quality)}
+    with atomic(path) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, **arrays, **{key: np.array(text) for key, text in texts.items()})
+
+
+def load_prior(path: Path) -> Prior:
+    """Read a prior file.
+
+    Raises:
+        UserError: no such file, not an npz, an array is missing, or has another shape, kind or values than documented.
+    """
+    raw = _read(path)
+    sizes: dict[str, int] = {}
+    arrays = {key: _checked(path, raw, key, shape, sizes) for key, shape in SHAPES.items()}
+    flipped = {key: _checked(path, raw, key, shape, sizes) for key, shape in FLIPPED.items() if key in raw}
+    _check_values(path, arrays, flipped)
+    cameras = _cameras(arrays["world_to_camera"], arrays["intrinsics"], arrays["sizes"])
+    mirrored = tuple(mirror_camera(camera) for camera in cameras)
+    if len(flipped) == len(FLIPPED):
+        mirrored = _cameras(flipped["world_to_camera_flip"], flipped["intrinsics_flip"], arrays["sizes"])
+        transforms_flip = flipped["transforms_flip"]
+    else:
+        transforms_flip = mirror_transforms(arrays["transforms"], arrays["mirror"])
+    shared = {key: arrays[key] for key in SHAPES if key not in ("world_to_camera", "intrinsics", "sizes")}
+    return seal(
+        Prior(
+            name=_text(raw, "name", path.stem),
+            provenance=_text(raw, "provenance", f"Read from {path.name}."),
+            cameras=cameras,
+            cameras_flip=mirrored,
+            transforms_flip=transforms_flip,
+            quality=_quality(path, _text(raw, "quality", "{}")),
+            digest="",
+            **shared,
+        )
+    )
+
+
+def _read(path: Path) -> Mapping[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {key: archive[key] for key in archive.files}
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: expected a prior file, but there is no such file.") from error
+    except (OSError, ValueError, BadZipFile, EOFError, AttributeError) as error:
+        raise UserError(f"{path}: expected a prior file (npz), but it cannot be read as one: {error}.") from error
+
+
+def _text(raw: Mapping[str, np.ndarray], key: str, default: str) -> str:
+    return str(raw[key]) if key in raw else default
+
+
+def _quality(path: Path, text: str) -> dict[str, float]:
+    try:
+        return {str(name): float(value) for name, value in json.loads(text).items()}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise UserError(f"{path}: expected 'quality' to be a JSON object of numbers, got {text[:60]!r}.") from error
+
+
+def _checked(
+    path: Path, raw: Mapping[str, np.ndarray], key: str, shape: tuple[str | int, ...], sizes: dict[str, int]
+) -> Tensor:
+    """One array with its documented shape and type; a letter stands for the size seen first."""
+    if key not in raw:
+        raise UserError(
+            f"{path}: expected an array '{key}', but the file holds only {', '.join(sorted(raw)) or 'nothing'}."
+        )
+    array = raw[key]
+    wanted = ", ".join(f"{name}={sizes[name]}" if name in sizes else str(name) for name in map(str, shape))
+    fits = array.ndim == len(shape) and all(
+        size == (name if isinstance(name, int) else sizes.setdefault(name, size))
+        for name, size in zip(shape, array.shape, strict=True)
+    )
+    if not fits or 0 in array.shape:
+        raise UserError(f"{path}: expected '{key}' of shape [{wanted}], got {list(array.shape)}.")
+    integer = key in INTEGERS
+    if not np.issubdtype(array.dtype, np.integer if integer else np.floating):
+        raise UserError(f"{path}: expected '{key}' to hold {'integers' if integer else 'floats'}, got {array.dtype}.")
+    if not np.isfinite(array).all():
+        raise UserError(
+            f"{path}: expected finite numbers in '{key}', got {int((~np.isfinite(array)).sum())} that are not."
+        )
+    return torch.from_numpy(array.astype(np.int64 if integer else np.float32 if key in SINGLE else np.float64))
+
+
+def _check_values(path: Path, arrays: Mapping[str, Tensor], flipped: Mapping[str, Tensor]) -> None:
+    """What the shapes do not say.
+
+    Raises:
+        UserError: naming the first array that breaks its promise.
+    """
+    bones = torch.arange(len(arrays["parents"]))
+    vertices, faces, mirror, parents = (arrays[key] for key in ("vertices", "faces", "mirror", "parents"))
+    sums, extent = arrays["weights"].sum(1), float((vertices.amax(0) - vertices.amin(0)).norm())
+    scales = torch.linalg.det(arrays["object_to_world"][:, :3, :3])
+    inside = {key: (arrays[key] >= low) & (arrays[key] < high) for key, low, high in (
+        ("faces", 0, len(vertices)), ("parents", -1, len(bones)), ("mirror", 0, len(bones)),
+    )}  # fmt: skip
+    promises = [
+        (bool(inside["faces"].all()), f"'faces' to be below {len(vertices)}", f"{int(faces.max())}"),
+        (bool(inside["parents"].all()), f"'parents' to lie in -1..{len(bones) - 1}", f"{parents.tolist()}"),
+        (_is_forest(parents), "'parents' to form a tree", f"a cycle in {parents.tolist()}"),
+        (
+            bool(inside["mirror"].all()) and bool((mirror[mirror.clamp(0, len(bones) - 1)] == bones).all()),
+            "'mirror' to be its own inverse",
+            f"{mirror.tolist()}",
+        ),
+        (float((sums - 1).abs().max()) < 1e-3, "rows of 'weights' to sum to one", f"{float(sums.min()):.4g} at least"),
+        (
+            abs(extent - OBJECT_DIAGONAL) < 0.01 * OBJECT_DIAGONAL,
+            f"a rest bounding-box diagonal of {OBJECT_DIAGONAL:g}",
+            f"{extent:.4g}",
+        ),
+        (bool((scales > 0).all()), "'object_to_world' to keep handedness", f"determinant {float(scales.min()):.4g}"),
+        (bool((arrays["times"].diff() > 0).all()), "'times' to increase", f"{arrays['times'].tolist()[:6]}"),
+        (bool((arrays["sizes"] > 0).all()), "'sizes' above zero", f"{int(arrays['sizes'].min())}"),
+        (len(flipped) in (0, len(FLIPPED)), f"all or none of {', '.join(FLIPPED)}", f"only {', '.join(flipped)}"),
+    ]
+    for kept, expected, came in promises:
+        if not kept:
+            raise UserError(f"{path}: expected {expected}, got {came}.")
+
+
+def _is_forest(parents: Tensor) -> bool:
+    """Whether every bone reaches a root."""
+    at = torch.arange(len(parents))
+    for _ in range(len(parents)):
+        at = torch.where(at >= 0, parents[at.clamp(0, len(parents) - 1)].clamp(-1, len(parents) - 1), at)
+    return bool((at < 0).all())
+
+
+def _cameras(world_to_camera: Tensor, intrinsics: Tensor, sizes: Tensor) -> tuple[Camera, ...]:
+    return tuple(
+        Camera(matrix, inner, int(width), int(height))
+        for matrix, inner, (width, height) in zip(world_to_camera, intrinsics, sizes.tolist(), strict=True)
+    )

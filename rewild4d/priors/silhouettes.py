@@ -1,0 +1,202 @@
+"""What the fit compares: soft silhouettes in square crops around the animal.
+
+The search compares hundreds of hypotheses, so its silhouettes use the fact that the image of a round Gaussian is
+separable: the summed density of all blobs is one matrix product per view, and alpha = 1 - exp(-density). That is
+order-free, differentiable and needs no sorting; the final score draws the exact outline of the mesh.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from rewild4d.errors import UserError
+from rewild4d.transforms import camera_in_object
+from rewild4d.types import Camera, Frame
+
+CROP_MARGIN = 0.25
+"""Border added on each side of the mask's bounding box, as a share of its longer side."""
+DENSITY = 2.5
+"""Optical depth in the middle of one blob, so that a few overlapping blobs are opaque."""
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Cropped masks of a set of observations.
+
+    Attributes:
+        masks: soft mattes of the crops, [v, s, s].
+        valid: share of each pixel that lies inside the image, [v, s, s].
+        world_to_camera: [v, 4, 4].
+        intrinsics: of the crops, [v, 3, 3].
+        moments: index of the moment of each observation, int64, [v].
+    """
+
+    masks: Tensor
+    valid: Tensor
+    world_to_camera: Tensor
+    intrinsics: Tensor
+    moments: Tensor
+
+    def select(self, rows: Tensor) -> "Targets":
+        return Targets(
+            self.masks[rows], self.valid[rows], self.world_to_camera[rows], self.intrinsics[rows], self.moments[rows]
+        )
+
+
+def known_camera(frame: Frame, name: str) -> Camera:
+    """The frame's camera.
+
+    Raises:
+        UserError: it has none.
+    """
+    if frame.camera is None:
+        raise UserError(
+            f"{name}: expected a camera for every frame, but the frame at {frame.time:g} s has none; "
+            "the template fit needs known cameras, so give a prior file instead."
+        )
+    return frame.camera
+
+
+def crop_targets(frames: Sequence[Frame], moments: Sequence[int], world: Tensor, size: int, name: str) -> Targets:
+    """Square crops around the masks, resampled by area; frames with an empty mask are left out.
+
+    Args:
+        frames: observations with cameras.
+        moments: index of each frame's moment.
+        world: similarity from the working frame to the world, [4, 4]; the targets' cameras look at the working frame.
+        size: side of the crop in pixels.
+        name: of the case, for messages.
+
+    Raises:
+        UserError: no mask holds anything.
+    """
+    masks, valid, cameras, kept = [], [], [], []
+    for frame, moment in zip(frames, moments, strict=True):
+        box = _square(frame.mask[0])
+        if box is None:
+            continue
+        left, top, side = box
+        camera = camera_in_object(known_camera(frame, name), world)
+        cameras.append(camera.shifted(left, top, side, side).resized(size, size))
+        inside = torch.ones_like(frame.mask[0])
+        masks.append(_window(frame.mask[0], left, top, side, size))
+        valid.append(_window(inside, left, top, side, size))
+        kept.append(moment)
+    if not masks:
+        raise UserError(f"{name}: expected at least one mask that shows the animal, but all {len(frames)} are empty.")
+    return Targets(
+        torch.stack(masks),
+        torch.stack(valid),
+        torch.stack([camera.world_to_camera for camera in cameras]).float(),
+        torch.stack([camera.intrinsics for camera in cameras]).float(),
+        torch.tensor(kept),
+    )
+
+
+def _square(mask: Tensor) -> tuple[int, int, int] | None:
+    """Left, top and side of the crop window; it may reach beyond the image."""
+    rows, columns = torch.nonzero(mask > 0.5, as_tuple=True)
+    if len(rows) == 0:
+        return None
+    low_x, high_x = int(columns.min()), int(columns.max()) + 1
+    low_y, high_y = int(rows.min()), int(rows.max()) + 1
+    side = round(max(high_x - low_x, high_y - low_y) * (1 + 2 * CROP_MARGIN)) + 2
+    return (low_x + high_x - side) // 2, (low_y + high_y - side) // 2, side
+
+
+def _window(image: Tensor, left: int, top: int, side: int, size: int) -> Tensor:
+    height, width = image.shape
+    padding = (max(-left, 0), max(left + side - width, 0), max(-top, 0), max(top + side - height, 0))
+    padded = torch.nn.functional.pad(image, padding)
+    x, y = left + padding[0], top + padding[2]
+    window = padded[y : y + side, x : x + side]
+    return torch.nn.functional.interpolate(window[None, None], (size, size), mode="area")[0, 0]
+
+
+def splat(points: Tensor, sizes: Tensor, intrinsics: Tensor, size: int) -> Tensor:
+    """Soft silhouettes of round Gaussians.
+
+    Args:
+        points: in camera coordinates, [..., n, 3].
+        sizes: standard deviations, broadcastable to [..., n].
+        intrinsics: [..., 3, 3].
+        size: side of the square image in pixels.
+
+    Returns:
+        Alpha, [..., size, size].
+    """
+    depth = points[..., 2].clamp_min(1e-2)
+    focal = torch.stack((intrinsics[..., 0, 0], intrinsics[..., 1, 1]), -1)[..., None, :]
+    center = points[..., :2] / depth[..., None] * focal + intrinsics[..., None, :2, 2]
+    spread = sizes[..., None] * focal / depth[..., None]
+    widened = spread.square() + 0.3
+    strength = DENSITY * (spread.square() / widened).prod(-1).sqrt()
+    pixels = torch.arange(size) + 0.5
+    kernel = torch.exp(-0.5 * (center[..., None] - pixels).square() / widened[..., None])
+    density = (kernel[..., 1, :] * strength[..., None]).transpose(-1, -2) @ kernel[..., 0, :]
+    return 1 - torch.exp(-density)
+
+
+@cache
+def _blur_matrix(size: int, sigma: float) -> Tensor:
+    """Rows that sum to at most one: what leaves the crop is lost, [size, size]."""
+    at = torch.arange(size)
+    kernel = torch.exp(-0.5 * ((at[:, None] - at) / sigma).square())
+    return kernel / torch.exp(-0.5 * (torch.arange(-size, size + 1) / sigma).square()).sum()
+
+
+def blur(images: Tensor, sigma: float) -> Tensor:
+    """Gaussian blur of square images, zero outside, [..., s, s]."""
+    matrix = _blur_matrix(images.shape[-1], round(max(sigma, 0.05), 2))
+    return matrix @ images @ matrix.T
+
+
+def mismatch(rendered: Tensor, targets: Targets, sigma: float) -> Tensor:
+    """Squared difference over the animal's area, plus Dice, of blurred silhouettes; [..., v, s, s] -> [...]."""
+    rendered = blur(rendered * targets.valid, sigma)
+    wanted = blur(targets.masks, sigma)
+    square = (rendered - wanted).square().sum((-1, -2)) / wanted.sum((-1, -2))
+    dice = 1 - 2 * (rendered * wanted).sum((-1, -2)) / (rendered.square() + wanted.square()).sum((-1, -2))
+    return (square + dice).mean(-1)
+
+
+def outline(vertices: Tensor, faces: Tensor, camera: Camera) -> np.ndarray:
+    """The silhouette of a mesh, anti-aliased, uint8, [h, w].
+
+    Args:
+        vertices: in the camera's world, [n, 3].
+        faces: [f, 3].
+        camera: where to look from.
+    """
+    pixels, depth = camera.project(vertices.double())
+    image = np.zeros((4 * camera.height, 4 * camera.width), np.uint8)
+    corners = pixels.numpy()[faces.numpy()]
+    visible = (depth.numpy() > 1e-6)[faces.numpy()].all(1) & (np.abs(corners) < 1e5).all((1, 2))
+    # cv2 also fills the pixels on an edge; four times the size keeps that below an eighth of a pixel
+    fixed_point = np.round((4 * corners[visible] - 0.5) * 16).astype(np.int32)
+    for triangle in fixed_point:
+        cv2.fillConvexPoly(image, triangle, 255, shift=4)
+    return cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+
+
+def overlap(vertices: Sequence[Tensor], faces: Tensor, cameras: Sequence[Camera], masks: Sequence[Tensor]) -> float:
+    """Mean intersection over union of posed meshes with masks at 0.5; empty masks do not count.
+
+    Args:
+        vertices: posed in the cameras' world, one [n, 3] per observation.
+        faces: [f, 3].
+        cameras: one per observation.
+        masks: soft mattes, [1, h, w] each.
+    """
+    scores = []
+    for points, camera, mask in zip(vertices, cameras, masks, strict=True):
+        wanted = mask[0].numpy() > 0.5
+        if wanted.any():
+            drawn = outline(points, faces, camera) > 127
+            scores.append((drawn & wanted).sum() / (drawn | wanted).sum())
+    return float(np.mean(scores))
