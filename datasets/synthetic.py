@@ -69,7 +69,7 @@ RECIPES = {
                 Wave("head", "pitch", 3.0, 2, 0.55), Wave("tail", "yaw", 9.0, 1, 0.0, 0.12),
                 Wave("tail", "pitch", 2.0, 2, 0.2, 0.1),
             )),
-            "gallop": Gait(GALLOP_PHASES, 0.30, 0.85, 0.30, 60, (0.08, 0.08), (
+            "gallop": Gait(GALLOP_PHASES, 0.30, 0.60, 0.30, 60, (0.20, 0.08), (
                 Wave("spine.0", "rise", 0.055, 1, 0.30, offset=-0.02), Wave("spine.0", "pitch", 5.0, 1, 0.05),
                 Wave("spine.1", "pitch", 3.0, 1, 0.55), Wave("spine.2", "pitch", 3.0, 1, 0.55),
                 Wave("neck", "pitch", 6.0, 1, 0.6, 0.03, offset=9.0), Wave("head", "pitch", 5.0, 1, 0.1, offset=-14.0),
@@ -86,7 +86,7 @@ RECIPES = {
         coats.tiger,
         {"ear": "231a15", "nose": "b5675a", "tip": "1d1612", "eye": "17130c"},
         {
-            "walk": Gait(WALK_PHASES, 0.64, 0.48, 0.09, 50, (0.02, 0.05), (
+            "walk": Gait(WALK_PHASES, 0.64, 0.48, 0.15, 50, (0.02, 0.05), (
                 Wave("spine.0", "rise", 0.010, 2, 0.1, offset=-0.025), Wave("spine.0", "roll", 3.0, 1, 0.1),
                 Wave("spine", "yaw", 3.5, 1, 0.0, 0.2), Wave("neck", "pitch", 2.5, 2, 0.3, 0.05, offset=4.0),
                 Wave("neck", "yaw", 2.0, 1, 0.5), Wave("head", "pitch", 3.0, 2, 0.6, offset=-6.0),
@@ -103,7 +103,7 @@ RECIPES = {
         coats.giraffe,
         {"mane": "7a4a22", "horn": "33241a", "tuft": "2a1c14", "hoof": "4a3a2e", "eye": "140d0a"},
         {
-            "walk": Gait(WALK_PHASES, 0.64, 1.0, 0.20, 40, (0.06, 0.10), (
+            "walk": Gait(WALK_PHASES, 0.64, 1.0, 0.28, 40, (0.06, 0.10), (
                 Wave("spine.0", "rise", 0.03, 2, 0.1, offset=-0.05), Wave("spine.0", "roll", 1.5, 1, 0.1),
                 Wave("spine", "yaw", 1.0, 1, 0.0, 0.15), Wave("neck", "pitch", 3.0, 2, 0.3, 0.06, offset=2.0),
                 Wave("head", "pitch", 4.0, 2, 0.6), Wave("tail", "yaw", 10.0, 1, 0.0, 0.12),
