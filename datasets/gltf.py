@@ -7,6 +7,7 @@ import base64
 import binascii
 import struct
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 import cv2
@@ -19,7 +20,14 @@ from rewild4d.errors import UserError
 Floats = NDArray[np.float64]
 
 COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+TYPES: dict[int, type[Any]] = {
+    5120: np.int8,
+    5121: np.uint8,
+    5122: np.int16,
+    5123: np.uint16,
+    5125: np.uint32,
+    5126: np.float32,
+}
 READABLE_EXTENSIONS = {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"}
 
 

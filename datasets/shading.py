@@ -53,14 +53,16 @@ class Picture:
 
     def render(self, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Straight sRGB colour [h, w, 3] and matte [h, w], area averages over SAMPLES x SAMPLES rays a pixel."""
-        rgb, alpha = np.zeros((camera.height, camera.width, 3)), np.zeros((camera.height, camera.width))
+        rgb = np.zeros((camera.height, camera.width, 3), np.float32)
+        alpha = np.zeros((camera.height, camera.width), np.float32)
         left, top, right, bottom = self._window(camera)
         if right > left and bottom > top:
             rays = self._rays(camera, left, top, right, bottom)
-            color, hit = self._cast(rays)
-            shape = (bottom - top, SAMPLES, right - left, SAMPLES)
-            alpha[top:bottom, left:right] = hit.reshape(shape).mean((1, 3))
-            rgb[top:bottom, left:right] = color.reshape(*shape, 3).mean((1, 3))
+            where, color = self._cast(rays)
+            pixel, count = where % ((bottom - top) * (right - left)), (bottom - top) * (right - left)
+            sums = [np.bincount(pixel, channel, count) for channel in (*color.T, np.ones(len(pixel)))]
+            window = np.stack(sums, axis=1).reshape(bottom - top, right - left, 4) / SAMPLES**2
+            rgb[top:bottom, left:right], alpha[top:bottom, left:right] = window[..., :3], window[..., 3]
         return _straight(rgb, alpha), np.round(alpha * 255).astype(np.uint8)
 
     def _window(self, camera: Camera) -> tuple[int, int, int, int]:
@@ -77,45 +79,48 @@ class Picture:
         return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
     def _rays(self, camera: Camera, left: int, top: int, right: int, bottom: int) -> NDArray[np.float32]:
-        """Origins and directions of all rays of a window, rows first, [n, 6]."""
+        """Origins and directions of all rays of a window: every pixel once, for one sample after the other, [n, 6]."""
         world_to_camera = camera.world_to_camera.numpy()
-        u = left + (np.arange((right - left) * SAMPLES) + 0.5) / SAMPLES
-        v = top + (np.arange((bottom - top) * SAMPLES) + 0.5) / SAMPLES
+        inner = (np.arange(SAMPLES) + 0.5) / SAMPLES
+        u = np.arange(left, right) + inner[:, None, None]
+        v = np.arange(top, bottom)[:, None] + inner[:, None, None, None]
         to_world = world_to_camera[:3, :3].T @ np.linalg.inv(camera.intrinsics.numpy())
-        directions = u[None, :, None] * to_world[:, 0] + v[:, None, None] * to_world[:, 1] + to_world[:, 2]
-        rays = np.empty((*directions.shape[:2], 6), np.float32)
+        rays = np.empty((SAMPLES, SAMPLES, bottom - top, right - left, 6), np.float32)
         rays[..., :3] = camera.center.numpy() - self.origin
-        rays[..., 3:] = directions
+        for axis in range(3):
+            rays[..., 3 + axis] = u * to_world[axis, 0] + (v * to_world[axis, 1] + to_world[axis, 2])
         return rays.reshape(-1, 6)
 
-    def _cast(self, rays: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Shaded colour (black where nothing is hit) and hit flag of each ray, [n, 3] and [n]."""
+    def _cast(self, rays: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Which rays hit the animal, [m], and the shaded colour that they see, [m, 3]."""
         answer = {key: value.numpy() for key, value in self.scene.cast_rays(rays).items()}
-        hit = np.isfinite(answer["t_hit"])
-        where = np.flatnonzero(hit)
+        where = np.flatnonzero(np.isfinite(answer["t_hit"]))
         geometry = answer["geometry_ids"][where]
         primitive = answer["primitive_ids"][where].astype(np.int64)
         share = barycentric(answer["primitive_uvs"][where])
-        shade = self._shade(answer["primitive_normals"][where], rays[where, 3:])
-        color = np.zeros((len(rays), 3))
+        color = np.empty((len(where), 3), np.float32)
         for number, surface in enumerate(self.surfaces):
             mine = np.flatnonzero(geometry == number)
             if len(mine):
-                albedo = _albedo(surface, surface.faces[primitive[mine]], share[mine])
-                color[where[mine]] = albedo * shade[mine, None]
-        return color, hit
+                color[mine] = _albedo(surface, surface.faces[primitive[mine]], share[mine])
+        return where, color * self._shade(answer["primitive_normals"][where], rays[where, 3:])[:, None]
 
-    def _shade(self, normals: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.float64]:
+    def _shade(self, normals: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.float32]:
         """Factor in [0.7, 1] from the flat normals, turned towards the viewer, [n]."""
-        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
-        normals = np.where((normals * directions).sum(1, keepdims=True) > 0, -normals, normals)
-        sky = 0.5 + 0.5 * normals @ self.up
-        return AMBIENT + SKY * sky + SUN * np.maximum(normals @ self.sun, 0.0)
+        away = np.einsum("na,na->n", normals, directions)
+        length = np.sqrt(np.einsum("na,na->n", normals, normals))
+        sign = np.where(away > 0, -1.0, 1.0) / np.maximum(length, 1e-20)
+        axes = np.stack((self.up, self.sun), axis=1).astype(np.float32)
+        above, lit = (normals @ axes).T * sign.astype(np.float32)
+        return AMBIENT + SKY * (0.5 + 0.5 * above) + SUN * np.maximum(lit, 0.0)
 
 
 def _albedo(surface: Surface, corners: NDArray[np.int64], share: NDArray[np.float64]) -> NDArray[np.float64]:
     """Unshaded colour at points of triangles, [n, 3]."""
-    color = np.einsum("nk,nkc->nc", share, surface.colors[corners])
+    if (surface.colors == surface.colors[0]).all():  # flat, which is common and cheap
+        color = surface.colors[:1]
+    else:
+        color = np.einsum("nk,nkc->nc", share, surface.colors[corners])
     if surface.texture is None or surface.uv is None:
         return color
     return color * sample_texture(surface.texture, np.einsum("nk,nkc->nc", share, surface.uv[corners]))
@@ -133,7 +138,7 @@ def sample_texture(texture: NDArray[np.uint8], uv: NDArray[np.float64]) -> NDArr
     return ((1 - fy) * upper + fy * lower) / 255.0
 
 
-def _straight(premultiplied: NDArray[np.float64], alpha: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _straight(premultiplied: NDArray[np.float32], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Un-premultiplied colour, carried a little past the silhouette, black beyond, [h, w, 3]."""
     spread = cv2.blur(np.dstack((premultiplied, alpha)), (DILATION, DILATION))
     color = np.where(alpha[..., None] > 0, premultiplied, spread[..., :3])
