@@ -89,7 +89,7 @@ class Artemis:
     def _table(self, selection: Selection) -> dict[str, tuple[str, str, str]]:
         """Case name -> animal, motion, placement ("" for none)."""
         placements = selection.placements if selection.cameras == "fixed" else ()
-        table = {}
+        table: dict[str, tuple[str, str, str]] = {}
         for animal, folder in self._animals.items():
             read_intrinsics(folder / "Intrinsic.inf", len(read_cameras(folder / "CamPose.inf")))
             for motion in list_motions(folder):

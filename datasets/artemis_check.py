@@ -73,15 +73,16 @@ class _Check:
 
     def _images(self, motion: str, frames: list[Path], views: int, intrinsics: np.ndarray | None) -> None:
         """Decode every view of every frame."""
-        pairs = [
-            pair for frame in frames for pair in self._attempt(lambda frame=frame: list_images(frame, views)) or []
-        ]
+        pairs: list[ImagePair] = []
+        for frame in frames:
+            pairs += self._attempt(list_images, frame, views) or []
         first = self._attempt(read_rgb, pairs[0].rgb) if pairs else None
         source = (first.shape[1], first.shape[0]) if first is not None else None
         title = f"checking {self.animal.name}/{motion}"
         with ThreadPoolExecutor(2) as pool:
-            results = pool.map(lambda pair: _is_seen(pair, source), pairs)
-            for pair, seen in zip(pairs, tqdm(results, total=len(pairs), desc=title, disable=None, leave=False)):
+            results = pool.map(_is_seen, pairs, [source] * len(pairs))
+            progress = tqdm(results, total=len(pairs), desc=title, disable=None, leave=False)
+            for pair, seen in zip(pairs, progress, strict=True):
                 if isinstance(seen, UserError):
                     self._fault(seen)
                 elif not seen:
