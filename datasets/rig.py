@@ -66,7 +66,7 @@ def load_rig(path: Path, clip: str, frames: int = 24) -> AnimatedAnimal:
         AnimatedAnimal(
             name=_folder_name(path.stem),
             species=path.stem,
-            licence=(document.tree.asset.copyright or "see the rig file"),
+            licence=document.tree.asset.copyright or f"that of the rig file {path.name}",
             surfaces=tuple(surfaces),
             bone_names=tuple(document.tree.nodes[i].name or f"node_{i}" for i in skeleton.nodes),
             parents=skeleton.parents(),

@@ -101,7 +101,15 @@ def render_artemis(
     total = len(posed) * views
     with (
         ArtemisWriter(
-            out, cameras, first.bones_rest, first.parents, volume.voxels, volume.indices, volume.weights, volume.radius
+            out,
+            cameras,
+            first.bones_rest,
+            first.parents,
+            volume.voxels,
+            volume.indices,
+            volume.weights,
+            volume.radius,
+            first.licence,
         ) as writer,
         ThreadPoolExecutor(1) as encoder,
     ):

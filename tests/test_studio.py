@@ -103,6 +103,7 @@ def test_matte_agrees_with_projected_triangles(tmp_path: Path, up: tuple[float, 
 
 def test_colors_are_straight_and_shaded_mildly(tmp_path: Path) -> None:
     render_artemis([toy()], tmp_path / "toy", views=4, width=96, height=54)
+    assert (tmp_path / "toy" / "licence.txt").read_text() == "CC0\n"
     seen = set()
     for view in range(4):
         rgb, alpha = read(tmp_path / "toy", "nod", 0, view)
