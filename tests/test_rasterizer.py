@@ -149,7 +149,8 @@ def test_one_round_gaussian_is_its_closed_form(backend: str) -> None:
     pinhole = torch.tensor([[[focal, 0, 8.5], [0, focal, 8.5], [0, 0, 1]]])
     image, alpha, info = rasterize(
         torch.tensor([[0.0, 0, depth]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), sigma),
-        torch.tensor([opacity]), torch.tensor([[2.0]]), camera, pinhole, 17, 17, background=torch.tensor([0.5]), eps2d=eps2d, backend=backend,
+        torch.tensor([opacity]), torch.tensor([[2.0]]), camera, pinhole, 17, 17, background=torch.tensor([0.5]),
+        eps2d=eps2d, backend=backend,
     )  # fmt: skip
     variance = (focal * sigma / depth) ** 2 + eps2d
     expected = opacity * math.exp(-0.5 * (3**2 + 2**2) / variance)  # pixel (11, 10) has its centre at (11.5, 10.5)

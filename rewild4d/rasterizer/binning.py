@@ -104,16 +104,18 @@ def count_slots(
 
 
 @kernel
-def _reached_blocks(record: np.ndarray, left: int, top: int, block_left: np.ndarray, block_top: np.ndarray) -> int:
+def _reached_blocks(
+    records: np.ndarray, view: int, n: int, left: int, top: int, block_left: np.ndarray, block_top: np.ndarray
+) -> int:
     """Bits of the blocks in which the exponent at some point between pixel centres exceeds log2(1/255).
 
     The maximum over a rectangle lies on one of the two sides that face the centre, at the clamped one-dimensional
     optimum; all sixteen blocks are tested at once.
     """
     zero, span = splat(np.float32(0)), splat(np.float32(BLOCK - 1))
-    xx, xy, yy = record[XX], record[XY], record[YY]
-    low_x = load(block_left, 0) + splat(np.float32(left + 0.5 - record[CENTER_X]))
-    low_y = load(block_top, 0) + splat(np.float32(top + 0.5 - record[CENTER_Y]))
+    xx, xy, yy = records[view, n, XX], records[view, n, XY], records[view, n, YY]
+    low_x = load(block_left, 0) + splat(np.float32(left + 0.5 - records[view, n, CENTER_X]))
+    low_y = load(block_top, 0) + splat(np.float32(top + 0.5 - records[view, n, CENTER_Y]))
     high_x, high_y = low_x + span, low_y + span
     near_x, near_y = minimum(maximum(zero, low_x), high_x), minimum(maximum(zero, low_y), high_y)
     best_y = minimum(maximum(near_x * splat(np.float32(-0.5) * xy / yy), low_y), high_y)
@@ -121,7 +123,7 @@ def _reached_blocks(record: np.ndarray, left: int, top: int, block_left: np.ndar
     a, b, c = splat(xx), splat(xy), splat(yy)
     on_column = fma(near_x, fma(a, near_x, b * best_y), c * (best_y * best_y))
     on_row = fma(best_x, fma(a, best_x, b * near_y), c * (near_y * near_y))
-    needed = np.float32(LOG2_MIN_ALPHA) - record[LOG_OPACITY]
+    needed = np.float32(LOG2_MIN_ALPHA) - records[view, n, LOG_OPACITY]
     return bits_gt(maximum(on_column, on_row), splat(needed * np.float32(1.0001) - SLACK))
 
 
@@ -147,7 +149,7 @@ def mark_pairs(
         left, right, top, bottom = _tile_rectangle(records, view, n, tiles_x, tiles_y)
         for tile_y in range(top, bottom):
             for tile_x in range(left, right):
-                bits = _reached_blocks(records[view, n], tile_x * TILE, tile_y * TILE, block_left, block_top)
+                bits = _reached_blocks(records, view, n, tile_x * TILE, tile_y * TILE, block_left, block_top)
                 tile = (view * tiles_y + tile_y) * tiles_x + tile_x
                 pair_tile[slot] = tile
                 pair_bits[slot] = bits

@@ -19,6 +19,7 @@ from rewild4d.rasterizer.projection import (
     CENTER_Y,
     LOG2_MIN_ALPHA,
     LOG_OPACITY,
+    RECORD,
     XX,
     XY,
     YY,
@@ -36,12 +37,14 @@ from rewild4d.rasterizer.simd import (
     fold8,
     keep_where_ge,
     load,
+    load_block,
     lowest_bit,
     minimum,
     rows_of_block,
     select_gt,
     splat,
     store,
+    store_block,
     take_ticket,
 )
 
@@ -60,16 +63,39 @@ def slot_width(channels: int) -> int:
     return -(-(MOMENTS + channels) // LANES) * LANES
 
 
+_slot_width = kernel(slot_width)
+
+
 @kernel
-def _exponent(record: np.ndarray, dx: object, dy: object) -> object:
-    """log2 of alpha before the cap, at one block's pixels."""
-    along_x = fma(splat(record[XX]), dx, splat(record[XY]) * dy)
-    return fma(along_x, dx, fma(splat(record[YY]), dy * dy, splat(record[LOG_OPACITY])))
+def _form(records: np.ndarray, record: int) -> tuple:
+    """The four coefficients of one Gaussian's exponent, each in all lanes."""
+    xx, xy, yy = records[record + XX], records[record + XY], records[record + YY]
+    return splat(xx), splat(xy), splat(yy), splat(records[record + LOG_OPACITY])
+
+
+@kernel
+def _offsets(records: np.ndarray, record: int, tile_left: int, tile_top: int) -> tuple:
+    """From the Gaussian's centre to the pixel centres of the tile's first block, two vectors."""
+    dx = splat(np.float32(tile_left + 0.5 - records[record + CENTER_X]))
+    dy = splat(np.float32(tile_top + 0.5 - records[record + CENTER_Y]))
+    return columns_of_block() + dx, rows_of_block() + dy
+
+
+@kernel
+def _exponent(form: tuple, offset_x: object, offset_y: object, block: int) -> tuple:
+    """The offsets of one block's pixels from the centre, and log2 of alpha there before the cap."""
+    xx, xy, yy, log_opacity = form
+    dx = offset_x + splat(np.float32(BLOCK * (block & 3)))
+    dy = offset_y + splat(np.float32(BLOCK * (block >> 2)))
+    return dx, dy, fma(fma(xx, dx, xy * dy), dx, fma(yy, dy * dy, log_opacity))
 
 
 @kernel
 def _open_tile(tile_left: int, tile_top: int, width: int, height: int, transmittance: np.ndarray) -> int:
     """Set transmittance to 1 inside the image and 0 outside; give the bits of the blocks that hold a pixel."""
+    if tile_left + TILE <= width and tile_top + TILE <= height:
+        transmittance[:] = 1
+        return (1 << BLOCKS) - 1
     live = 0
     for block in range(BLOCKS):
         for lane in range(LANES):
@@ -99,9 +125,10 @@ def blend(
 ) -> None:
     """Blend tiles until no ticket is left: fill image [V, C, h, w] and alpha [V, 1, h, w].
 
-    On the way ``pair_bits`` shrinks to the blocks to which a pair really contributed.
+    ``records`` and ``features`` are flat. ``pair_bits`` shrinks to the blocks where a pair really contributed.
     """
     views, channels, height, width = image.shape
+    count = len(records) // (RECORD * views)
     left, final = np.empty(BLOCKS * LANES, np.float32), np.empty(BLOCKS * LANES, np.float32)
     colors = np.empty(BLOCKS * channels * LANES, np.float32)
     while True:
@@ -118,8 +145,9 @@ def blend(
             if bits != 0:
                 n = entry_gaussian[entry]
                 touched, closed = _blend_entry(
-                    bits, records[view, n], features[n], tile_left, tile_top, left, final, colors
-                )
+                    bits, records, (view * count + n) * RECORD, features, n * channels, channels, tile_left, tile_top,
+                    left, final, colors,
+                )  # fmt: skip
                 pair_bits[slot] = touched
                 live &= ~closed
             else:
@@ -136,8 +164,11 @@ def _tile_place(tile: int, tiles_x: int, tiles_y: int) -> tuple:
 @kernel
 def _blend_entry(
     bits: int,
-    record: np.ndarray,
-    feature: np.ndarray,
+    records: np.ndarray,
+    record: int,
+    features: np.ndarray,
+    feature: int,
+    channels: int,
     tile_left: int,
     tile_top: int,
     left: np.ndarray,
@@ -146,16 +177,13 @@ def _blend_entry(
 ) -> tuple:
     """Blend one Gaussian into the blocks of ``bits``; give the blocks that it touched and those that are now closed."""
     zero, least = splat(np.float32(0)), splat(_MIN_TRANSMITTANCE)
-    offset_x = np.float32(tile_left + 0.5 - record[CENTER_X])
-    offset_y = np.float32(tile_top + 0.5 - record[CENTER_Y])
-    channels = feature.shape[0]
+    form = _form(records, record)
+    offset_x, offset_y = _offsets(records, record, tile_left, tile_top)
     touched, closed = 0, 0
     while bits != 0:
         block = lowest_bit(bits)
         bits &= bits - 1
-        dx = columns_of_block() + splat(np.float32(offset_x + np.float32(BLOCK * (block & 3))))
-        dy = rows_of_block() + splat(np.float32(offset_y + np.float32(BLOCK * (block >> 2))))
-        exponent = _exponent(record, dx, dy)
+        dx, dy, exponent = _exponent(form, offset_x, offset_y, block)
         alpha = keep_where_ge(minimum(exp2(exponent), splat(_MAX_ALPHA)), exponent, splat(_WEAKEST))
         before = load(left, block * LANES)
         weight = alpha * before
@@ -168,7 +196,7 @@ def _blend_entry(
         closed |= (bits_gt(after, zero) == 0) << block
         for channel in range(channels):
             place = (block * channels + channel) * LANES
-            store(colors, place, fma(weight, splat(feature[channel]), load(colors, place)))
+            store(colors, place, fma(weight, splat(features[feature + channel]), load(colors, place)))
     return touched, closed
 
 
@@ -184,16 +212,42 @@ def _write_tile(
     alpha: np.ndarray,
 ) -> None:
     _, channels, height, width = image.shape
+    pixels, mattes = image.reshape(-1), alpha.reshape(-1)
     for block in range(BLOCKS):
-        x0, y0 = tile_left + BLOCK * (block % 4), tile_top + BLOCK * (block // 4)
-        for y in range(y0, min(y0 + BLOCK, height)):
-            for x in range(x0, min(x0 + BLOCK, width)):
-                lane = (y - y0) * 4 + x - x0
-                through = final[block * LANES + lane]
-                alpha[view, 0, y, x] = np.float32(1) - through
-                for channel in range(channels):
-                    behind = through * background[view, channel]
-                    image[view, channel, y, x] = colors[(block * channels + channel) * LANES + lane] + behind
+        x, y = tile_left + BLOCK * (block % 4), tile_top + BLOCK * (block // 4)
+        through = load(final, block * LANES)
+        _write_block(mattes, view * height, x, y, width, height, splat(np.float32(1)) - through)
+        for channel in range(channels):
+            color = load(colors, (block * channels + channel) * LANES)
+            color = fma(through, splat(background[view, channel]), color)
+            _write_block(pixels, (view * channels + channel) * height, x, y, width, height, color)
+
+
+@kernel
+def _write_block(plane: np.ndarray, first_row: int, x: int, y: int, width: int, height: int, value: object) -> None:
+    """Store the part of a block that lies in the image."""
+    corner = (first_row + y) * width + x
+    if x + BLOCK <= width and y + BLOCK <= height:
+        store_block(plane, corner, width, value)
+    elif x < width and y < height:
+        lanes = np.empty(LANES, np.float32)
+        store(lanes, 0, value)
+        for row in range(min(BLOCK, height - y)):
+            for column in range(min(BLOCK, width - x)):
+                plane[corner + row * width + column] = lanes[row * BLOCK + column]
+
+
+@kernel
+def _read_block(plane: np.ndarray, first_row: int, x: int, y: int, width: int, height: int) -> object:
+    """Load a block, zero where it leaves the image."""
+    corner = (first_row + y) * width + x
+    if x + BLOCK <= width and y + BLOCK <= height:
+        return load_block(plane, corner, width)
+    lanes = np.zeros(LANES, np.float32)
+    for row in range(min(BLOCK, height - y)):
+        for column in range(min(BLOCK, width - x)):
+            lanes[row * BLOCK + column] = plane[corner + row * width + column]
+    return load(lanes, 0)
 
 
 @kernel
@@ -215,9 +269,11 @@ def blend_backward(
 ) -> None:
     """Fill the slots' rows of ``sums`` (`slot_width` numbers each) for tiles until no ticket is left."""
     views, channels, height, width = image.shape
+    count = len(records) // (RECORD * views)
     left, behind = np.empty(BLOCKS * LANES, np.float32), np.empty(BLOCKS * LANES, np.float32)
     gradients = np.empty(BLOCKS * channels * LANES, np.float32)
-    rows = np.empty(slot_width_kernel(channels) * LANES, np.float32)
+    row_length = _slot_width(channels)
+    rows = np.empty(row_length * LANES, np.float32)
     while True:
         tile = take_ticket(tickets)
         if tile >= views * tiles_x * tiles_y:
@@ -233,12 +289,9 @@ def blend_backward(
             if bits != 0:
                 n = entry_gaussian[entry]
                 _entry_backward(
-                    bits, records[view, n], features[n], tile_left, tile_top, left, behind, gradients, rows,
-                    sums, slot * slot_width_kernel(channels),
+                    bits, records, (view * count + n) * RECORD, features, n * channels, channels, tile_left, tile_top,
+                    left, behind, gradients, rows, sums, slot * row_length,
                 )  # fmt: skip
-
-
-slot_width_kernel = kernel(slot_width)
 
 
 @kernel
@@ -255,28 +308,28 @@ def _read_tile(
 ) -> None:
     """Load dL/dimage per block, and the loss's linear share of everything blended: sum of g.out minus T dL/dalpha."""
     _, channels, height, width = image.shape
+    pixels, mattes, g_pixels, g_mattes = image.reshape(-1), alpha.reshape(-1), g_image.reshape(-1), g_alpha.reshape(-1)
+    one = splat(np.float32(1))
     for block in range(BLOCKS):
-        x0, y0 = tile_left + BLOCK * (block % 4), tile_top + BLOCK * (block // 4)
-        for lane in range(LANES):
-            x, y = x0 + lane % 4, y0 + lane // 4
-            if x < width and y < height:
-                total = -(np.float32(1) - alpha[view, 0, y, x]) * g_alpha[view, 0, y, x]
-                for channel in range(channels):
-                    slope = g_image[view, channel, y, x]
-                    gradients[(block * channels + channel) * LANES + lane] = slope
-                    total += slope * image[view, channel, y, x]
-                behind[block * LANES + lane] = total
-            else:
-                behind[block * LANES + lane] = 0
-                for channel in range(channels):
-                    gradients[(block * channels + channel) * LANES + lane] = 0
+        x, y = tile_left + BLOCK * (block % 4), tile_top + BLOCK * (block // 4)
+        through = one - _read_block(mattes, view * height, x, y, width, height)
+        total = splat(np.float32(0)) - through * _read_block(g_mattes, view * height, x, y, width, height)
+        for channel in range(channels):
+            first_row = (view * channels + channel) * height
+            slope = _read_block(g_pixels, first_row, x, y, width, height)
+            store(gradients, (block * channels + channel) * LANES, slope)
+            total = fma(slope, _read_block(pixels, first_row, x, y, width, height), total)
+        store(behind, block * LANES, total)
 
 
 @kernel
 def _entry_backward(
     bits: int,
-    record: np.ndarray,
-    feature: np.ndarray,
+    records: np.ndarray,
+    record: int,
+    features: np.ndarray,
+    feature: int,
+    channels: int,
     tile_left: int,
     tile_top: int,
     left: np.ndarray,
@@ -288,18 +341,15 @@ def _entry_backward(
 ) -> None:
     """Sum one Gaussian's six moments and channel gradients over the blocks of ``bits`` into sums[place:]."""
     zero, one, least = splat(np.float32(0)), splat(np.float32(1)), splat(_MIN_TRANSMITTANCE)
-    offset_x = np.float32(tile_left + 0.5 - record[CENTER_X])
-    offset_y = np.float32(tile_top + 0.5 - record[CENTER_Y])
-    channels = feature.shape[0]
+    form = _form(records, record)
+    offset_x, offset_y = _offsets(records, record, tile_left, tile_top)
     for channel in range(channels):
         store(rows, (MOMENTS + channel) * LANES, zero)
     m, mx, my, mxx, mxy, myy = zero, zero, zero, zero, zero, zero
     while bits != 0:
         block = lowest_bit(bits)
         bits &= bits - 1
-        dx = columns_of_block() + splat(np.float32(offset_x + np.float32(BLOCK * (block & 3))))
-        dy = rows_of_block() + splat(np.float32(offset_y + np.float32(BLOCK * (block >> 2))))
-        exponent = _exponent(record, dx, dy)
+        dx, dy, exponent = _exponent(form, offset_x, offset_y, block)
         alpha = keep_where_ge(minimum(exp2(exponent), splat(_MAX_ALPHA)), exponent, splat(_WEAKEST))
         before = load(left, block * LANES)
         weight = alpha * before
@@ -309,7 +359,7 @@ def _entry_backward(
         along = zero
         for channel in range(channels):
             slope = load(gradients, (block * channels + channel) * LANES)
-            along = fma(slope, splat(feature[channel]), along)
+            along = fma(slope, splat(features[feature + channel]), along)
             row = (MOMENTS + channel) * LANES
             store(rows, row, fma(weight, slope, load(rows, row)))
         rest = load(behind, block * LANES) - weight * along

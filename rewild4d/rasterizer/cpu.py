@@ -195,7 +195,7 @@ class _Blend(torch.autograd.Function):
         image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
         call = (
             np.zeros(1, np.int64), *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.pair_bits,
-            records.numpy(), _array(features), _array(background), image.numpy(), alpha.numpy(),
+            records.numpy().ravel(), _array(features).ravel(), _array(background), image.numpy(), alpha.numpy(),
         )  # fmt: skip
         run(blend, [call] * _blend_threads(lists))
         ctx.save_for_backward(records, features, background, image, alpha)
@@ -212,7 +212,8 @@ class _Blend(torch.autograd.Function):
         sums = np.empty(len(lists.pair_bits) * width, np.float32)
         call = (
             np.zeros(1, np.int64), *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.pair_bits,
-            records.numpy(), _array(features), image.numpy(), alpha.numpy(), _array(g_image), _array(g_alpha), sums,
+            records.numpy().ravel(), _array(features).ravel(), image.numpy(), alpha.numpy(),
+            _array(g_image), _array(g_alpha), sums,
         )  # fmt: skip
         run(blend_backward, [call] * _blend_threads(lists))
         v_means2d = torch.zeros(*records.shape[:2], 2)

@@ -54,10 +54,15 @@ def _axes(w: float, x: float, y: float, z: float) -> tuple:
 
 
 @kernel
-def _tangent(ratio: float, focal: float, center: float, size: int) -> float:
-    """Where the Jacobian is taken: the ratio x / z, clamped to a little outside the frame."""
+def _limits(focal: float, center: float, size: int) -> tuple:
+    """Between which x / z the Jacobian is taken: a little outside the frame."""
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
-    return min(max(ratio, -center / focal - margin), (size - center) / focal + margin)
+    return -center / focal - margin, (size - center) / focal + margin
+
+
+@kernel
+def _clamp(value: float, limits: tuple) -> float:
+    return min(max(value, limits[0]), limits[1])
 
 
 @kernel
@@ -98,6 +103,7 @@ def project(
         )
         move = world_to_camera[view, 0, 3], world_to_camera[view, 1, 3], world_to_camera[view, 2, 3]
         fx, fy, cx, cy = intrinsics[view, 0, 0], intrinsics[view, 1, 1], intrinsics[view, 0, 2], intrinsics[view, 1, 2]
+        limits_x, limits_y = _limits(fx, cx, width), _limits(fy, cy, height)
         for n in range(begin, end):
             means2d[view, n, :] = 0
             records[view, n, :] = 0
@@ -107,11 +113,12 @@ def project(
             z = _dot(row_z, mean) + move[2]
             if not z > near:
                 continue
-            slope_x, slope_y = (_dot(row_x, mean) + move[0]) / z, (_dot(row_y, mean) + move[1]) / z
+            near_by = 1 / z
+            slope_x, slope_y = (_dot(row_x, mean) + move[0]) * near_by, (_dot(row_y, mean) + move[1]) * near_by
             u, v = fx * slope_x + cx, fy * slope_y + cy
             means2d[view, n, 0], means2d[view, n, 1] = u, v
-            linear_x = _mix(fx / z, row_x, -fx / z * _tangent(slope_x, fx, cx, width), row_z)
-            linear_y = _mix(fy / z, row_y, -fy / z * _tangent(slope_y, fy, cy, height), row_z)
+            linear_x = _mix(fx * near_by, row_x, -fx * near_by * _clamp(slope_x, limits_x), row_z)
+            linear_y = _mix(fy * near_by, row_y, -fy * near_by * _clamp(slope_y, limits_y), row_z)
             qw, qx, qy, qz, _ = _unit_quat(quats, n)
             half_x, half_y = _image_axes(linear_x, linear_y, _axes(qw, qx, qy, qz), scales, n)
             raw_xx, xy, raw_yy = _dot(half_x, half_x), _dot(half_x, half_y), _dot(half_y, half_y)
@@ -122,7 +129,8 @@ def project(
                 opacity *= math.sqrt(max((raw_xx * raw_yy - xy * xy) / det, MIN_COMPENSATION))
             if not (opacity > MIN_ALPHA and det > 0):
                 continue
-            reach = 2 * math.log(opacity / MIN_ALPHA)
+            log_opacity = math.log2(opacity)
+            reach = (log_opacity - LOG2_MIN_ALPHA) / HALF_LOG2_E
             extent_x, extent_y = math.sqrt(reach * xx), math.sqrt(reach * yy)
             if not (u + extent_x > 0 and u - extent_x < width and v + extent_y > 0 and v - extent_y < height):
                 continue
@@ -130,9 +138,10 @@ def project(
             radii[view, n] = math.sqrt(reach * (0.5 * (xx + yy) + math.sqrt(spread * spread + xy * xy)))
             depths[view, n] = z
             records[view, n, CENTER_X], records[view, n, CENTER_Y] = u, v
-            records[view, n, XX], records[view, n, YY] = -HALF_LOG2_E * yy / det, -HALF_LOG2_E * xx / det
-            records[view, n, XY] = 2 * HALF_LOG2_E * xy / det
-            records[view, n, LOG_OPACITY] = math.log2(opacity)
+            factor = HALF_LOG2_E / det
+            records[view, n, XX], records[view, n, YY] = -factor * yy, -factor * xx
+            records[view, n, XY] = 2 * factor * xy
+            records[view, n, LOG_OPACITY] = log_opacity
             records[view, n, EXTENT_X], records[view, n, EXTENT_Y] = extent_x, extent_y
 
 
@@ -182,15 +191,15 @@ def _rotation_gradient(w: float, x: float, y: float, z: float, inverse: float, a
 
 @kernel
 def _pinhole_gradient(
-    slope: float, z: float, focal: float, center: float, size: int, g_center: float, g_direct: float, g_depth: float
+    slope: float, near_by: float, focal: float, limits: tuple, g_center: float, g_direct: float, g_depth: float
 ) -> tuple:
-    """One image axis: gradients of (x / z slope, z, focal) from those of the centre and the Jacobian's two entries."""
-    tangent = _tangent(slope, focal, center, size)
+    """One image axis: gradients of (slope x / z, z, focal) from those of the centre and the Jacobian's two entries."""
+    tangent = _clamp(slope, limits)
     g_slope = g_center * focal
     if tangent == slope:
-        g_slope -= g_depth * focal / z
-    g_z = (g_depth * tangent - g_direct) * focal / (z * z)
-    g_focal = g_center * slope + (g_direct - g_depth * tangent) / z
+        g_slope -= g_depth * focal * near_by
+    g_z = (g_depth * tangent - g_direct) * focal * near_by * near_by
+    g_focal = g_center * slope + (g_direct - g_depth * tangent) * near_by
     return g_slope, g_z, g_focal
 
 
@@ -230,14 +239,16 @@ def project_backward(
         )
         move = world_to_camera[view, 0, 3], world_to_camera[view, 1, 3], world_to_camera[view, 2, 3]
         fx, fy, cx, cy = intrinsics[view, 0, 0], intrinsics[view, 1, 1], intrinsics[view, 0, 2], intrinsics[view, 1, 2]
+        limits_x, limits_y = _limits(fx, cx, width), _limits(fy, cy, height)
         for n in range(begin, end):
             if radii[view, n] == 0:
                 continue
             mean = np.float64(means[n, 0]), np.float64(means[n, 1]), np.float64(means[n, 2])
             z = _dot(row_z, mean) + move[2]
-            slope_x, slope_y = (_dot(row_x, mean) + move[0]) / z, (_dot(row_y, mean) + move[1]) / z
-            direct_x, depth_x = fx / z, -fx / z * _tangent(slope_x, fx, cx, width)
-            direct_y, depth_y = fy / z, -fy / z * _tangent(slope_y, fy, cy, height)
+            near_by = 1 / z
+            slope_x, slope_y = (_dot(row_x, mean) + move[0]) * near_by, (_dot(row_y, mean) + move[1]) * near_by
+            direct_x, depth_x = fx * near_by, -fx * near_by * _clamp(slope_x, limits_x)
+            direct_y, depth_y = fy * near_by, -fy * near_by * _clamp(slope_y, limits_y)
             linear_x, linear_y = _mix(direct_x, row_x, depth_x, row_z), _mix(direct_y, row_y, depth_y, row_z)
             qw, qx, qy, qz, inverse = _unit_quat(quats, n)
             axes = _axes(qw, qx, qy, qz)
@@ -271,13 +282,13 @@ def project_backward(
             v_linear_y = _mix(1.0, _mix(v_half_y[0] * a, axes[0], v_half_y[1] * b, axes[1]), v_half_y[2] * c, axes[2])
             g_u, g_v = np.float64(g_means2d[view, n, 0]), np.float64(g_means2d[view, n, 1])
             v_slope_x, v_z_x, v_fx = _pinhole_gradient(
-                slope_x, z, fx, cx, width, g_u, _dot(v_linear_x, row_x), _dot(v_linear_x, row_z)
+                slope_x, near_by, fx, limits_x, g_u, _dot(v_linear_x, row_x), _dot(v_linear_x, row_z)
             )
             v_slope_y, v_z_y, v_fy = _pinhole_gradient(
-                slope_y, z, fy, cy, height, g_v, _dot(v_linear_y, row_y), _dot(v_linear_y, row_z)
+                slope_y, near_by, fy, limits_y, g_v, _dot(v_linear_y, row_y), _dot(v_linear_y, row_z)
             )
-            local_x, local_y = v_slope_x / z, v_slope_y / z
-            local_z = v_z_x + v_z_y - (v_slope_x * slope_x + v_slope_y * slope_y) / z
+            local_x, local_y = v_slope_x * near_by, v_slope_y * near_by
+            local_z = v_z_x + v_z_y - (v_slope_x * slope_x + v_slope_y * slope_y) * near_by
             for i in range(3):
                 v_means[n, i] += local_x * row_x[i] + local_y * row_y[i] + local_z * row_z[i]
                 v_cameras[view, 0, i] += local_x * mean[i] + direct_x * v_linear_x[i]
