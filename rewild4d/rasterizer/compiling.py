@@ -18,7 +18,8 @@ def _source_digest() -> str:
     return sha.hexdigest()[:16]
 
 
-_CACHE = Path(numba.config.CACHE_DIR or cache_folder() / "kernels") / _source_digest()
+_config: Any = numba.config
+_CACHE = Path(_config.CACHE_DIR or cache_folder() / "kernels") / _source_digest()
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -26,12 +27,12 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
 
     Where no cache folder can be written the kernel is compiled anew in every process.
     """
-    options = {"nogil": True, "error_model": "numpy"}
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(_CACHE)
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    before = _config.CACHE_DIR
+    _config.CACHE_DIR = str(_CACHE)
     try:
         return numba.njit(cache=True, **options)(function)
     except (RuntimeError, OSError):
         return numba.njit(**options)(function)
     finally:
-        numba.config.CACHE_DIR = before
+        _config.CACHE_DIR = before

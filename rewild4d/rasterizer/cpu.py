@@ -21,7 +21,8 @@ from rewild4d.rasterizer.binning import (
     sort_by_depth,
     start_tiles,
 )
-from rewild4d.rasterizer.blending import blend, blend_backward, gather_slots, slot_width
+from rewild4d.rasterizer.blending import blend
+from rewild4d.rasterizer.blending_backward import blend_backward, gather_slots, slot_width
 from rewild4d.rasterizer.conventions import RasterInfo
 from rewild4d.rasterizer.projection import CHUNK, RECORD, project, project_backward
 from rewild4d.rasterizer.threads import run, spans, thread_count

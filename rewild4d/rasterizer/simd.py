@@ -13,7 +13,10 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.typing import signature
 from numba.core.typing.templates import AbstractTemplate, infer_global
-from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba.extending import intrinsic as numba_intrinsic
+from numba.extending import lower_builtin, models, register_model
+
+intrinsic: Any = numba_intrinsic  # to a type checker its results are still functions of the typing context
 
 LANES = 16
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)

@@ -13,6 +13,7 @@ _Job = tuple[Callable[..., Any], tuple[Any, ...], "_Outcome"]
 
 class _Outcome:
     def __init__(self) -> None:
+        self.claim = threading.Lock()  # taken for good by whoever does the job
         self.done = threading.Lock()
         self.done.acquire()
         self.error: BaseException | None = None
@@ -35,6 +36,8 @@ os.register_at_fork(after_in_child=_forget_workers)
 def _work(jobs: "SimpleQueue[_Job]") -> None:
     while True:
         function, args, outcome = jobs.get()
+        if not outcome.claim.acquire(blocking=False):
+            continue
         try:
             function(*args)
         except BaseException as error:  # handed to the caller, who raises it
@@ -50,7 +53,8 @@ def thread_count() -> int:
 def run(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> None:
     """Call a function once per argument tuple, all at the same time; raise the first error.
 
-    The caller's thread takes the first call. Pass at most `thread_count` calls: each further one takes a thread.
+    The caller's thread takes the first call, then those that no worker has begun: on a busy machine nobody waits for a
+    thread to wake. Pass at most `thread_count` calls: each further one takes a thread.
     """
     global _workers
     if len(calls) > 1 and _workers < len(calls) - 1:
@@ -58,17 +62,26 @@ def run(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> None:
             while _workers < len(calls) - 1:
                 threading.Thread(target=_work, args=(_jobs,), daemon=True, name="rewild4d-raster").start()
                 _workers += 1
-    outcomes = []
-    for args in calls[1:]:
-        outcome = _Outcome()
-        outcomes.append(outcome)
+    outcomes = [_Outcome() for _ in calls[1:]]
+    for args, outcome in zip(calls[1:], outcomes, strict=True):
         _jobs.put((function, args, outcome))
+    begun = outcomes
     try:
         if calls:
             function(*calls[0])
+        begun = []
+        for args, outcome in zip(calls[1:], outcomes, strict=True):
+            if outcome.claim.acquire(blocking=False):
+                function(*args)
+            else:
+                begun.append(outcome)
     finally:
-        for outcome in outcomes:
-            outcome.done.acquire()
+        _wait(begun)
+
+
+def _wait(outcomes: list[_Outcome]) -> None:
+    for outcome in outcomes:
+        outcome.done.acquire()
     for outcome in outcomes:
         if outcome.error is not None:
             raise outcome.error

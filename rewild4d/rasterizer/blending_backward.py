@@ -1,0 +1,261 @@
+"""The gradient of blending, tile by tile.
+
+It walks front to back as the blend does: what lies behind Gaussian i is the pixel's total minus the prefix, so nothing
+is divided back and one number per pixel is enough, however many channels there are.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from rewild4d.rasterizer.binning import BLOCK, BLOCKS
+from rewild4d.rasterizer.blending import (
+    LEAST_LEFT,
+    STRONGEST_ALPHA,
+    WEAKEST,
+    exponent_at,
+    form,
+    offsets,
+    open_tile,
+    tile_place,
+)
+from rewild4d.rasterizer.compiling import kernel
+from rewild4d.rasterizer.conventions import MAX_ALPHA
+from rewild4d.rasterizer.projection import LOG_OPACITY, RECORD, XX, XY, YY
+from rewild4d.rasterizer.simd import (
+    LANES,
+    divide,
+    exp2,
+    fma,
+    fold1,
+    fold2,
+    fold4,
+    fold8,
+    keep_where_ge,
+    load,
+    load_block,
+    lowest_bit,
+    minimum,
+    select_gt,
+    splat,
+    store,
+    take_ticket,
+)
+
+MOMENTS = 6
+"""Sums of q, q dx, q dy, q dx^2, q dx dy, q dy^2 that come before the channel sums in a slot, q = dL/dalpha alpha."""
+
+LN2 = math.log(2.0)
+_STRONGEST = np.float32(math.log2(MAX_ALPHA))
+
+
+def slot_width(channels: int) -> int:
+    """Numbers in a slot: the moments and channel sums, rounded up to whole vectors."""
+    return -(-(MOMENTS + channels) // LANES) * LANES
+
+
+_slot_width = kernel(slot_width)
+
+
+@kernel
+def _read_block(plane: np.ndarray, first_row: int, x: int, y: int, width: int, height: int) -> Any:
+    """Load a block, zero where it leaves the image."""
+    corner = (first_row + y) * width + x
+    if x + BLOCK <= width and y + BLOCK <= height:
+        return load_block(plane, corner, width)
+    lanes = np.zeros(LANES, np.float32)
+    for row in range(min(BLOCK, height - y)):
+        for column in range(min(BLOCK, width - x)):
+            lanes[row * BLOCK + column] = plane[corner + row * width + column]
+    return load(lanes, 0)
+
+
+@kernel
+def blend_backward(
+    tickets: np.ndarray,
+    tiles_x: int,
+    tiles_y: int,
+    starts: np.ndarray,
+    entry_gaussian: np.ndarray,
+    entry_slot: np.ndarray,
+    pair_bits: np.ndarray,
+    records: np.ndarray,
+    features: np.ndarray,
+    image: np.ndarray,
+    alpha: np.ndarray,
+    g_image: np.ndarray,
+    g_alpha: np.ndarray,
+    sums: np.ndarray,
+) -> None:
+    """Fill the slots' rows of ``sums`` (`slot_width` numbers each) for tiles until no ticket is left."""
+    views, channels, height, width = image.shape
+    count = len(records) // (RECORD * views)
+    left, behind = np.empty(BLOCKS * LANES, np.float32), np.empty(BLOCKS * LANES, np.float32)
+    gradients = np.empty(BLOCKS * channels * LANES, np.float32)
+    row_length = _slot_width(channels)
+    rows = np.empty(row_length * LANES, np.float32)
+    while True:
+        tile = take_ticket(tickets)
+        if tile >= views * tiles_x * tiles_y:
+            return
+        if starts[tile] == starts[tile + 1]:
+            continue
+        view, tile_top, tile_left = tile_place(tile, tiles_x, tiles_y)
+        open_tile(tile_left, tile_top, width, height, left)
+        _read_tile(view, tile_left, tile_top, image, alpha, g_image, g_alpha, behind, gradients)
+        for entry in range(starts[tile], starts[tile + 1]):
+            slot = entry_slot[entry]
+            bits = np.int64(pair_bits[slot])
+            if bits != 0:
+                n = entry_gaussian[entry]
+                _entry_backward(
+                    bits, records, (view * count + n) * RECORD, features, n * channels, channels, tile_left, tile_top,
+                    left, behind, gradients, rows, sums, slot * row_length,
+                )  # fmt: skip
+
+
+@kernel
+def _read_tile(
+    view: int,
+    tile_left: int,
+    tile_top: int,
+    image: np.ndarray,
+    alpha: np.ndarray,
+    g_image: np.ndarray,
+    g_alpha: np.ndarray,
+    behind: np.ndarray,
+    gradients: np.ndarray,
+) -> None:
+    """Load dL/dimage per block, and the loss's linear share of everything blended: sum of g.out minus T dL/dalpha."""
+    _, channels, height, width = image.shape
+    pixels, mattes, g_pixels, g_mattes = image.reshape(-1), alpha.reshape(-1), g_image.reshape(-1), g_alpha.reshape(-1)
+    one = splat(np.float32(1))
+    for block in range(BLOCKS):
+        x, y = tile_left + BLOCK * (block % 4), tile_top + BLOCK * (block // 4)
+        through = one - _read_block(mattes, view * height, x, y, width, height)
+        total = splat(np.float32(0)) - through * _read_block(g_mattes, view * height, x, y, width, height)
+        for channel in range(channels):
+            first_row = (view * channels + channel) * height
+            slope = _read_block(g_pixels, first_row, x, y, width, height)
+            store(gradients, (block * channels + channel) * LANES, slope)
+            total = fma(slope, _read_block(pixels, first_row, x, y, width, height), total)
+        store(behind, block * LANES, total)
+
+
+@kernel
+def _entry_backward(
+    bits: int,
+    records: np.ndarray,
+    record: int,
+    features: np.ndarray,
+    feature: int,
+    channels: int,
+    tile_left: int,
+    tile_top: int,
+    left: np.ndarray,
+    behind: np.ndarray,
+    gradients: np.ndarray,
+    rows: np.ndarray,
+    sums: np.ndarray,
+    place: int,
+) -> None:
+    """Sum one Gaussian's six moments and channel gradients over the blocks of ``bits`` into sums[place:]."""
+    zero, one, least = splat(np.float32(0)), splat(np.float32(1)), splat(LEAST_LEFT)
+    shape = form(records, record)
+    offset_x, offset_y = offsets(records, record, tile_left, tile_top)
+    for channel in range(channels):
+        store(rows, (MOMENTS + channel) * LANES, zero)
+    m, mx, my, mxx, mxy, myy = zero, zero, zero, zero, zero, zero
+    while bits != 0:
+        block = lowest_bit(bits)
+        bits &= bits - 1
+        dx, dy, exponent = exponent_at(shape, offset_x, offset_y, block)
+        alpha = keep_where_ge(minimum(exp2(exponent), splat(STRONGEST_ALPHA)), exponent, splat(WEAKEST))
+        before = load(left, block * LANES)
+        weight = alpha * before
+        after = before - weight
+        weight = select_gt(after, least, weight, zero)
+        store(left, block * LANES, select_gt(after, least, after, zero))
+        along = zero
+        for channel in range(channels):
+            slope = load(gradients, (block * channels + channel) * LANES)
+            along = fma(slope, splat(features[feature + channel]), along)
+            row = (MOMENTS + channel) * LANES
+            store(rows, row, fma(weight, slope, load(rows, row)))
+        rest = load(behind, block * LANES) - weight * along
+        store(behind, block * LANES, rest)
+        # alpha dL/dalpha, where the pixel took this Gaussian and the cap did not hold it.
+        pull = weight * along - divide(rest * alpha, one - alpha)
+        pull = select_gt(weight, zero, pull, zero)
+        pull = select_gt(exponent, splat(_STRONGEST), zero, pull)
+        m = m + pull
+        pull_x, pull_y = pull * dx, pull * dy
+        mx, my = mx + pull_x, my + pull_y
+        mxx, mxy, myy = fma(pull_x, dx, mxx), fma(pull_x, dy, mxy), fma(pull_y, dy, myy)
+    store(rows, 0, m)
+    store(rows, LANES, mx)
+    store(rows, 2 * LANES, my)
+    store(rows, 3 * LANES, mxx)
+    store(rows, 4 * LANES, mxy)
+    store(rows, 5 * LANES, myy)
+    _sum_rows(rows, MOMENTS + channels, sums, place)
+
+
+@kernel
+def _four_rows(rows: np.ndarray, first: int, count: int) -> Any:
+    zero = splat(np.float32(0))
+    if first >= count:
+        return zero
+    a = load(rows, first * LANES)
+    b = load(rows, (first + 1) * LANES) if first + 1 < count else zero
+    c = load(rows, (first + 2) * LANES) if first + 2 < count else zero
+    d = load(rows, (first + 3) * LANES) if first + 3 < count else zero
+    return fold2(fold1(a, b), fold1(c, d))
+
+
+@kernel
+def _sum_rows(rows: np.ndarray, count: int, sums: np.ndarray, place: int) -> None:
+    """Write the sum of each vector in ``rows`` to sums[place:], sixteen at a time."""
+    for first in range(0, count, LANES):
+        near = fold4(_four_rows(rows, first, count), _four_rows(rows, first + 4, count))
+        far = fold4(_four_rows(rows, first + 8, count), _four_rows(rows, first + 12, count))
+        store(sums, place + first, fold8(near, far))
+
+
+@kernel
+def gather_slots(
+    view: int,
+    begin: int,
+    end: int,
+    order: np.ndarray,
+    slots: np.ndarray,
+    pair_bits: np.ndarray,
+    records: np.ndarray,
+    sums: np.ndarray,
+    width: int,
+    v_means2d: np.ndarray,
+    v_records: np.ndarray,
+    v_features: np.ndarray,
+) -> None:
+    """Add each Gaussian's slots into the zeroed gradients of means2d, records and features, for sorted begin..end.
+
+    A Gaussian occurs once in a view's order, so chunks of one view never share a row.
+    """
+    channels = v_features.shape[1]
+    total = np.empty(width, np.float32)
+    for k in range(begin, end):
+        n = order[view, k]
+        total[:] = 0
+        for slot in range(slots[view, k], slots[view, k + 1]):
+            if pair_bits[slot] != 0:
+                for i in range(MOMENTS + channels):
+                    total[i] += sums[slot * width + i]
+        m, mx, my, mxx, mxy, myy = total[0], total[1], total[2], total[3], total[4], total[5]
+        xx, xy, yy = records[view, n, XX], records[view, n, XY], records[view, n, YY]
+        v_means2d[view, n, 0] = -LN2 * (2 * xx * mx + xy * my)
+        v_means2d[view, n, 1] = -LN2 * (2 * yy * my + xy * mx)
+        v_records[view, n, XX], v_records[view, n, XY], v_records[view, n, YY] = LN2 * mxx, LN2 * mxy, LN2 * myy
+        v_records[view, n, LOG_OPACITY] = LN2 * m
+        for channel in range(channels):
+            v_features[n, channel] += total[MOMENTS + channel]
