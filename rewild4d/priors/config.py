@@ -9,6 +9,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         size: side of the square crops in pixels; early rounds only need the gross outline.
         steps: of Adam.
+        frames: per step; of longer clips as many are drawn anew each step, so that time does not grow with the clip.
         blur: of both silhouettes at the first and last step, as a share of the crop: a thin leg must feel a far one.
         keep: hypotheses that survive; the best of the opposite facing is always among them while two or more do.
         joints: whether joints bend and the root moves over time, or the animal stands still.
@@ -19,6 +20,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     blur: tuple[float, float]
     keep: int
     joints: bool = True
+    frames: int = 24
 
 
 class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -28,7 +30,6 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         yaw_starts: facing is a local minimum, so every start turns the template by an equal share of the circle.
         elevations: camera elevations (degrees) tried where the cameras alone do not tell which way is up.
         stages: rounds, from all starts to one winner.
-        frames: per step; of longer clips as many are drawn anew each step, so that time does not grow with the clip.
         learning_rate: of Adam at the start of each round, on parameters whitened by their natural spread.
         shape_weight: of the mean squared deviation of proportions: an average animal unless the masks insist.
         angle_weight: of the squared whitened joint angles: limbs rest, and move slowly, unless the masks insist.
@@ -38,7 +39,6 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stages: tuple[Stage, ...]
     yaw_starts: int = 12
     elevations: tuple[float, ...] = (5.0, 20.0, 40.0)
-    frames: int = 24
     learning_rate: float = 0.06
     shape_weight: float = 0.02
     angle_weight: float = 0.02
@@ -47,7 +47,7 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 STANDARD = PriorConfig(
     stages=(
-        Stage(size=32, steps=40, blur=(0.08, 0.04), keep=6, joints=False),
+        Stage(size=32, steps=40, blur=(0.08, 0.04), keep=6, joints=False, frames=12),
         Stage(size=48, steps=80, blur=(0.05, 0.03), keep=2),
         Stage(size=64, steps=150, blur=(0.04, 0.015), keep=1),
         Stage(size=80, steps=250, blur=(0.02, 0.006), keep=1),
@@ -55,7 +55,7 @@ STANDARD = PriorConfig(
 )
 QUICK = PriorConfig(
     stages=(
-        Stage(size=32, steps=30, blur=(0.08, 0.04), keep=4, joints=False),
+        Stage(size=32, steps=30, blur=(0.08, 0.04), keep=4, joints=False, frames=12),
         Stage(size=40, steps=60, blur=(0.05, 0.03), keep=2),
         Stage(size=48, steps=60, blur=(0.04, 0.02), keep=1),
         Stage(size=64, steps=80, blur=(0.02, 0.008), keep=1),

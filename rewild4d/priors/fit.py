@@ -100,6 +100,12 @@ def fit_animal(
     return leader.winner()
 
 
+def _spaced(targets: Targets, count: int) -> Targets:
+    """At most ``count`` evenly spaced observations."""
+    count = min(len(targets.masks), count)
+    return targets.select(torch.linspace(0, len(targets.masks) - 1, count).round().long())
+
+
 class _Race:
     """Hypotheses under one choice of the up direction."""
 
@@ -129,11 +135,11 @@ class _Race:
     def _targets(self, size: int) -> Targets:
         return crop_targets(self.frames, self.moments, self.working, size, self.name)
 
-    def _draw(self, targets: Targets) -> Targets:
+    def _draw(self, targets: Targets, count: int) -> Targets:
         """All observations, or a fresh sample of as many as a step may look at."""
-        if len(targets.masks) <= self.config.frames:
+        if len(targets.masks) <= count:
             return targets
-        rows = torch.randperm(len(targets.masks), generator=self.generator)[: self.config.frames]
+        rows = torch.randperm(len(targets.masks), generator=self.generator)[:count]
         return targets.select(rows.sort().values)
 
     def _cost(self, targets: Targets, sigma: float, joints: bool) -> Tensor:
@@ -154,7 +160,7 @@ class _Race:
             share = step / max(stage.steps - 1, 1)
             optimizer.param_groups[0]["lr"] = self.config.learning_rate * (1 - 0.85 * share)
             sigma = stage.size * (stage.blur[0] + share * (stage.blur[1] - stage.blur[0]))
-            cost = self._cost(self._draw(targets), sigma, stage.joints)
+            cost = self._cost(self._draw(targets, stage.frames), sigma, stage.joints)
             if not torch.isfinite(cost).all():
                 raise FloatingPointError(f"{self.name}: the template fit's cost is not finite at step {step}: {cost}")
             optimizer.zero_grad()
@@ -163,13 +169,8 @@ class _Race:
             self.done += 1
             self.log(self.done, self.total, {"prior": float(cost.detach().min())})
         with torch.no_grad():
-            self.costs = self._cost(self._spaced(targets), stage.size * stage.blur[1], stage.joints)
+            self.costs = self._cost(_spaced(targets, 2 * stage.frames), stage.size * stage.blur[1], stage.joints)
         self._cut(stage.keep)
-
-    def _spaced(self, targets: Targets) -> Targets:
-        """Evenly spaced observations, at most twice as many as a step looks at: the same for every guess."""
-        count = min(len(targets.masks), 2 * self.config.frames)
-        return targets.select(torch.linspace(0, len(targets.masks) - 1, count).round().long())
 
     def _cut(self, keep: int) -> None:
         """Keep the best, and the best that faces away from it while there is room."""

@@ -153,9 +153,8 @@ def _checked(
 ) -> Tensor:
     """One array with its documented shape and type; a letter stands for the size seen first."""
     if key not in raw:
-        raise UserError(
-            f"{path}: expected an array '{key}', but the file holds only {', '.join(sorted(raw)) or 'nothing'}."
-        )
+        held = ", ".join(sorted(raw)) or "nothing"
+        raise UserError(f"{path}: expected an array '{key}', but the file holds only {held}.")
     array = raw[key]
     wanted = ", ".join(f"{name}={sizes[name]}" if name in sizes else str(name) for name in map(str, shape))
     fits = array.ndim == len(shape) and all(

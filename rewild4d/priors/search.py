@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rewild4d.errors import UserError
 from rewild4d.priors.hypotheses import SCALE_SPREAD, Hypotheses, cosine_series
 from rewild4d.priors.silhouettes import Targets, known_camera
 from rewild4d.transforms import similarity
@@ -40,7 +41,11 @@ class Rays:
 
 
 def mask_rays(frames: Sequence[Frame], moments: Sequence[int], name: str) -> Rays:
-    """Rays through the mask centroids, in the world."""
+    """Rays through the mask centroids, in the world.
+
+    Raises:
+        UserError: no mask holds anything, or a frame has no camera.
+    """
     rows = []
     for frame, moment in zip(frames, moments, strict=True):
         solid = frame.mask[0].double()
@@ -56,6 +61,8 @@ def mask_rays(frames: Sequence[Frame], moments: Sequence[int], name: str) -> Ray
         )
         span = (area / (camera.intrinsics[0, 0] * camera.intrinsics[1, 1])).sqrt()
         rows.append((camera.center.double(), direction, span, rotation[0], rotation[1], torch.tensor(moment)))
+    if not rows:
+        raise UserError(f"{name}: expected at least one mask that shows the animal, but all {len(frames)} are empty.")
     return Rays(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
@@ -124,7 +131,7 @@ def up_directions(rays: Rays, elevations: Sequence[float]) -> Tensor:
 
 
 def working_frame(rays: Rays, path: Tensor, up: Tensor) -> Tensor:
-    """Similarity working frame -> world: y up, origin amid the path, unit so that the animal has template size, [4, 4]."""
+    """Similarity working frame -> world: y up, origin amid the path, the animal about template size, [4, 4]."""
     distance = ((path[rays.moments] - rays.centers) * rays.directions).sum(1).clamp_min(1e-6)
     size = torch.median(rays.spans * distance) / SILHOUETTE_SIDE
     helper = torch.eye(3, dtype=torch.float64)[up.abs().argmin()]

@@ -63,7 +63,7 @@ def known_camera(frame: Frame, name: str) -> Camera:
 
 
 def crop_targets(frames: Sequence[Frame], moments: Sequence[int], world: Tensor, size: int, name: str) -> Targets:
-    """Square crops around the masks, resampled by area; frames with an empty mask are left out.
+    """Square crops around the masks, resampled by area; frames with an empty mask are left out (not all may be).
 
     Args:
         frames: observations with cameras.
@@ -71,9 +71,6 @@ def crop_targets(frames: Sequence[Frame], moments: Sequence[int], world: Tensor,
         world: similarity from the working frame to the world, [4, 4]; the targets' cameras look at the working frame.
         size: side of the crop in pixels.
         name: of the case, for messages.
-
-    Raises:
-        UserError: no mask holds anything.
     """
     masks, valid, cameras, kept = [], [], [], []
     for frame, moment in zip(frames, moments, strict=True):
@@ -87,8 +84,6 @@ def crop_targets(frames: Sequence[Frame], moments: Sequence[int], world: Tensor,
         masks.append(_window(frame.mask[0], left, top, side, size))
         valid.append(_window(inside, left, top, side, size))
         kept.append(moment)
-    if not masks:
-        raise UserError(f"{name}: expected at least one mask that shows the animal, but all {len(frames)} are empty.")
     return Targets(
         torch.stack(masks),
         torch.stack(valid),

@@ -160,8 +160,8 @@ class _Tube(NamedTuple):
 
     def blobs(self, segments: int) -> tuple[Tensor, Tensor]:
         """Round Gaussians inside whose common 50 % contour is close to the tube, [..., m, 3] and [..., m]."""
-        sizes = 0.42 * torch.minimum(self.widths, self.heights)
-        return self.points(segments, 1.35 * sizes), sizes.repeat_interleave(segments, dim=-1)
+        sizes = 0.3 * torch.minimum(self.widths, self.heights)
+        return self.points(segments, 2.1 * sizes), sizes.repeat_interleave(segments, dim=-1)
 
 
 @cache

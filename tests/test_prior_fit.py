@@ -1,0 +1,147 @@
+"""The fit finds a known animal again, in a world that is turned, scaled and shifted at random."""
+
+import math
+from dataclasses import replace
+
+import msgspec
+import pytest
+import torch
+from torch import Tensor
+
+from rewild4d.errors import UserError
+from rewild4d.priors.config import PRESETS, PriorConfig
+from rewild4d.priors.fit import fit_template
+from rewild4d.priors.hypotheses import cosine_series
+from rewild4d.priors.kinematics import pose
+from rewild4d.priors.overlay import overlay
+from rewild4d.priors.search import mask_rays, trajectory, up_directions
+from rewild4d.priors.silhouettes import outline, splat
+from rewild4d.priors.template import PARENTS, Proportions, quadruped
+from rewild4d.transforms import axis_angle_to_matrix, look_at, similarity, skin_points
+from rewild4d.types import Camera, Clip, Frame
+
+QUICK = PRESETS["quick"]
+WORLD_SCALE = 0.37
+
+
+def world() -> tuple[Tensor, Tensor]:
+    """The animal's similarity to a world with a tilted up axis, and that up axis."""
+    rotation = axis_angle_to_matrix(torch.tensor((0.9, 2.1, -0.7), dtype=torch.float64))
+    return similarity(WORLD_SCALE, rotation, torch.tensor((1.0, -2.0, 0.5), dtype=torch.float64)), rotation[:, 1]
+
+
+def walking_clip(count: int, cameras: str) -> Clip:
+    """A long-necked walking template seen by a ring of cameras ("sweep") or from one place ("fixed")."""
+    template = quadruped(Proportions.of(neck_length=1.2, tail_length=0.7, body_length=2.0))
+    object_to_world, up = world()
+    frames = []
+    for t in range(count):
+        angles, phase = torch.zeros(20, 3), 2 * math.pi * t / count
+        for top, offset in ((10, 0.0), (13, math.pi), (16, 0.0), (19, math.pi)):
+            angles[top, 0] = 0.45 * math.sin(phase + offset)
+        posed = skin_points(template.vertices, template.weights, pose(angles, template.bones[:, 0], PARENTS))
+        turn = 2 * math.pi * t / count if cameras == "sweep" else 0.8
+        eye = torch.tensor((9 * math.sin(turn), 2.5, 9 * math.cos(turn)), dtype=torch.float64)
+        eye = object_to_world[:3, :3] @ eye + object_to_world[:3, 3]
+        intrinsics = torch.tensor(((150.0, 0.0, 64.0), (0.0, 150.0, 48.0), (0.0, 0.0, 1.0)), dtype=torch.float64)
+        camera = Camera(look_at(eye, object_to_world[:3, 3], up), intrinsics, 128, 96)
+        points = posed.double() @ object_to_world[:3, :3].T + object_to_world[:3, 3]
+        mask = torch.from_numpy(outline(points, template.faces, camera)).float()[None] / 255
+        frames.append(Frame(t / 24, camera, mask.expand(3, -1, -1), mask))
+    return Clip("made/walk", "none", tuple(frames), 24.0, "CC0", "")
+
+
+def angle(a: Tensor, b: Tensor) -> float:
+    cosine = torch.nn.functional.cosine_similarity(a, b, dim=0).clamp(-1, 1)
+    return float(torch.rad2deg(torch.arccos(cosine)))
+
+
+def silent(*_: object) -> None:
+    return None
+
+
+def test_a_known_animal_is_found_again() -> None:
+    clip = walking_clip(12, "sweep")
+    prior = fit_template(clip, config=QUICK, seed=0, log=silent)
+    truth, up = world()
+    found = prior.object_to_world[:, :3, :3].mean(0)
+    assert angle(found[:, 2], truth[:3, 2]) < 10 and angle(found[:, 1], up) < 10
+    assert prior.quality["mask_iou"] > 0.8 and prior.quality["facing_margin"] > 0
+    assert float(found[:, 1].norm()) == pytest.approx(WORLD_SCALE, rel=0.1)
+    extent = prior.vertices.amax(0) - prior.vertices.amin(0)
+    assert float(extent.norm()) == pytest.approx(5.0, abs=1e-4)
+    assert overlay(clip, prior, [0, 5]).shape == (2, 3, 96, 128)
+
+
+def shortened(steps: int) -> PriorConfig:
+    """The quick preset with a few steps a stage and few starts: for what does not depend on a good fit."""
+    stages = tuple(msgspec.structs.replace(stage, steps=steps) for stage in QUICK.stages)
+    return msgspec.structs.replace(QUICK, stages=stages, yaw_starts=4)
+
+
+def test_the_same_seed_gives_the_same_prior() -> None:
+    clip = walking_clip(4, "sweep")
+    first, second = (fit_template(clip, config=shortened(2), seed=5, log=silent) for _ in range(2))
+    assert first.digest == second.digest
+    assert first.object_to_world.shape == (4, 4, 4) and len(first.cameras_flip) == 4
+
+
+def test_progress_counts_up_to_its_total() -> None:
+    seen: list[tuple[int, int]] = []
+    fit_template(
+        walking_clip(3, "sweep"), config=shortened(1), seed=0, log=lambda step, total, _: seen.append((step, total))
+    )
+    assert seen == [(step, len(QUICK.stages)) for step in range(1, len(QUICK.stages) + 1)]
+
+
+def test_an_empty_mask_is_bridged_and_only_empty_masks_are_an_error() -> None:
+    clip = walking_clip(4, "sweep")
+    empty = [replace(frame, mask=torch.zeros_like(frame.mask)) for frame in clip.frames]
+    bridged = replace(clip, frames=(*clip.frames[:2], empty[2], clip.frames[3]))
+    assert torch.isfinite(fit_template(bridged, config=shortened(1), seed=0, log=silent).transforms).all()
+    with pytest.raises(UserError, match="made/walk: expected at least one mask that shows the animal, but all 4"):
+        fit_template(replace(clip, frames=tuple(empty)), config=shortened(1), seed=0, log=silent)
+
+
+def test_a_frame_without_a_camera_is_one_sentence() -> None:
+    clip = walking_clip(3, "sweep")
+    blind = replace(clip, frames=(*clip.frames[:2], replace(clip.frames[2], camera=None)))
+    with pytest.raises(UserError, match="expected a camera for every frame, but the frame at 0.083"):
+        fit_template(blind, config=shortened(1), seed=0, log=silent)
+
+
+def test_up_is_square_to_all_cameras_and_the_path_passes_the_animal() -> None:
+    clip = walking_clip(12, "sweep")
+    truth, up = world()
+    rays = mask_rays(clip.frames, list(range(12)), clip.name)
+    (found,) = up_directions(rays, (20.0,))
+    assert angle(found, up) < 0.1
+    path = trajectory(rays, 12)
+    assert float((path - truth[:3, 3]).norm(dim=1).max()) < 0.5 * WORLD_SCALE
+
+
+def test_one_camera_that_does_not_move_leaves_several_ups_and_a_finite_path() -> None:
+    clip = walking_clip(4, "fixed")
+    rays = mask_rays(clip.frames, list(range(4)), clip.name)
+    ups = up_directions(rays, (5.0, 20.0, 40.0))
+    elevation = math.degrees(math.atan2(2.5, 9))
+    assert len(ups) == 3 and min(angle(found, world()[1]) for found in ups) < abs(20 - elevation) + 1
+    assert torch.isfinite(trajectory(rays, 4)).all()
+
+
+def test_one_blob_is_a_round_gaussian_of_its_projected_size() -> None:
+    intrinsics = torch.tensor(((50.0, 0.0, 16.0), (0.0, 50.0, 16.0), (0.0, 0.0, 1.0)))
+    image = splat(torch.tensor(((0.0, 0.0, 5.0),)), torch.tensor((0.3,)), intrinsics, 32)
+    density = -torch.log1p(-image)
+    sigma2 = (0.3 * 50 / 5) ** 2 + 0.3
+    assert float(density[15, 20] / density[15, 15]) == pytest.approx(
+        math.exp(-(4.5**2 - 0.5**2) / 2 / sigma2), rel=1e-3
+    )
+    assert torch.allclose(image, image.T, atol=1e-6)
+
+
+def test_cosines_start_with_a_constant_and_damp_fast_motion() -> None:
+    series = cosine_series(16, 8)
+    assert torch.equal(series[:, 0], torch.ones(16))
+    peaks = series.abs().amax(0)
+    assert bool((peaks.diff() < 0).all()) and float(peaks[4]) == pytest.approx(0.5, rel=0.02)
