@@ -5,8 +5,9 @@ All images are float tensors in [0, 1], [B, C, H, W]; predictions and truths sha
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d
 
+WINDOW = 11
+"""Side of the SSIM window in pixels."""
 PSNR_CAP = 100.0
 """Identical images have an infinite PSNR; it is reported as this many dB so that a mean exists."""
 
@@ -49,25 +50,52 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
         Mean over the map and the channels per image, float64, [B].
     """
     _check_pair(prediction, target)
-    if min(target.shape[2:]) < 11:
+    if min(target.shape[2:]) < WINDOW:
         raise ValueError(f"expected images of at least 11x11 pixels for SSIM, got {target.shape[3]}x{target.shape[2]}")
-    x, y = prediction.double(), target.double()
-    mean_x, mean_y, xx, yy, xy = (_blur(image) for image in (x, y, x * x, y * y, x * y))
+    return torch.stack([_ssim_of_one(x, y) for x, y in zip(prediction, target, strict=True)])
+
+
+def _ssim_of_one(prediction: Tensor, target: Tensor) -> Tensor:
+    """SSIM of one image [C, H, W].
+
+    The map is exactly one wherever its window sees no difference, so only the rest is computed.
+    """
+    height, width = target.shape[1:]
+    differs = (prediction != target).any(0)
+    if not differs.any():
+        return torch.ones((), dtype=torch.float64, device=target.device)
+    top, bottom = _span(differs.any(1), height)
+    left, right = _span(differs.any(0), width)
+    x, y = (image[:, top:bottom, left:right].double() for image in (prediction, target))
+    mean_x, mean_y, xx, yy, xy = _blur(torch.stack((x, y, x * x, y * y, x * y)))
     c1, c2 = 0.01**2, 0.03**2
     luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
     structure = (2 * (xy - mean_x * mean_y) + c2) / (xx - mean_x**2 + yy - mean_y**2 + c2)
-    return (luminance * structure).flatten(1).mean(1)
+    positions = target.shape[0] * (height - WINDOW + 1) * (width - WINDOW + 1)
+    return 1 - (1 - luminance * structure).sum() / positions
+
+
+def _span(differs: Tensor, size: int) -> tuple[int, int]:
+    """Rows (or columns) that the windows over a difference read, as a slice of at least one window."""
+    places = torch.nonzero(differs)
+    first = min(max(0, int(places[0]) - WINDOW + 1), size - WINDOW)
+    return first, max(min(size, int(places[-1]) + WINDOW), first + WINDOW)
 
 
 def _blur(images: Tensor) -> Tensor:
-    """Separable Gaussian window over the valid region, [B, C, H, W] -> [B, C, H-10, W-10]."""
-    offsets = torch.arange(-5, 6, dtype=images.dtype, device=images.device)
+    """Separable Gaussian window over the valid region as two banded products, [..., H, W] -> [..., H-10, W-10]."""
+    rows, columns = (_band(size, images) for size in images.shape[-2:])
+    return rows @ images @ columns.T
+
+
+def _band(size: int, like: Tensor) -> Tensor:
+    """Each row holds the window, shifted by one, [size-10, size]."""
+    offsets = torch.arange(WINDOW, dtype=like.dtype, device=like.device) - WINDOW // 2
     window = torch.exp(-(offsets**2) / (2 * 1.5**2))
-    window = window / window.sum()
-    single = images.flatten(0, 1)[:, None]
-    return conv2d(conv2d(single, window.view(1, 1, 11, 1)), window.view(1, 1, 1, 11)).view(
-        *images.shape[:2], images.shape[2] - 10, images.shape[3] - 10
-    )
+    band = torch.zeros(size - WINDOW + 1, size, dtype=like.dtype, device=like.device)
+    for row in range(len(band)):
+        band[row, row : row + WINDOW] = window / window.sum()
+    return band
 
 
 def _check_pair(prediction: Tensor, target: Tensor) -> None:

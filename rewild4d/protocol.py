@@ -12,6 +12,7 @@ from torch import Tensor
 from rewild4d.contracts import Log, Reconstruction, Selection
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import digest
+from rewild4d.harmonics import seen_colors
 from rewild4d.leaderboard.records import Score
 from rewild4d.metrics.image import PSNR_CAP, psnr, ssim
 from rewild4d.metrics.silhouette import mask_iou
@@ -74,7 +75,9 @@ def find_protocol(dataset: str, name: str | None) -> Protocol:
     """
     protocols = load_protocols()
     if name is None:
-        return next(p for p in protocols.values() if p.dataset == dataset and p.default)
+        name = next((p.name for p in protocols.values() if p.dataset == dataset and p.default), None)
+        if name is None:
+            raise UserError(f"--protocol: the data set '{dataset}' has no default; name one of its protocols.")
     if name not in protocols:
         raise unknown_name("protocol", name, protocols)
     if protocols[name].dataset != dataset:
@@ -95,7 +98,7 @@ def render(splats: Splats, camera: Camera, device: torch.device | None = None) -
         splats.quats.to(device),
         splats.scales.to(device),
         splats.opacities.to(device),
-        splats.colors[:, 0].to(device),
+        seen_colors(splats, camera.center).to(device),
         camera.world_to_camera[None].to(device, torch.float32),
         camera.intrinsics[None].to(device, torch.float32),
         camera.width,

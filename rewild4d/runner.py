@@ -64,7 +64,7 @@ class Progress:
 
     def __call__(self, step: int, total: int, values: Mapping[str, float]) -> None:
         if self.bar is None:
-            self.bar = tqdm(desc=self.title, total=total, file=sys.stderr, mininterval=0.5, dynamic_ncols=True)
+            self.bar = tqdm(desc=self.title, total=total, file=sys.stderr, mininterval=0.5 if sys.stderr.isatty() else 10.0)
         self.bar.total = total
         self.bar.update(step - self.bar.n)
         if values:

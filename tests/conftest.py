@@ -12,7 +12,7 @@ sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() != RO
 try:
     import rewild4d.datasets  # noqa: F401
 except ImportError:
-    pytest.exit("rewild4d is not installed here: run `make test`, or `pip install -e . -c constraints.txt`.", returncode=2)
+    pytest.exit("rewild4d is not installed: run `make test`, or `pip install -e . -c constraints.txt`.", returncode=2)
 
 SHARED = Path(os.environ.get("REWILD4D_SHARED", ROOT.parent / "shared"))
 

@@ -1,4 +1,4 @@
-"""The mapped folders: every package is listed, its data travels in the wheel, and nothing shadows other people's names."""
+"""The mapped folders: every package is listed, its data travels in the wheel, and nobody's names are shadowed."""
 
 import ast
 import subprocess
@@ -62,10 +62,8 @@ def test_imports_are_absolute_and_run_one_way() -> None:
 
 
 def test_files_stay_readable() -> None:
-    long = {
-        str(file.relative_to(ROOT)): lines for file in sources() if (lines := len(file.read_text().splitlines())) > 350
-    }
-    assert not long
+    lines = {str(file.relative_to(ROOT)): len(file.read_text().splitlines()) for file in sources()}
+    assert not {file: count for file, count in lines.items() if count > 350}
 
 
 def test_the_wheel_carries_code_and_data(tmp_path: Path) -> None:

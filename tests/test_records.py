@@ -15,8 +15,8 @@ from rewild4d.protocol import summarize
 def record(**changes: Any) -> RunRecord:
     fields: dict[str, Any] = {
         "schema": 1, "run_id": "0" * 16, "method": "ours", "dataset": "artemis", "case": "wolf/Run", "seed": 0,
-        "preset": "quick", "status": "ok", "error": "", "scores": {"psnr": Score(20.0, "dB", "higher", 2, [19.0, 21.0])},
-        "coverage": {"foreground": 0.1}, "config": {}, "data": {}, "prior": {}, "diagnostics": {}, "items": [], "pictures": [],
+        "preset": "quick", "status": "ok", "error": "", "scores": psnr(20.0), "coverage": {"foreground": 0.1},
+        "config": {}, "data": {}, "prior": {}, "diagnostics": {}, "items": [], "pictures": [],
         "protocol": {"name": "p-v1", "title": "P", "scores": ["psnr"]}, "code": {}, "machine": {},
         "timing": Timing("2026-01-01T00:00:00+00:00", 60.0, 1.0, 100.0),
     }  # fmt: skip

@@ -77,6 +77,7 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
         UserError: an unknown name, a folder that is not there or cannot be written.
     """
     device = pick_device(options.device)
+    load_dataset(options.dataset)  # an unknown data set is the first thing to say
     protocol = find_protocol(options.dataset, options.protocol)
     if not options.seeds:
         raise UserError("--seeds: expected at least one number, got none.")

@@ -1,0 +1,65 @@
+"""View-dependent colour: real spherical harmonics up to degree 3, in the order and sign of 3D Gaussian Splatting."""
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from rewild4d.types import Splats
+
+C0 = 0.28209479177387814
+C1 = 0.4886025119029199
+C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+C3 = (
+    -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
+    -0.4570457994644658, 1.445305721320277, -0.5900435899266435,
+)  # fmt: skip
+
+
+def basis(directions: Tensor, degree: int) -> Tensor:
+    """Values of the basis functions for unit directions, [n, 3] -> [n, (degree + 1)^2], degree 0 to 3."""
+    x, y, z = directions.unbind(-1)
+    values = [torch.full_like(x, C0)]
+    if degree > 0:
+        values += [-C1 * y, C1 * z, -C1 * x]
+    if degree > 1:
+        values += [
+            C2[0] * x * y,
+            C2[1] * y * z,
+            C2[2] * (2 * z * z - x * x - y * y),
+            C2[3] * x * z,
+            C2[4] * (x * x - y * y),
+        ]
+    if degree > 2:
+        values += [
+            C3[0] * y * (3 * x * x - y * y),
+            C3[1] * x * y * z,
+            C3[2] * y * (4 * z * z - x * x - y * y),
+            C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y),
+            C3[4] * x * (4 * z * z - x * x - y * y),
+            C3[5] * z * (x * x - y * y),
+            C3[6] * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(values, dim=-1)
+
+
+def seen_colors(splats: Splats, eye: Tensor) -> Tensor:
+    """RGB of each Gaussian from a camera centre.
+
+    Args:
+        splats: colours [n, k, 3]; k = 1 is RGB itself, k = 4, 9, 16 are coefficients, 0.5 standing for their zero.
+        eye: camera centre in the frame of the Gaussians, [3].
+
+    Returns:
+        [n, 3], not below 0.
+
+    Raises:
+        ValueError: another k.
+    """
+    count = splats.colors.shape[1]
+    if count == 1:
+        return splats.colors[:, 0]
+    if count not in (4, 9, 16):
+        raise ValueError(f"expected 1, 4, 9 or 16 colour coefficients per Gaussian, got {count}")
+    directions = normalize(splats.means - eye.to(splats.means), dim=-1)
+    values = basis(directions, round(count**0.5) - 1)
+    return (torch.einsum("nk,nkc->nc", values, splats.colors) + 0.5).clamp_min(0)

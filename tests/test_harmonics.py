@@ -1,0 +1,38 @@
+"""The basis is orthonormal, and degree 0 is plain colour."""
+
+import math
+
+import numpy as np
+import torch
+
+from rewild4d.harmonics import C0, basis, seen_colors
+from rewild4d.types import Splats
+
+
+def test_basis_is_orthonormal() -> None:
+    """Integrals over the sphere by a product rule that is exact for these polynomials."""
+    z, weight = (torch.from_numpy(a) for a in np.polynomial.legendre.leggauss(8))
+    phi = torch.arange(16, dtype=torch.float64) * (2 * math.pi / 16)
+    ring = (1 - z**2).sqrt()
+    directions = torch.stack(
+        ((ring[:, None] * phi.cos()).flatten(), (ring[:, None] * phi.sin()).flatten(), z.repeat_interleave(16)), dim=-1
+    )
+    values = basis(directions, 3)
+    gram = (values * (weight.repeat_interleave(16) * 2 * math.pi / 16)[:, None]).T @ values
+    torch.testing.assert_close(gram, torch.eye(16, dtype=torch.float64), atol=1e-12, rtol=0)
+
+
+def splats(colors: torch.Tensor) -> Splats:
+    n = len(colors)
+    return Splats(torch.randn(n, 3), torch.ones(n, 4), torch.ones(n, 3), torch.ones(n), colors)
+
+
+def test_constant_coefficient_is_a_colour_from_everywhere() -> None:
+    colors = torch.zeros(5, 9, 3)
+    colors[:, 0] = 0.3 / C0
+    torch.testing.assert_close(seen_colors(splats(colors), torch.tensor((0.0, 0, 9))), torch.full((5, 3), 0.3 + 0.5))
+
+
+def test_rgb_passes_through() -> None:
+    colors = torch.rand(5, 1, 3)
+    torch.testing.assert_close(seen_colors(splats(colors), torch.zeros(3)), colors[:, 0])
