@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from rewild4d.ours.config import Canonical
-from rewild4d.transforms import matrix_to_quat
-from rewild4d.types import OBJECT_DIAGONAL, Splats
+from rewild4d.priors.motion import quats_from_normals, sample_surface
+from rewild4d.types import OBJECT_DIAGONAL, Prior, Splats
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "colors")
 """The learnable attributes, in the order of the optimizer's groups."""
@@ -58,36 +58,11 @@ class Gaussians(nn.Module):
             return Splats(self.means, quats, self.scales_log().exp(), self.opacities(), self.rgb()[:, None])
 
 
-def sample_surface(vertices: Tensor, faces: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Area-uniform points of a mesh and their normals.
-
-    Args:
-        vertices: [n, 3].
-        faces: [f, 3].
-        count: number of samples.
-        generator: the only source of chance.
-
-    Returns:
-        Points and unit normals, [count, 3] each.
-    """
-    a, b, c = vertices[faces].unbind(1)
-    cross = torch.linalg.cross(b - a, c - a)
-    area = cross.norm(dim=-1)
-    chosen = torch.multinomial(area.double(), count, replacement=True, generator=generator)
-    root, v = torch.rand(2, count, 1, generator=generator, dtype=vertices.dtype)
-    root = root.sqrt()
-    points = (1 - root) * a[chosen] + root * (1 - v) * b[chosen] + root * v * c[chosen]
-    return points, nn.functional.normalize(cross[chosen], dim=-1)
-
-
-def initial_gaussians(
-    vertices: Tensor, faces: Tensor, count: int, config: Canonical, generator: torch.Generator
-) -> dict[str, Tensor]:
+def initial_gaussians(prior: Prior, count: int, config: Canonical, generator: torch.Generator) -> dict[str, Tensor]:
     """Flat Gaussians on the rest surface (METHOD section 3): radius sqrt(area / pi n), normal along the third axis.
 
     Args:
-        vertices: rest shape in the object frame, [n, 3].
-        faces: [f, 3].
+        prior: its rest surface is sampled.
         count: number of Gaussians.
         config: thickness and opacity at the start.
         generator: the only source of chance.
@@ -95,22 +70,12 @@ def initial_gaussians(
     Returns:
         The five attributes by name; colours are mid-grey.
     """
-    points, normals = sample_surface(vertices, faces, count, generator)
-    a, b, c = vertices[faces].unbind(1)
-    radius = (0.5 * torch.linalg.cross(b - a, c - a).norm(dim=-1).sum() / (math.pi * count)).sqrt()
-    scales = radius * torch.tensor((1.0, 1.0, config.thickness))
+    surface = sample_surface(prior, count, generator)
+    scales = surface.radius * torch.tensor((1.0, 1.0, config.thickness))
     return {
-        "means": points,
-        "quats": matrix_to_quat(frame_of_normal(normals)),
+        "means": surface.points,
+        "quats": quats_from_normals(surface.normals),
         "log_scales": scales.log().expand(count, 3),
         "logit_opacities": torch.full((count,), math.log(config.opacity / (1 - config.opacity))),
         "colors": torch.full((count, 3), 0.5),
     }
-
-
-def frame_of_normal(normals: Tensor) -> Tensor:
-    """Rotations whose third column is the given unit normal, [n, 3] -> [n, 3, 3]."""
-    # The world axis furthest from the normal, so that the cross product never vanishes.
-    helper = nn.functional.one_hot(normals.abs().argmin(dim=-1), 3).to(normals)
-    x = nn.functional.normalize(torch.linalg.cross(helper, normals), dim=-1)
-    return torch.stack((x, torch.linalg.cross(normals, x), normals), dim=-1)

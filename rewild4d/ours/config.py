@@ -17,7 +17,7 @@ class Canonical(Section):
     samples: int = 15_000
     """Gaussians at the start: area-uniform samples of the prior's rest surface."""
     thickness: float = 0.5
-    """Scale along the normal over the scale in the surface: flat enough to have a normal, thick enough to be seen edge-on."""
+    """Scale along the normal over the scale in the surface: flat enough for a normal, thick enough edge-on."""
     opacity: float = 0.9
     """At the start; 0.1 leaves the silhouette too weak when the pose loss begins."""
     max_scale: float = 0.05
@@ -99,7 +99,7 @@ class PriorUse(Section):
     """What the prior's poses do after the start (section 4)."""
 
     blend: bool = False
-    """Blend the prior's poses into the network's (the paper's schedule; off on Artemis, and after a warm-up it only undoes it)."""
+    """Blend the prior's poses into the network's (paper; off on Artemis: after a warm-up it only undoes that)."""
     blend_until: float = 0.35
     """Fraction at which the blend reaches zero (7k of 20k)."""
     pull: float = 1.0
@@ -122,7 +122,7 @@ class WarmUp(Section):
     size: int = 160
     """Longest image side."""
     blur: float = 0.06
-    """Blur at the start, times the side of the animal's box, falling linearly to zero: reaches limbs that do not overlap yet."""
+    """Blur at the start, times the side of the animal's box, falling linearly to zero: reaches limbs apart."""
     rate: float = 2e-3
     """Learning rate of the pose network."""
     pull: float = 0.3

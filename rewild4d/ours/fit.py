@@ -12,7 +12,7 @@ from rewild4d.contracts import Log
 from rewild4d.ours.canonical import NAMES
 from rewild4d.ours.checkpoint import fit_digest, load_checkpoint, save_checkpoint
 from rewild4d.ours.coloring import initial_colors
-from rewild4d.ours.config import Config
+from rewild4d.ours.config import Config, Rates
 from rewild4d.ours.deform import Posed
 from rewild4d.ours.density import DensityControl
 from rewild4d.ours.geometry_losses import compact_loss, neighbours, rigid_loss, smooth_loss, tv_loss
@@ -43,9 +43,8 @@ class Training:
         self.model, self.supervision, self.config, self.generator = model, supervision, config, generator
         own, rates = model.gaussians, config.rates
         self.gaussian_optimizer = torch.optim.Adam(
-            [{"params": [getattr(own, name)], "lr": 0.0 if name == "means" else getattr(rates, name)} for name in NAMES],
-            eps=1e-15, fused=True,
-        )  # fmt: skip
+            [{"params": [getattr(own, name)], "lr": _fixed_rate(rates, name)} for name in NAMES], eps=1e-15, fused=True
+        )
         self.groups = {
             "skinning": list(model.field.parameters()),
             "pose": list(model.network.parameters()),
@@ -277,10 +276,18 @@ def train(
             log(index + 1, total, figures)
         if workdir is not None and (index + 1) % config.checkpoint_every == 0 and index + 1 < total:
             state = {
-                "step": index + 1, "main": main.state(), "warmup": warmup.optimizer.state_dict(), "generator": generator.get_state(),
-            }  # fmt: skip
+                "step": index + 1,
+                "main": main.state(),
+                "warmup": warmup.optimizer.state_dict(),
+                "generator": generator.get_state(),
+            }
             save_checkpoint(workdir, identity, state)
     return model
+
+
+def _fixed_rate(rates: Rates, name: str) -> float:
+    """Learning rate of a Gaussian attribute; that of the means is set at every step."""
+    return 0.0 if name == "means" else getattr(rates, name)
 
 
 def _resume(workdir: Path | None, identity: str) -> dict[str, Any] | None:

@@ -121,7 +121,7 @@ def attach_loss(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
 
 
 def temporal_loss(pose: Pose) -> Tensor:
-    """Mean squared second difference of rotations and shifts over triples of neighbouring frames, batch of 3 k poses."""
+    """Mean squared second difference of rotations and shifts over triples of neighbouring frames, B = 3 k."""
     quats, shifts = pose.quats.unflatten(0, (-1, 3)), pose.shifts.unflatten(0, (-1, 3))
     middle = quats[:, 1]
     bend = aligned(quats[:, 0], middle) + aligned(quats[:, 2], middle) - 2 * middle

@@ -95,7 +95,7 @@ def ssim_map(x: Tensor, y: Tensor) -> Tensor:
 
 @cache
 def blur_matrix(size: int, sigma: float, radius: int, device: torch.device) -> Tensor:
-    """Banded matrix that convolves a column of ``size`` pixels with a normalised Gaussian, zero padding, [size, size]."""
+    """Banded matrix that convolves a column of pixels with a normalised Gaussian, zero padding, [size, size]."""
     place = torch.arange(size, dtype=torch.float64)
     offset = place[:, None] - place
     kernel = torch.exp(-(torch.arange(-radius, radius + 1, dtype=torch.float64) ** 2) / (2 * sigma**2)).sum()

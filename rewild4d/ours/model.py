@@ -99,8 +99,7 @@ class Model(nn.Module):
 
 def build_model(config: Config, prior: Prior, generator: torch.Generator) -> Model:
     """The model at its start: Gaussians on the prior's rest surface, the field filled from its weights."""
-    vertices, faces = prior.vertices.float(), prior.faces.long()
-    values = initial_gaussians(vertices, faces, config.canonical.samples, config.canonical, generator)
-    field = build_field(vertices, prior.weights.float(), prior.mirror.long(), config.skinning)
+    values = initial_gaussians(prior, config.canonical.samples, config.canonical, generator)
+    field = build_field(prior.vertices.float(), prior.weights.float(), prior.mirror.long(), config.skinning)
     skeleton = (prior.bones[:, 0].float(), prior.parents.long(), prior.mirror.long())
     return Model(config, Gaussians(values, config.canonical.max_scale), field, *skeleton, generator)

@@ -2,9 +2,8 @@
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from rewild4d.transforms import matrix_to_quat, quat_to_matrix, similarity, split_similarity
+from rewild4d.priors.motion import blend_similarities
 
 
 def frame_position(times: Tensor, time: float) -> float:
@@ -24,7 +23,7 @@ def frame_position(times: Tensor, time: float) -> float:
 
 
 def interpolate_similarity(matrices: Tensor, position: float) -> Tensor:
-    """A similarity between those of the frames: rotation by normalised quaternion blend, the rest linearly.
+    """A similarity between those of the frames: exact at a frame.
 
     Args:
         matrices: [T, 4, 4].
@@ -37,9 +36,4 @@ def interpolate_similarity(matrices: Tensor, position: float) -> Tensor:
     part = position - low
     if part == 0:
         return matrices[low]
-    scale, rotation, translation = split_similarity(matrices[low : low + 2])
-    first, second = matrix_to_quat(rotation)
-    second = torch.where((first * second).sum() < 0, -second, second)
-    turn = quat_to_matrix(normalize((1 - part) * first + part * second, dim=0))
-    mix = torch.tensor((1 - part, part), dtype=matrices.dtype)
-    return similarity((mix * scale).sum(), turn, mix @ translation)
+    return blend_similarities(matrices[low], matrices[low + 1], part)

@@ -43,7 +43,7 @@ class OursReconstruction:
 
     @torch.no_grad()
     def at(self, time: float) -> Splats:
-        """The Gaussians at a time in seconds in the world frame; between frames the networks and the root interpolate."""
+        """The Gaussians at a time in seconds in the world; between frames the networks and the root interpolate."""
         position = frame_position(self.times, time)
         pose = self._pose(torch.tensor([position]))
         strength = ramp(1.0, self.config.deform.ramp_start, self.config.deform.ramp_end)
@@ -86,14 +86,12 @@ class OursReconstruction:
 
     def save(self, folder: Path) -> None:
         """Write the state and the config into an existing, empty folder."""
-        cameras = [
-            None if camera is None
-            else {"world_to_camera": camera.world_to_camera, "intrinsics": camera.intrinsics, "size": [camera.width, camera.height]}
-            for camera in self.cameras
-        ]  # fmt: skip
         state = {
-            "model": self.model.state_dict(), "times": self.times, "object_to_world": self.object_to_world, "cameras": cameras,
-        }  # fmt: skip
+            "model": self.model.state_dict(),
+            "times": self.times,
+            "object_to_world": self.object_to_world,
+            "cameras": [_camera_state(camera) for camera in self.cameras],
+        }
         with atomic(folder / STATE) as path:
             torch.save(state, path)
         with atomic(folder / CONFIG) as path:
@@ -102,6 +100,13 @@ class OursReconstruction:
     def _pose(self, positions: Tensor) -> Pose:
         times = (positions.float() + 1) / len(self.times)
         return self.model.pose(times, [Key(1, 1, 0)] * len(positions))
+
+
+def _camera_state(camera: Camera | None) -> dict[str, Tensor | list[int]] | None:
+    if camera is None:
+        return None
+    size = [camera.width, camera.height]
+    return {"world_to_camera": camera.world_to_camera, "intrinsics": camera.intrinsics, "size": size}
 
 
 def from_fit(model: Model, config: Config, clip: Clip, prior: Prior, rows: list[int]) -> OursReconstruction:

@@ -34,7 +34,7 @@ def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geomet
 
     Args:
         model: gives the skeleton.
-        pose: [B, J, ...]; in triples of neighbouring frames where ``config.temporal`` is above zero and B is a multiple of 3.
+        pose: [B, J, ...]; in triples of neighbouring frames where ``config.temporal`` is above zero.
         transforms: of the same poses, [B, J, 4, 4].
         config: the weights.
     """

@@ -20,6 +20,7 @@ class SkinningField(nn.Module):
     logits: nn.Parameter
     origin: Tensor
     pitch: Tensor
+    mirror: Tensor
     flipped: Tensor
 
     def __init__(self, logits: Tensor, origin: Tensor, pitch: Tensor, mirror: Tensor, tied: bool) -> None:
@@ -32,8 +33,6 @@ class SkinningField(nn.Module):
         self.register_buffer("mirror", mirror)
         rows = torch.arange(self.resolution**3).view(self.resolution, -1).flip(0).reshape(-1)
         self.register_buffer("flipped", rows, persistent=False)
-
-    mirror: Tensor
 
     def probabilities(self) -> Tensor:
         """Weights of every voxel, [R^3, J]."""
@@ -95,7 +94,7 @@ def build_field(vertices: Tensor, weights: Tensor, mirror: Tensor, config: Skinn
     start = np.einsum("vk,vkj->vj", influence, weights.double().numpy()[nearest.reshape(-1, count)])
     spread = _sweep(torch.from_numpy(start).view(size, size, size, -1), config)
     logits = (spread.reshape(size**3, -1) + config.floor).log()
-    return SkinningField(logits, center - half, pitch.expand(3), mirror, config.tied)
+    return SkinningField(logits, center - half, pitch.repeat(3), mirror, config.tied)
 
 
 def _sweep(field: Tensor, config: Skinning) -> Tensor:

@@ -8,16 +8,18 @@ import math
 import torch
 from torch import Tensor, nn
 
-from rewild4d.ours.canonical import sample_surface
 from rewild4d.ours.config import Config
 from rewild4d.ours.losses import blur_matrix
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import pose_distance
 from rewild4d.ours.skeleton import neighbour_keys, skeleton_losses
 from rewild4d.ours.symmetry import Key, Supervision
+from rewild4d.priors.motion import sample_surface
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import skin_points
 from rewild4d.types import Prior
+
+OPACITY = 0.9
 
 
 class WarmUp:
@@ -36,13 +38,8 @@ class WarmUp:
         stage = config.warmup
         self.total = (stage.regress + stage.iterations) if stage.iterations else 0
         self.optimizer = torch.optim.Adam(model.network.parameters(), lr=stage.rate, fused=True)
-        vertices, faces = prior.vertices.float(), prior.faces.long()
-        self.points, _ = sample_surface(vertices, faces, stage.samples, generator)
-        a, b, c = vertices[faces].unbind(1)
-        area = 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=-1).sum()
-        self.scale = float((area / (math.pi * stage.samples)).sqrt())
-        device = model.pivots.device
-        self.points = self.points.to(device)
+        surface = sample_surface(prior, stage.samples, generator)
+        self.points, self.scale = surface.points.to(model.pivots.device), surface.radius
         with torch.no_grad():
             self.weights = model.field.sample(model.field.probabilities(), self.points)
 
@@ -80,8 +77,9 @@ class WarmUp:
         means = skin_points(self.points, self.weights, transforms)
         count = len(means)
         quats = means.new_tensor((1.0, 0, 0, 0)).expand(count, 4)
+        scales, opacities = means.new_full((count, 3), self.scale), means.new_full((count,), OPACITY)
         _, alpha, _ = rasterize(
-            means, quats, means.new_full((count, 3), self.scale), means.new_full((count,), 0.9), means.new_zeros(count, 1),
+            means, quats, scales, opacities, means.new_zeros(count, 1),
             camera.world_to_camera[None], camera.intrinsics[None], camera.width, camera.height,
         )  # fmt: skip
         # Steps of a twentieth keep the number of blur matrices small.

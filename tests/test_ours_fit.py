@@ -1,0 +1,246 @@
+"""The whole fit of `ours` on a toy: the procedural quadruped swings its legs while a camera walks around it."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import pytest
+import torch
+
+from rewild4d.errors import UserError
+from rewild4d.ours.config import Canonical, Config, Deform, Density, Geometry, Loss, PriorUse, Skinning, WarmUp
+from rewild4d.ours.fit import Training, train
+from rewild4d.ours.method import Ours
+from rewild4d.ours.model import build_model
+from rewild4d.ours.symmetry import SIGNS, Key, Supervision
+from rewild4d.priors.kinematics import pose
+from rewild4d.priors.motion import quats_from_normals, sample_surface
+from rewild4d.priors.template import MIRROR, PARENTS, quadruped
+from rewild4d.rasterizer import rasterize
+from rewild4d.transforms import look_at, mirror_camera, mirror_transforms, skin_points
+from rewild4d.types import Camera, Clip, Frame, Prior
+
+CPU = torch.device("cpu")
+WIDTH, HEIGHT, FRAMES = 64, 48, 5
+TINY = Config(
+    image_size=64,
+    iterations=16,
+    checkpoint_every=5,
+    canonical=Canonical(samples=200),
+    skinning=Skinning(resolution=10, sweeps=5),
+    deform=Deform(width=16),
+    warmup=WarmUp(iterations=6, regress=4, samples=150, size=48, views=2),
+    geometry=Geometry(smooth_size=24, temporal=0.1, rigid=0.1),
+    density=Density(every=0.2, cap=260),
+)
+
+
+def camera(index: int) -> Camera:
+    """One of twelve on a ring around the origin."""
+    angle = 2 * math.pi * index / 12
+    eye = torch.tensor((12 * math.sin(angle), 3.0, 12 * math.cos(angle)), dtype=torch.float64)
+    up = torch.tensor((0.0, 1.0, 0.0), dtype=torch.float64)
+    focal = 2.2 * HEIGHT
+    intrinsics = torch.tensor(((focal, 0, WIDTH / 2), (0, focal, HEIGHT / 2), (0, 0, 1)), dtype=torch.float64)
+    return Camera(look_at(eye, torch.zeros(3, dtype=torch.float64), up), intrinsics, WIDTH, HEIGHT)
+
+
+def swing(amplitude: float) -> torch.Tensor:
+    """Transforms of legs that swing by an amplitude in radians, [T, J, 4, 4]."""
+    angles = torch.zeros(FRAMES, 20, 3)
+    for frame in range(FRAMES):
+        step = amplitude * math.sin(2 * math.pi * (frame + 1) / FRAMES)
+        for bone, sign in ((10, 1), (19, -1), (13, -1), (16, 1)):
+            angles[frame, bone, 0] = sign * step
+    return pose(angles, quadruped().bones[:, 0], PARENTS)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Tiny tensors on a busy machine: threads only wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def toy() -> tuple[Clip, Prior]:
+    """A clip of the animal, and a prior of the right shape that does not move."""
+    template, mirror = quadruped(), torch.tensor(MIRROR)
+    cameras = tuple(camera(index) for index in range(FRAMES))
+    still = swing(0.0)
+    prior = Prior(
+        "toy", "toy", template.vertices, template.faces, template.weights, template.bones,
+        torch.tensor(PARENTS), mirror, torch.arange(FRAMES, dtype=torch.float64) / 10, torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1),
+        cameras, still, tuple(mirror_camera(each) for each in cameras), mirror_transforms(still, mirror), {}, "toy",
+    )  # fmt: skip
+    surface = sample_surface(prior, 800, torch.Generator().manual_seed(1))
+    front = surface.points[:, 2:] > 0
+    colors = torch.where(front, torch.tensor((0.8, 0.3, 0.1)), torch.tensor((0.1, 0.4, 0.7)))
+    frames = []
+    for index, transforms in enumerate(swing(0.7)):
+        view = cameras[index]
+        means = skin_points(surface.points, surface.weights, transforms)
+        image, alpha, _ = rasterize(
+            means, quats_from_normals(surface.normals), torch.full((800, 3), surface.radius), torch.full((800,), 0.95),
+            colors, view.world_to_camera[None], view.intrinsics[None], WIDTH, HEIGHT,
+        )  # fmt: skip
+        frames.append(Frame(index / 10, view, image[0].clamp(0, 1), alpha[0].clamp(0, 1), index))
+    return Clip("toy/swing", "toy", tuple(frames), 10.0, "CC0", "toy"), prior
+
+
+def quiet(step: int, total: int, values: object) -> None:
+    """Log nothing."""
+
+
+def start(toy: tuple[Clip, Prior], config: Config) -> Training:
+    """The main stage at its first step, with networks that are not at zero."""
+    generator = torch.Generator().manual_seed(0)
+    supervision = Supervision(*toy, config.image_size, CPU)
+    model = build_model(config, toy[1], generator)
+    for layer in (model.network.head, model.deform.out):
+        torch.nn.init.normal_(layer.weight, std=0.01, generator=generator)
+    return Training(model, supervision, config, generator)
+
+
+def test_the_mirrored_groups(toy: tuple[Clip, Prior]) -> None:
+    clip, prior = toy
+    supervision = Supervision(clip, prior, 64, CPU)
+    for group, view in SIGNS:
+        target = supervision.target(Key(group, view, 2))
+        image = clip.frames[2].rgb if view > 0 else clip.frames[2].rgb.flip(-1)
+        assert torch.equal(target.rgb, image)
+        # Flip cameras of a fitted prior are exact mirrors, so image and camera always agree.
+        expected = prior.cameras[2] if view > 0 else prior.cameras_flip[2]
+        torch.testing.assert_close(target.camera.world_to_camera, expected.world_to_camera)
+        torch.testing.assert_close(target.camera.intrinsics, expected.intrinsics)
+        assert float(torch.linalg.det(target.camera.world_to_camera)) == pytest.approx(1)
+    quats, shifts = supervision.prior_pose([Key(1, 1, 1), Key(-1, 1, 1), Key(1, -1, 1)])
+    assert torch.equal(quats[0], quats[1]) and shifts.abs().max() < 1e-5
+    generator = torch.Generator().manual_seed(0)
+    drawn = {supervision.draw(generator)[:2] for _ in range(60)}
+    assert drawn == set(SIGNS)
+
+
+def test_zero_networks_give_the_skinned_canonical(toy: tuple[Clip, Prior]) -> None:
+    generator = torch.Generator().manual_seed(0)
+    model = build_model(TINY, toy[1], generator)
+    weights = model.field.sample(model.field.probabilities(), model.gaussians.means)
+    posed, deformed = model.deformed(model.pose(torch.tensor([0.4]), [Key(1, 1, 1)]), weights, 1.0)
+    torch.testing.assert_close(posed.means, model.gaussians.means)
+    torch.testing.assert_close(deformed.means, posed.means)
+    torch.testing.assert_close(deformed.log_scales, posed.log_scales)
+
+
+def test_gradients_stay_in_their_branch(toy: tuple[Clip, Prior]) -> None:
+    training = start(toy, TINY)
+    model, key = training.model, Key(1, 1, 1)
+    losses, _ = training.losses(key, training.supervision.target(key), index=TINY.iterations - 1)
+    head, own = model.network.head, model.gaussians
+
+    def slopes(loss: torch.Tensor, *leaves: torch.Tensor) -> list[torch.Tensor | None]:
+        return list(torch.autograd.grad(loss, leaves, retain_graph=True, allow_unused=True))
+
+    appearance = losses["l1"] + losses["ssim"] + losses["silhouette"]
+    assert all(slope is None or slope.abs().max() == 0 for slope in slopes(appearance, head.weight, head.bias))
+    assert slopes(losses["pose_silhouette"], head.weight)[0].abs().max() > 0
+    apart = (own.colors, own.log_scales, own.logit_opacities, model.deform.out.weight, model.deform.key.weight)
+    assert slopes(losses["pose_silhouette"], *apart) == [None] * len(apart)
+    assert all(slope.abs().max() > 0 for slope in slopes(appearance, *apart[:4], own.means, model.field.logits))
+    # The anchors are the declared shared space.
+    assert slopes(appearance, model.network.anchors)[0].abs().max() > 0
+
+
+def test_a_killed_fit_resumes_to_the_same_bits(toy: tuple[Clip, Prior], tmp_path: Path) -> None:
+    whole = train(*toy, TINY, 0, CPU, quiet, None)
+
+    class Killed(Exception):
+        pass
+
+    def kill_late(step: int, total: int, values: object) -> None:
+        if step == total:
+            raise Killed
+
+    # The last log comes after the last checkpoint but one: everything since then is lost and done again.
+    with pytest.raises(Killed):
+        train(*toy, TINY, 0, CPU, kill_late, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
+    resumed = train(*toy, TINY, 0, CPU, quiet, tmp_path)
+    other = train(*toy, TINY, 1, CPU, quiet, tmp_path)
+    assert len(whole.gaussians) > TINY.canonical.samples
+    for (name, a), b in zip(whole.state_dict().items(), resumed.state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
+    assert not torch.equal(whole.network.head.weight, other.network.head.weight)
+
+
+def test_save_and_load_give_the_same_gaussians(toy: tuple[Clip, Prior], tmp_path: Path) -> None:
+    method = Ours()
+    made = method.fit(*toy, config=TINY, seed=0, device=CPU, log=quiet, workdir=None)
+    made.save(tmp_path)
+    read = method.load(tmp_path, CPU)
+    for time in (0.0, 0.13, 0.4):
+        for name in ("means", "quats", "scales", "opacities", "colors"):
+            assert torch.equal(getattr(made.at(time), name), getattr(read.at(time), name))
+        assert read.camera(time).world_to_camera.equal(made.camera(time).world_to_camera)
+    assert made.weights.sum(-1).allclose(torch.ones(len(made.canonical())))
+    figures = made.diagnostics()
+    assert len(figures["joint_angle_std"]) == 20 and figures["gaussians"] == len(made.canonical())
+    with pytest.raises(UserError, match=r"expected a reconstruction by 'ours', but it has no ours\.pt"):
+        method.load(tmp_path / "elsewhere", CPU)
+
+
+def test_a_short_fit_improves_the_silhouette(toy: tuple[Clip, Prior]) -> None:
+    config = replace_warmup(TINY, WarmUp(iterations=80, regress=5, samples=300, size=64, pull=0.0))
+    before, after = (silhouette_error(toy, each) for each in (replace_warmup(TINY, WarmUp(iterations=0)), config))
+    assert after < 0.8 * before
+
+
+def replace_warmup(config: Config, warmup: WarmUp) -> Config:
+    """The config with another warm-up and a main stage of one step."""
+    return msgspec.structs.replace(config, warmup=warmup, iterations=1, prior=PriorUse(pull=0.0), loss=Loss())
+
+
+def silhouette_error(toy: tuple[Clip, Prior], config: Config) -> float:
+    """Mean absolute difference of mattes over the input views."""
+    made = Ours().fit(*toy, config=config, seed=0, device=CPU, log=quiet, workdir=None)
+    errors = []
+    for frame in toy[0].frames:
+        moved = made.at(frame.time)
+        _, alpha, _ = rasterize(
+            moved.means, moved.quats, moved.scales, moved.opacities, moved.colors[:, 0],
+            frame.camera.world_to_camera[None], frame.camera.intrinsics[None], WIDTH, HEIGHT,
+        )  # fmt: skip
+        errors.append(float((alpha[0] - frame.mask).abs().mean()))
+    return sum(errors) / len(errors)
+
+
+def test_unusable_input_is_named(toy: tuple[Clip, Prior]) -> None:
+    clip, prior = toy
+    method = Ours()
+
+    def fit(clip: Clip, prior: Prior) -> None:
+        method.fit(clip, prior, config=TINY, seed=0, device=CPU, log=quiet, workdir=None)
+
+    empty = replace(clip.frames[3], mask=torch.zeros_like(clip.frames[3].mask))
+    with pytest.raises(
+        UserError, match="toy/swing: expected an animal in every frame, but the mask of frame 3 is empty"
+    ):
+        fit(replace(clip, frames=(*clip.frames[:3], empty, clip.frames[4])), prior)
+    with pytest.raises(UserError, match="expected a clip of at least 2 frames, got 1"):
+        fit(replace(clip, frames=clip.frames[:1]), prior)
+    with pytest.raises(UserError, match=r"knows frame 4 at 0\.400 s, but prior 'toy' covers 0\.000 to 0\.300 s"):
+        fit(clip, replace(prior, times=prior.times[:4]))
+    small = replace(clip.frames[0], rgb=torch.zeros(3, 20, 20), mask=torch.ones(1, 20, 20))
+    with pytest.raises(UserError, match="cameras are for images of 64x48 pixels, but the clip's are 20x20"):
+        fit(replace(clip, frames=(small, *clip.frames[1:])), prior)
+
+
+def test_a_loss_that_is_not_finite_stops_the_fit_with_its_name(toy: tuple[Clip, Prior]) -> None:
+    training = start(toy, TINY)
+    with torch.no_grad():
+        training.model.field.logits[:, 0] = float("nan")
+    with pytest.raises((FloatingPointError, ValueError), match="not finite|expected finite values"):
+        training.step(0)
