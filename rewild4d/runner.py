@@ -64,7 +64,8 @@ class Progress:
 
     def __call__(self, step: int, total: int, values: Mapping[str, float]) -> None:
         if self.bar is None:
-            self.bar = tqdm(desc=self.title, total=total, file=sys.stderr, mininterval=0.5 if sys.stderr.isatty() else 10.0)
+            pause = 0.5 if sys.stderr.isatty() else 10.0
+            self.bar = tqdm(desc=self.title, total=total, file=sys.stderr, mininterval=pause)
         self.bar.total = total
         self.bar.update(step - self.bar.n)
         if values:
@@ -159,16 +160,15 @@ class _Job:
         record = self._record(case, "ok", "", scores=scores, items=items, coverage=seen, pictures=pictures,
                               diagnostics=_diagnostics(reconstruction),
                               timing=self._timing(fit_seconds, seconds))  # fmt: skip
-        write_record(record, self.folder)
+        path = write_record(record, self.folder)
         shutil.rmtree(self.folder / "work", ignore_errors=True)
-        return record
+        return read_record(path)
 
     def fail(self, message: str, case: Case | None = None) -> RunRecord:
         """Record a failure: it is a finding too."""
         print(f"{self.title}: failed: {message}", file=sys.stderr)
         record = self._record(case, "failed", message, timing=self._timing(0.0, 0.0))
-        write_record(record, self.folder)
-        return record
+        return read_record(write_record(record, self.folder))
 
     def _fit(self, case: Case) -> tuple[Reconstruction, float]:
         """The reconstruction, saved; a run killed while scoring reads it back instead of fitting again."""

@@ -72,5 +72,4 @@ def score_again(folder: Path, options: Options) -> RunRecord:
         record, status="ok", error="", scores=scores, items=items, pictures=pictures, protocol=settings,
         code=code_version(), machine=machine(),
     )  # fmt: skip
-    write_record(renewed, folder)
-    return renewed
+    return read_record(write_record(renewed, folder))

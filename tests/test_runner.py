@@ -1,0 +1,178 @@
+"""The runner: records, resume, failures that are records, and methods that never see what is held out."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import torch
+
+from rewild4d import runner
+from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig
+from rewild4d.commands.evaluate import Options as EvaluateOptions
+from rewild4d.commands.evaluate import score_again
+from rewild4d.conformance import check_method, tiny_case
+from rewild4d.contracts import Selection
+from rewild4d.coverage import coverage, visible
+from rewild4d.errors import UserError
+from rewild4d.leaderboard.records import FILE, RunRecord, Timing
+from rewild4d.priors.choose import PriorChoice
+from rewild4d.priors.config import STANDARD
+from rewild4d.priors.io import save_prior
+from rewild4d.protocol import find_protocol
+from rewild4d.registry import load_method
+from rewild4d.types import Camera, Case, Clip, Truth
+
+SETTINGS = PriorOnlyConfig(gaussians=2000)
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    return tiny_case()
+
+
+class OneCase:
+    """A reader of the tiny case."""
+
+    licence = "CC0 1.0"
+
+    def __init__(self, case: Case) -> None:
+        self.case = case
+
+    def cases(self, selection: Selection) -> list[str]:
+        return [self.case.clip.name]
+
+    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
+        return self.case.clip, self.case.truth
+
+    def check(self) -> list[Any]:
+        return []
+
+
+@pytest.fixture
+def plan(case: Case, tmp_path: Path) -> runner.Plan:
+    save_prior(case.prior, tmp_path / "prior.npz")
+    return runner.Plan(
+        dataset="artemis",
+        reader=OneCase(case),
+        root=tmp_path,
+        cases=(case.clip.name,),
+        protocol=find_protocol("artemis", None),
+        entries=(runner.Entry("empty", "default", load_method("empty").Config(), (0,)),
+                 runner.Entry("prior-only", "quick", SETTINGS, (0, 1))),
+        prior=PriorChoice(str(tmp_path / "prior.npz"), STANDARD),
+        device=torch.device("cpu"),
+        out=tmp_path / "runs",
+    )  # fmt: skip
+
+
+def still(record: RunRecord) -> RunRecord:
+    """A record without what may differ between two equal runs."""
+    return msgspec.structs.replace(record, timing=Timing("", 0, 0, 0))
+
+
+def test_a_run_scores_the_exact_prior_well(plan: runner.Plan) -> None:
+    empty, first, second = runner.execute(plan)
+    assert [r.status for r in (empty, first, second)] == ["ok"] * 3
+    assert empty.scores["iou"].value == 0.0
+    psnr, floor = first.scores["psnr"].value, empty.scores["psnr"].value
+    assert psnr is not None and floor is not None and psnr > floor + 10
+    assert (first.scores["iou"].value or 0) > 0.9
+    assert len(first.items) == first.scores["psnr"].count == len(first.scores["psnr"].per_item) == 4
+    assert first.run_id != second.run_id
+    for name in first.pictures:
+        folder = next(plan.out.rglob(f"prior-only-quick-seed0-{first.run_id[:8]}"))
+        assert (folder / name).stat().st_size > 500
+
+
+def test_two_runs_with_one_seed_give_equal_records(plan: runner.Plan, tmp_path: Path) -> None:
+    once = runner.execute(plan)
+    again = runner.execute(replace(plan, out=tmp_path / "other"))
+    assert [still(r) for r in once] == [still(r) for r in again]
+
+
+def test_finished_runs_are_skipped(plan: runner.Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    once = runner.execute(plan)
+    monkeypatch.setattr(PriorOnly, "fit", lambda *_, **__: pytest.fail("fitted a finished run again"))
+    assert runner.execute(plan) == once
+
+
+def test_a_run_killed_while_scoring_is_not_fitted_again(plan: runner.Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    once = runner.execute(plan)
+    for record in plan.out.rglob(FILE):
+        record.unlink()
+    monkeypatch.setattr(PriorOnly, "fit", lambda *_, **__: pytest.fail("fitted again"))
+    assert [still(r) for r in runner.execute(plan)] == [still(r) for r in once]
+
+
+def test_a_failure_is_a_record_and_is_tried_again(plan: runner.Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: Any, **__: Any) -> None:
+        raise FloatingPointError("iteration 7: the loss is not finite")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PriorOnly, "fit", broken)
+        failed = runner.execute(plan)
+    assert [r.status for r in failed] == ["ok", "failed", "failed"]
+    assert failed[1].error == "FloatingPointError: iteration 7: the loss is not finite"
+    assert failed[1].scores == {}
+    assert [r.status for r in runner.execute(plan)] == ["ok"] * 3
+
+
+def test_other_settings_are_another_run(plan: runner.Plan) -> None:
+    first = runner.execute(plan)[1]
+    entry = runner.Entry("prior-only", "quick", PriorOnlyConfig(gaussians=2001), (0,))
+    assert runner.execute(replace(plan, entries=(entry,)))[0].run_id != first.run_id
+
+
+def test_methods_get_the_clip_and_nothing_that_is_held_out(plan: runner.Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Any] = []
+    fit = PriorOnly.fit
+
+    def spy(self: PriorOnly, *given: Any, **named: Any) -> Any:
+        seen.extend([*given, *named.values()])
+        return fit(self, *given, **named)
+
+    monkeypatch.setattr(PriorOnly, "fit", spy)
+    runner.execute(plan)
+    assert seen and not any(isinstance(value, Truth | Case) for value in seen)
+
+
+def test_evaluate_gives_the_same_scores(plan: runner.Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    record = runner.execute(plan)[1]
+    folder = next(plan.out.rglob(f"prior-only-quick-seed0-{record.run_id[:8]}"))
+    monkeypatch.setattr("rewild4d.commands.evaluate.load_dataset", lambda _: lambda _: plan.reader)
+    assert still(score_again(folder, EvaluateOptions(runs=(folder,)))) == still(record)
+    shutil.rmtree(folder / "reconstruction")
+    with pytest.raises(UserError, match="reconstruction: expected a saved reconstruction, but there is no such folder"):
+        score_again(folder, EvaluateOptions(runs=(folder,)))
+
+
+def test_unknown_case_has_a_suggestion() -> None:
+    assert runner.choose_cases(["wolf/Run", "wolf/Walk", "cat/run"], ["wolf/*"]) == ("wolf/Run", "wolf/Walk")
+    with pytest.raises(UserError, match="unknown case 'wolf/run'. Did you mean 'wolf/Run'"):
+        runner.choose_cases(["wolf/Run", "wolf/Walk"], ["wolf/run"])
+
+
+@pytest.mark.parametrize("name", ["empty", "prior-only"])
+def test_floors_keep_the_contract(name: str) -> None:
+    assert [finding.message for finding in check_method(name, "quick")] == ["kept"] * 5
+
+
+def test_coverage_of_a_two_sided_wall() -> None:
+    """Points on two parallel squares: a camera in front sees the front one only, half of a side view's evidence."""
+    grid = torch.linspace(-1, 1, 40, dtype=torch.float64)
+    x, y = (a.flatten() for a in torch.meshgrid(grid, grid, indexing="ij"))
+    wall = torch.cat([torch.stack((x, y, torch.full_like(x, depth)), dim=-1) for depth in (5.0, 6.0)])
+    intrinsics = torch.tensor(((50.0, 0, 32), (0, 50, 32), (0, 0, 1)), dtype=torch.float64)
+    camera = Camera(torch.eye(4, dtype=torch.float64), intrinsics, 64, 64)
+    shown = visible(wall, camera)
+    assert shown[:1600].all()
+    assert not shown[1600:].any()
+
+
+def test_coverage_without_geometry_has_only_the_foreground(case: Case) -> None:
+    found = coverage(case.clip, case.truth)
+    assert set(found) == {"foreground"}
+    assert 0 < found["foreground"] < 0.5
