@@ -11,7 +11,7 @@ from torch import Tensor
 from rewild4d.errors import UserError
 from rewild4d.priors.config import PRESETS, PriorConfig
 from rewild4d.priors.fit import fit_template
-from rewild4d.priors.hypotheses import cosine_series
+from rewild4d.priors.hypotheses import Hypotheses, cosine_series
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.overlay import overlay
 from rewild4d.priors.search import mask_rays, trajectory, up_directions
@@ -147,3 +147,13 @@ def test_cosines_start_with_a_constant_and_damp_fast_motion() -> None:
     assert torch.equal(series[:, 0], torch.ones(16))
     peaks = series.abs().amax(0)
     assert bool((peaks.diff() < 0).all()) and float(peaks[4]) == pytest.approx(math.cos(math.pi / 8) / 2)
+
+
+def test_legs_that_swing_backwards_on_the_ground_are_a_gait_and_time_reversed_they_are_none() -> None:
+    guesses = Hypotheses.start(torch.eye(3).expand(2, 3, 3), torch.zeros(16, 3))
+    # the series' second term falls over time; a positive angle about x takes a hanging foot backwards
+    guesses.angles[:, 1, [10, 13, 16, 19], 0] = torch.tensor((-1.0, 1.0))[:, None]
+    forwards, backwards = guesses.backward_gait().tolist()
+    assert forwards < -0.5 and backwards == pytest.approx(-forwards, abs=1e-5)
+    still = Hypotheses.start(torch.eye(3)[None], torch.zeros(16, 3))
+    assert float(still.backward_gait()) == pytest.approx(0.0, abs=1e-6)

@@ -34,6 +34,8 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         shape_weight: of the mean squared deviation of proportions: an average animal unless the masks insist.
         angle_weight: of the squared whitened joint angles: limbs rest, and move slowly, unless the masks insist.
         root_weight: of the squared whitened root motion and tilt: a sweeping camera sees each moment once.
+        gait_weight: of feet that bear weight and move forwards, when guesses are compared: outlines alone hardly tell
+            the head of a bushy-tailed animal.
     """
 
     stages: tuple[Stage, ...]
@@ -43,13 +45,14 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shape_weight: float = 0.02
     angle_weight: float = 0.02
     root_weight: float = 0.02
+    gait_weight: float = 0.015
 
 
 STANDARD = PriorConfig(
     stages=(
         Stage(size=32, steps=40, blur=(0.08, 0.04), keep=6, joints=False, frames=12),
         Stage(size=48, steps=80, blur=(0.05, 0.03), keep=2),
-        Stage(size=64, steps=150, blur=(0.04, 0.015), keep=1),
+        Stage(size=64, steps=150, blur=(0.04, 0.015), keep=2),
         Stage(size=80, steps=250, blur=(0.02, 0.006), keep=1),
     )
 )

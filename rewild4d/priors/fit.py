@@ -170,6 +170,8 @@ class _Race:
             self.log(self.done, self.total, {"prior": float(cost.detach().min())})
         with torch.no_grad():
             self.costs = self._cost(_spaced(targets, 2 * stage.frames), stage.size * stage.blur[1], stage.joints)
+            if stage.joints:
+                self.costs = self.costs + self.config.gait_weight * self.guesses.backward_gait()
         self._cut(stage.keep)
 
     def _cut(self, keep: int) -> None:

@@ -17,6 +17,11 @@ from rewild4d.transforms import axis_angle_to_matrix, rigid
 
 ANGLE_LIMIT = 1.1
 """No joint axis turns further, in radians (Fauna: 60 degrees)."""
+FEET = [8, 11, 14, 17]
+LIFTED = 0.05
+"""Height above its lowest place at which a foot bears no weight, in template units."""
+STILL_STEP = 0.03
+"""Foot motion per moment below which no gait is read, in template units."""
 SCALE_SPREAD = 0.25
 TURN_SPREAD = (0.15, 0.35, 0.10)
 SHIFT_SPREAD = 0.30
@@ -124,6 +129,22 @@ class Hypotheses:
             local = template.blobs[:, None] @ linear[..., :3, :3].transpose(-1, -2) + linear[..., None, :3, 3]
         sizes = (template.blob_sizes * scale)[:, None]
         return splat(local, sizes, targets.intrinsics, targets.masks.shape[-1])
+
+    def backward_gait(self) -> Tensor:
+        """Whether low feet move towards the head (against every gait, up to 1) or the tail (down to -1), [B].
+
+        A foot that bears weight goes backwards in the body's frame, whether the animal travels or walks on the spot;
+        with head and tail confused it goes forwards. Near zero where the feet hardly move.
+        """
+        bones = quadruped(Proportions(self.shape), unit=False).bones
+        transforms = pose(self.joint_angles(), bones[:, None, :, 0], PARENTS)[:, :, FEET]
+        toes = (transforms[..., :3, :3] @ bones[:, None, FEET, 1, :, None])[..., 0] + transforms[..., :3, 3]
+        if toes.shape[1] < 2:
+            return toes.new_zeros(len(self))
+        height, step = (toes[:, 1:, :, 1] + toes[:, :-1, :, 1]) / 2, toes[..., 2].diff(dim=1)
+        bearing = torch.exp(-(height - height.amin(1, keepdim=True)) / LIFTED)
+        travel = (bearing * step.abs()).sum((1, 2))
+        return (bearing * step).sum((1, 2)) / (travel + STILL_STEP * bearing.sum((1, 2)))
 
     def penalties(self) -> tuple[Tensor, Tensor, Tensor]:
         """How unusual the proportions, the joint angles and the root's motion are, each [B]."""

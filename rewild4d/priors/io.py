@@ -25,6 +25,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -80,7 +81,7 @@ def save_prior(prior: Prior, path: Path) -> None:
     Raises:
         UserError: the file cannot be written.
     """
-    arrays = {
+    arrays: dict[str, Any] = {
         name: getattr(prior, name).detach().cpu().numpy()
         for name in (*SHAPES, *FLIPPED)
         if isinstance(getattr(prior, name, None), Tensor)
