@@ -90,9 +90,9 @@ def save_prior(prior: Prior, path: Path) -> None:
         arrays[f"world_to_camera{suffix}"] = torch.stack([camera.world_to_camera for camera in cameras]).numpy()
         arrays[f"intrinsics{suffix}"] = torch.stack([camera.intrinsics for camera in cameras]).numpy()
     arrays["sizes"] = np.array([(camera.width, camera.height) for camera in prior.cameras])
-    texts = {"name": prior.name, "provenance": prior.provenance, "quality": json.dumps(prior.quality)}
+    arrays |= {"name": prior.name, "provenance": prior.provenance, "quality": json.dumps(prior.quality)}
     with atomic(path) as temporary, temporary.open("wb") as stream:
-        np.savez_compressed(stream, **arrays, **{key: np.array(text) for key, text in texts.items()})
+        np.savez_compressed(stream, **arrays)
 
 
 def load_prior(path: Path) -> Prior:
