@@ -184,7 +184,7 @@ class Training:
         for group, pair in zip(
             self.network_optimizer.param_groups, (rates.skinning, rates.pose, rates.deform), strict=True
         ):
-            group["lr"] = exponential(*pair, progress)
+            group["lr"] = exponential(*pair, progress) * ramp(progress, 0.0, rates.rise)
 
     def _check_gradients(self, index: int) -> None:
         """Bound the networks' gradients; a value that is not finite stops the fit with its name."""

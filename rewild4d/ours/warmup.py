@@ -36,7 +36,7 @@ class WarmUp:
         self.model, self.supervision, self.config = model, supervision, config
         self.generator = generator
         stage = config.warmup
-        self.total = (stage.regress + stage.iterations) if stage.iterations else 0
+        self.total = stage.regress + stage.iterations
         self.optimizer = torch.optim.Adam(model.network.parameters(), lr=stage.rate, fused=True)
         surface = sample_surface(prior, stage.samples, generator)
         self.points, self.scale = surface.points.to(model.pivots.device), surface.radius
@@ -47,14 +47,12 @@ class WarmUp:
         """One update; returns the figures for the log."""
         stage = self.config.warmup
         progress = max(0.0, (index - stage.regress) / max(1, stage.iterations))
-        rate = stage.rate * min(1.0, 2.0 * (1.0 - progress)) + 1e-6
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
-        keys = [self.supervision.draw(self.generator) for _ in range(stage.views)]
-        keys, own = neighbour_keys(keys, self.supervision.frames, self.config.geometry.temporal > 0)
+        self._set_rate(index)
+        copied = index < stage.regress
+        keys = [self.supervision.draw(self.generator) for _ in range(stage.copies if copied else stage.views)]
+        keys, own = neighbour_keys(keys, self.supervision.frames, self.config.geometry.temporal > 0 and not copied)
         times = torch.tensor([(key.frame + 1) / self.supervision.frames for key in keys])
         pose = self.model.pose(times, keys)
-        copied = index < stage.regress
         distance = pose_distance(pose, *self.supervision.prior_pose(keys))
         if copied:
             loss, figures = distance, {}
@@ -69,6 +67,20 @@ class WarmUp:
         nn.utils.clip_grad_norm_(self.model.network.parameters(), self.config.rates.clip, error_if_nonfinite=True)
         self.optimizer.step()
         return {"loss": float(loss.detach()), "prior_distance": float(distance.detach())} | figures
+
+    def _set_rate(self, index: int) -> None:
+        """Each part rises over its first tenth and falls to zero; the second starts without the first's moments.
+
+        The copy ends with tiny gradients, so Adam would answer the first silhouette with a step that undoes it.
+        """
+        stage = self.config.warmup
+        copied = index < stage.regress
+        place = index / stage.regress if copied else (index - stage.regress) / stage.iterations
+        rate = stage.regress_rate if copied else stage.rate
+        if index == stage.regress:
+            self.optimizer.state.clear()
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate * min(1.0, 0.01 + 10 * place, 1.5 * (1 - place))
 
     def _silhouette(self, key: Key, transforms: Tensor, progress: float) -> Tensor:
         """L2 (per pixel of the animal's box) + Dice of blurred mattes."""
