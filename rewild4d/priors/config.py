@@ -43,8 +43,8 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     elevations: tuple[float, ...] = (5.0, 20.0, 40.0)
     learning_rate: float = 0.06
     shape_weight: float = 0.02
-    angle_weight: float = 0.02
-    root_weight: float = 0.02
+    angle_weight: float = 0.15
+    root_weight: float = 0.2
     gait_weight: float = 0.015
 
 

@@ -147,7 +147,12 @@ class Hypotheses:
         return (bearing * step).sum((1, 2)) / (travel + STILL_STEP * bearing.sum((1, 2)))
 
     def penalties(self) -> tuple[Tensor, Tensor, Tensor]:
-        """How unusual the proportions, the joint angles and the root's motion are, each [B]."""
-        swing = self.angles.square() * (ANGLE_SPREADS > 0)
-        root = self.turn.square().sum((1, 2)) + self.shift[:, 1:].square().sum((1, 2))
+        """How unusual the proportions, the joint angles and the root's motion are, each [B].
+
+        Fast terms cost more than slow ones: a moment seen by one camera says nothing of depth, its neighbours do.
+        """
+        pace = torch.arange(self.angles.shape[1])
+        swing = self.angles.square() * (ANGLE_SPREADS > 0) * (0.3 + (pace / 4).square())[:, None, None]
+        haste = torch.arange(self.shift.shape[1]).square()[:, None]
+        root = self.turn.square().sum((1, 2)) + 0.5 * (self.shift.square() * haste).sum((1, 2))
         return self.shape.square().mean(1), swing.sum(1).mean((1, 2)), root

@@ -17,6 +17,8 @@ SILHOUETTE_SIDE = 1.5
 """Square root of the average template's silhouette area over directions, in template units."""
 WIDE_BASELINE = 0.2
 """Viewing directions that spread by more (radians) fix the animal's depth; below, its depth is a guess."""
+STILLNESS = 0.5
+"""Damping of the path's cosine terms, per observation and squared order."""
 
 
 @dataclass(frozen=True)
@@ -83,10 +85,11 @@ def trajectory(rays: Rays, count: int) -> Tensor:
     terms = min(4, max(1, count // 4))
     series = cosine_series(count, terms).double()[rays.moments]
     across = torch.eye(3, dtype=torch.float64) - rays.directions[:, :, None] * rays.directions[:, None, :]
-    # unknowns: coefficients [terms, 3]; higher terms are damped so that a still animal stays still
+    # unknowns: coefficients [terms, 3]; higher terms are damped so that a still animal stays still: the outline's
+    # centre wanders with the view, and a path that follows it drifts in depth
     system = torch.einsum("vk,vab,vl->kalb", series, across, series)
     wanted = torch.einsum("vk,vab,vb->ka", series, across, rays.centers)
-    damping = 0.02 * len(series) * torch.arange(terms).double().square()
+    damping = STILLNESS * len(series) * torch.arange(terms).double().square()
     damping[0] = 1e-9 * len(series)
     system = system.reshape(3 * terms, 3 * terms) + torch.diag(damping.repeat_interleave(3))
     coefficients = torch.linalg.solve(system, wanted.flatten()).reshape(terms, 3)
