@@ -26,6 +26,7 @@ class DensityControl:
     def observe(self, info: RasterInfo, side: float, longest: int) -> None:
         """Add one view after its backward pass; ``side`` is the animal's box, ``longest`` the image's side, pixels."""
         drawn = info.radii[0] > 0
+        assert info.means2d.grad is not None, "observe comes after backward"
         slope = info.means2d.grad[0].norm(dim=-1) * (side / 2)
         self.gradient += torch.where(drawn, slope, 0.0)
         self.seen += drawn

@@ -1,7 +1,7 @@
 """The training loop: warm-up, then the stage-aware losses of METHOD section 6; one object holds all state."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +100,7 @@ class Training:
         network_pose = poses
         if config.prior.blend:
             poses = blend_poses(poses, *prior_pose, fade(progress, config.prior.blend_until))
-        pose = poses[own[0]]
+        pose = poses.row(own[0])
         probabilities = model.field.probabilities()
         weights = model.field.sample(probabilities, model.gaussians.means)
         opacities = model.gaussians.opacities()
@@ -268,10 +268,7 @@ def train(
     for index in range(start, total):
         if index == warmup.total:
             model.gaussians.colors.data = initial_colors(model, supervision)
-        step: Callable[[], dict[str, float]] = (
-            (lambda i=index: warmup.step(i)) if index < warmup.total else (lambda i=index: main.step(i - warmup.total))
-        )
-        figures = step()
+        figures = warmup.step(index) if index < warmup.total else main.step(index - warmup.total)
         if index % LOG_EVERY == 0 or index + 1 == total:
             log(index + 1, total, figures)
         if workdir is not None and (index + 1) % config.checkpoint_every == 0 and index + 1 < total:

@@ -6,7 +6,7 @@ from typing import ClassVar
 import torch
 
 from rewild4d.contracts import Log, MethodInfo
-from rewild4d.ours.config import Config
+from rewild4d.ours.config import Config as OursConfig
 from rewild4d.ours.fit import train
 from rewild4d.ours.reconstruction import OursReconstruction, from_fit, load_reconstruction
 from rewild4d.ours.symmetry import match_times
@@ -17,14 +17,14 @@ class Ours:
     """Part-aware canonical Gaussians with mirrored supervision (contracts.Method)."""
 
     info: ClassVar[MethodInfo] = MethodInfo(title="Ours", paper="this project's design", licence="MIT")
-    Config: ClassVar[type[Config]] = Config
+    Config: ClassVar[type[OursConfig]] = OursConfig
 
     def fit(
         self,
         clip: Clip,
         prior: Prior,
         *,
-        config: Config,
+        config: OursConfig,
         seed: int,
         device: torch.device,
         log: Log,

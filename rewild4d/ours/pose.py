@@ -23,9 +23,9 @@ class Pose(NamedTuple):
     shifts: Tensor
     features: Tensor
 
-    def __getitem__(self, index: int | slice) -> "Pose":  # type: ignore[override]
-        index = slice(index, index + 1) if isinstance(index, int) else index
-        return Pose(*(tensor[index] for tensor in (self.quats, self.shifts, self.features)))
+    def row(self, index: int) -> "Pose":
+        """One pose of the batch, as a batch of one."""
+        return Pose(*(tensor[index : index + 1] for tensor in self))
 
     def mirrored(self, mirror: Tensor) -> "Pose":
         """The same poses with left and right exchanged."""

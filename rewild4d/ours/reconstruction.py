@@ -132,9 +132,8 @@ def load_reconstruction(folder: Path, device: torch.device) -> OursReconstructio
         raise UserError(f"{folder}: expected a reconstruction by 'ours', but it cannot be read ({error}).") from error
     saved = state["model"]
     gaussians = Gaussians({name: saved[f"gaussians.{name}"] for name in NAMES}, config.canonical.max_scale)
-    field = SkinningField(
-        *(saved[f"field.{name}"] for name in ("logits", "origin", "pitch", "mirror")), config.skinning.tied
-    )
+    logits, origin, pitch, mirror = (saved[f"field.{name}"] for name in ("logits", "origin", "pitch", "mirror"))
+    field = SkinningField(logits, origin, pitch, mirror, config.skinning.tied)
     skeleton = (saved["pivots"], saved["parents"], saved["mirror"])
     model = Model(config, gaussians, field, *skeleton, torch.Generator().manual_seed(0))
     model.load_state_dict(saved)

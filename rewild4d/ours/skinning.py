@@ -36,10 +36,9 @@ class SkinningField(nn.Module):
 
     def probabilities(self) -> Tensor:
         """Weights of every voxel, [R^3, J]."""
-        logits = self.logits
-        if self.tied:
-            logits = 0.5 * (logits + logits[self.flipped][:, self.mirror])
-        return logits.softmax(dim=-1)
+        if not self.tied:
+            return self.logits.softmax(dim=-1)
+        return (0.5 * (self.logits + self.logits[self.flipped][:, self.mirror])).softmax(dim=-1)
 
     def sample(self, probabilities: Tensor, points: Tensor) -> Tensor:
         """Weights of points; outside the cube the nearest border counts.
