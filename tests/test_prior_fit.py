@@ -14,9 +14,10 @@ from rewild4d.priors.fit import fit_template
 from rewild4d.priors.hypotheses import Hypotheses, cosine_series
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.overlay import overlay
+from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.search import mask_rays, trajectory, up_directions
 from rewild4d.priors.silhouettes import outline, splat
-from rewild4d.priors.template import PARENTS, Proportions, quadruped
+from rewild4d.priors.template import PARENTS, quadruped
 from rewild4d.transforms import axis_angle_to_matrix, look_at, similarity, skin_points
 from rewild4d.types import Camera, Clip, Frame
 

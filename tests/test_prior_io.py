@@ -10,7 +10,7 @@ import torch
 from rewild4d.errors import UserError
 from rewild4d.priors.fit import Animal, make_prior
 from rewild4d.priors.io import load_prior, save_prior
-from rewild4d.priors.template import Proportions
+from rewild4d.priors.proportions import Proportions
 from rewild4d.transforms import look_at, mirror_points, similarity, skin_points
 from rewild4d.types import Camera, Clip, Frame, Prior
 

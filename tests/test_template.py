@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from rewild4d.priors.kinematics import depth_levels, pose
-from rewild4d.priors.template import MIRROR, PARENTS, PROPORTIONS, Proportions, diagonal, quadruped
+from rewild4d.priors.proportions import PROPORTIONS, Proportions
+from rewild4d.priors.template import MIRROR, PARENTS, diagonal, quadruped
 from rewild4d.transforms import mirror_points, mirror_transforms, skin_points
 
 

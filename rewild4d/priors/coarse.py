@@ -12,7 +12,7 @@ from rewild4d.contracts import Log
 from rewild4d.priors.config import PriorConfig
 from rewild4d.priors.fit import Animal, fit_animal, make_prior
 from rewild4d.priors.hypotheses import ANGLE_SPREADS
-from rewild4d.priors.template import Proportions
+from rewild4d.priors.proportions import Proportions
 from rewild4d.transforms import axis_angle_to_matrix
 from rewild4d.types import OBJECT_DIAGONAL, Clip, Frame, Prior
 

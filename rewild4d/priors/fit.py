@@ -16,6 +16,7 @@ from rewild4d.priors.config import PriorConfig, Stage
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.io import seal
 from rewild4d.priors.kinematics import pose
+from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.search import (
     facings,
     mask_rays,
@@ -25,7 +26,7 @@ from rewild4d.priors.search import (
     working_frame,
 )
 from rewild4d.priors.silhouettes import Targets, crop_targets, mismatch, overlap
-from rewild4d.priors.template import MIRROR, PARENTS, Proportions, diagonal, quadruped
+from rewild4d.priors.template import MIRROR, PARENTS, diagonal, quadruped
 from rewild4d.transforms import (
     camera_in_object,
     mirror_camera,

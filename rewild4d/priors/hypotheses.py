@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from rewild4d.priors.kinematics import pose
+from rewild4d.priors.proportions import PROPORTIONS, Proportions
 from rewild4d.priors.silhouettes import Targets, splat
-from rewild4d.priors.template import PARENTS, PROPORTIONS, Proportions, quadruped
+from rewild4d.priors.template import PARENTS, quadruped
 from rewild4d.transforms import axis_angle_to_matrix, rigid
 
 ANGLE_LIMIT = 1.1
