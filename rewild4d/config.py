@@ -67,7 +67,7 @@ def parse_flags(options_type: type[T], arguments: list[str], *, prog: str, descr
 
 def with_method_flags(options_type: type, config: msgspec.Struct) -> type:
     """``options_type`` with one more field, ``config``, whose settings are flags of their own (--loss.ssim 0.3)."""
-    flattened = typing.Annotated[type(config), tyro.conf.arg(name="")]
+    flattened: Any = typing.Annotated[type(config), tyro.conf.arg(name="")]  # type: ignore[valid-type]
     return dataclasses.make_dataclass(
         options_type.__name__,
         [("config", flattened, dataclasses.field(default=config))],

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import msgspec
@@ -62,7 +63,7 @@ class Progress:
         self.bar: tqdm | None = None
         self.title, self.path = title, path
 
-    def __call__(self, step: int, total: int, values: Mapping[str, float]) -> None:
+    def __call__(self, step: int, total: int, values: Mapping[str, float] = MappingProxyType({})) -> None:
         if self.bar is None:
             pause = 0.5 if sys.stderr.isatty() else 10.0
             self.bar = tqdm(desc=self.title, total=total, file=sys.stderr, mininterval=pause)

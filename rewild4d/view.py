@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import cv2
 import imageio.v2 as imageio
@@ -100,14 +101,9 @@ def save_png(image: Tensor, path: Path) -> None:
 
 def save_mp4(images: list[Tensor], path: Path, fps: float) -> None:
     """Write RGB images in [0, 1], each [3, h, w] of one size, as H.264 atomically; odd sizes are padded."""
-    with (
-        atomic(path) as temporary,
-        imageio.get_writer(
-            temporary, fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="error"
-        ) as writer,
-    ):
-        for image in images:
-            writer.append_data(_bytes(image))
+    settings: Any = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    with atomic(path) as temporary:
+        imageio.mimwrite(temporary, [_bytes(image) for image in images], fps=fps, **settings)
 
 
 def _shot(reconstruction: Reconstruction, frame: Frame) -> Tensor:

@@ -3,6 +3,7 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -60,7 +61,7 @@ def main(arguments: list[str]) -> int:
     preset = _peek(arguments, "--preset") or Options.preset
     method = load_method(wanted)
     options_type = with_method_flags(Options, load_preset(wanted, method.Config, preset))
-    options = parse_flags(options_type, arguments, prog="rewild4d-bench run", description=DESCRIPTION)
+    options: Any = parse_flags(options_type, arguments, prog="rewild4d-bench run", description=DESCRIPTION)
     records = execute(make_plan(options, options.config))
     if options.json:
         print("[" + ",\n".join(to_json(record) for record in records) + "]")
