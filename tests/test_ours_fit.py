@@ -116,7 +116,7 @@ def start(toy: tuple[Clip, Prior], config: Config) -> Training:
     model = build_model(config, toy[1], generator)
     for layer in (model.network.head, model.deform.out):
         torch.nn.init.normal_(layer.weight, std=0.01, generator=generator)
-    return Training(model, supervision, config, generator)
+    return Training(model, supervision, supervision, config, generator)
 
 
 def test_the_mirrored_groups(toy: tuple[Clip, Prior]) -> None:

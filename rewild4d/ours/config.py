@@ -30,7 +30,7 @@ class Skinning(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     neighbours: int = 8
     """Vertices averaged by inverse distance to fill a voxel; 30 mix both legs of a pair."""
     sweeps: int = 2
-    """Neighbour averages; 30 (SelfRecon) moved the posed prior by 5 times as much and cost 0.2 of its mask IoU."""
+    """Neighbour averages; 30 (SelfRecon) moved the posed prior by 5 times as much."""
     keep: float = 0.7
     """Share of itself that a voxel keeps in a sweep."""
     floor: float = 1e-3
@@ -128,6 +128,41 @@ class WarmUp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """Learning rate on silhouettes."""
     pull: float = 0.3
     """Weight of the pull to the prior's poses, falling linearly to zero."""
+
+
+class Repose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The second look at the poses: fitted again to the images with the learnt Gaussians, all else frozen."""
+
+    at: tuple[float, ...] = ()
+    """Fractions at which it happens; the fitted poses take the place of the prior's from there on."""
+    steps: int = 100
+    """Steps of Adam."""
+    frames: int = 24
+    """Frames a step."""
+    blur: tuple[float, float] = (0.03, 0.01)
+    """Blur of the difference image at the first and last step, times the side of the animal's box."""
+    colour: float = 1.0
+    """Weight of the squared colour difference against that of the mattes."""
+    rate: float = 0.05
+    """Learning rate on whitened parameters, falling to zero over the second half."""
+    penalty: float = 1e-3
+    """Weight of the squared whitened change."""
+    turn_spread: float = 0.1
+    """Natural size of the change of the root's rotation, radians."""
+    shift_spread: float = 0.02
+    """Natural size of the change of the root's place, times the rest diagonal."""
+    joint_spread: tuple[float, float, float] = (0.25, 0.06, 0.06)
+    """Natural size of the change of a joint's rotation about the object's axes, radians: x flexes, y and z turn out."""
+    root_terms: float = 0.25
+    """Terms of the root's cosine series a frame."""
+    joint_terms: float = 0.5
+    """Terms of a joint's."""
+    copy_steps: int = 100
+    """Steps that teach the network the fitted poses."""
+    copies: int = 48
+    """Poses a step of those."""
+    copy_rate: float = 2e-3
+    """Learning rate of those."""
 
 
 class Loss(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -242,6 +277,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     deform: Deform = Deform()
     prior: PriorUse = PriorUse()
     warmup: WarmUp = WarmUp()
+    repose: Repose = Repose()
     loss: Loss = Loss()
     geometry: Geometry = Geometry()
     rates: Rates = Rates()

@@ -4,6 +4,7 @@ Outside the union of both silhouettes render and target are the same background,
 is exactly what the whole frame would give.
 """
 
+import math
 from functools import cache
 
 import torch
@@ -101,3 +102,13 @@ def blur_matrix(size: int, sigma: float, radius: int, device: torch.device) -> T
     kernel = torch.exp(-(torch.arange(-radius, radius + 1, dtype=torch.float64) ** 2) / (2 * sigma**2)).sum()
     band = torch.exp(-(offset**2) / (2 * sigma**2)) * (offset.abs() <= radius) / kernel
     return band.float().to(device)
+
+
+def blurred(image: Tensor, sigma: float) -> Tensor:
+    """Gaussian blur with zero padding, [h, w]; below a third of a pixel nothing happens."""
+    if sigma < 0.3:
+        return image
+    radius = math.ceil(3 * sigma)
+    rows = blur_matrix(image.shape[0], sigma, radius, image.device)
+    columns = blur_matrix(image.shape[1], sigma, radius, image.device)
+    return rows @ image @ columns.T

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from rewild4d.ours.config import Config
-from rewild4d.ours.losses import blur_matrix
+from rewild4d.ours.losses import blurred
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import pose_distance
 from rewild4d.ours.skeleton import neighbour_keys, skeleton_losses
@@ -96,16 +96,6 @@ class WarmUp:
         )  # fmt: skip
         # Steps of a twentieth keep the number of blur matrices small.
         sigma = self.config.warmup.blur * target.side * (1 - math.floor(20 * progress) / 20)
-        rendered, truth = (_blurred(image[0], round(sigma, 1)) for image in (alpha[0], target.mask))
+        rendered, truth = (blurred(image[0], round(sigma, 1)) for image in (alpha[0], target.mask))
         l2 = (rendered - truth).square().sum() / target.side**2
         return l2 + 1 - (2 * (rendered * truth).sum() + 1) / (rendered.square().sum() + truth.square().sum() + 1)
-
-
-def _blurred(image: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur with zero padding, [h, w]; below a third of a pixel nothing happens."""
-    if sigma < 0.3:
-        return image
-    radius = math.ceil(3 * sigma)
-    rows = blur_matrix(image.shape[0], sigma, radius, image.device)
-    columns = blur_matrix(image.shape[1], sigma, radius, image.device)
-    return rows @ image @ columns.T
