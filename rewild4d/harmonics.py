@@ -1,5 +1,7 @@
 """View-dependent colour: real spherical harmonics up to degree 3, in the order and sign of 3D Gaussian Splatting."""
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -16,7 +18,7 @@ C3 = (
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """Values of the basis functions for unit directions, [n, 3] -> [n, (degree + 1)^2], degree 0 to 3."""
+    """Values of the basis functions for unit directions, [..., 3] -> [..., (degree + 1)^2], degree 0 to 3."""
     x, y, z = directions.unbind(-1)
     values = [torch.full_like(x, C0)]
     if degree > 0:
@@ -40,6 +42,29 @@ def basis(directions: Tensor, degree: int) -> Tensor:
             C3[6] * x * (x * x - 3 * y * y),
         ]
     return torch.stack(values, dim=-1)
+
+
+def rotated(coefficients: Tensor, rotations: Tensor) -> Tensor:
+    """Coefficients of the same colours on a sphere that turns: rotated(c, R) seen along R d is c seen along d.
+
+    The functions of one degree are closed under rotation, so matching them at enough directions is exact.
+
+    Args:
+        coefficients: k = 4, 9 or 16, [n, k, 3].
+        rotations: of each Gaussian, [n, 3, 3].
+
+    Returns:
+        [n, k, 3].
+    """
+    count = coefficients.shape[1]
+    order = torch.arange(4 * count, device=rotations.device, dtype=rotations.dtype)
+    height, angle = 1 - (2 * order + 1) / len(order), order * (math.pi * (3 - 5**0.5))
+    ring = (1 - height.square()).sqrt()
+    directions = torch.stack((ring * angle.cos(), ring * angle.sin(), height), dim=-1)
+    degree = round(count**0.5) - 1
+    before = torch.einsum("da,nab->ndb", directions, rotations)
+    inverse = torch.linalg.pinv(basis(directions, degree))
+    return torch.einsum("kd,ndl,nlc->nkc", inverse, basis(before, degree), coefficients)
 
 
 def seen_colors(splats: Splats, eye: Tensor) -> Tensor:

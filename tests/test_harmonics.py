@@ -5,7 +5,8 @@ import math
 import numpy as np
 import torch
 
-from rewild4d.harmonics import C0, basis, seen_colors
+from rewild4d.harmonics import C0, basis, rotated, seen_colors
+from rewild4d.transforms import axis_angle_to_matrix
 from rewild4d.types import Splats
 
 
@@ -36,3 +37,15 @@ def test_constant_coefficient_is_a_colour_from_everywhere() -> None:
 def test_rgb_passes_through() -> None:
     colors = torch.rand(5, 1, 3)
     torch.testing.assert_close(seen_colors(splats(colors), torch.zeros(3)), colors[:, 0])
+
+
+def test_a_turned_animal_keeps_its_colours() -> None:
+    generator = torch.Generator().manual_seed(0)
+    turns = axis_angle_to_matrix(torch.randn(6, 3, generator=generator, dtype=torch.float64))
+    directions = torch.nn.functional.normalize(torch.randn(6, 3, generator=generator, dtype=torch.float64), dim=-1)
+    moved = (turns @ directions[..., None])[..., 0]
+    for degree in (1, 2, 3):
+        colours = torch.randn(6, (degree + 1) ** 2, 3, generator=generator, dtype=torch.float64)
+        before = torch.einsum("nk,nkc->nc", basis(directions, degree), colours)
+        after = torch.einsum("nk,nkc->nc", basis(moved, degree), rotated(colours, turns))
+        torch.testing.assert_close(after, before)

@@ -10,16 +10,25 @@ import pytest
 import torch
 
 from rewild4d.errors import UserError
+from rewild4d.harmonics import seen_colors
 from rewild4d.ours.config import Canonical, Config, Deform, Density, Geometry, PriorUse, Skinning, WarmUp
 from rewild4d.ours.fit import Training, train
 from rewild4d.ours.method import Ours
 from rewild4d.ours.model import build_model
+from rewild4d.ours.reconstruction import OursReconstruction
 from rewild4d.ours.symmetry import SIGNS, Key, Supervision
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.motion import quats_from_normals, sample_surface
 from rewild4d.priors.template import MIRROR, PARENTS, quadruped
 from rewild4d.rasterizer import rasterize
-from rewild4d.transforms import look_at, mirror_camera, mirror_transforms, skin_points
+from rewild4d.transforms import (
+    axis_angle_to_matrix,
+    look_at,
+    mirror_camera,
+    mirror_transforms,
+    similarity,
+    skin_points,
+)
 from rewild4d.types import Camera, Clip, Frame, Prior
 
 CPU = torch.device("cpu")
@@ -28,7 +37,7 @@ TINY = Config(
     image_size=64,
     iterations=16,
     checkpoint_every=5,
-    canonical=Canonical(samples=200),
+    canonical=Canonical(samples=200, sh_degree=1),
     skinning=Skinning(resolution=10, sweeps=5),
     deform=Deform(width=16),
     warmup=WarmUp(iterations=6, regress=4, samples=150, size=48, views=2),
@@ -203,6 +212,24 @@ def test_save_and_load_give_the_same_gaussians(toy: tuple[Clip, Prior], tmp_path
     assert len(figures["joint_angle_std"]) == 20 and figures["gaussians"] == len(made.canonical())
     with pytest.raises(UserError, match=r"expected a reconstruction by 'ours', but it has no ours\.pt"):
         method.load(tmp_path / "elsewhere", CPU)
+
+
+def test_harmonics_mean_the_same_in_training_and_in_the_world(toy: tuple[Clip, Prior]) -> None:
+    clip, prior = toy
+    turn = axis_angle_to_matrix(torch.tensor((0.3, -0.8, 0.4), dtype=torch.float64))
+    root = similarity(1.7, turn, torch.tensor((0.5, -1.0, 2.0), dtype=torch.float64))
+    training = start(toy, msgspec.structs.replace(TINY, canonical=Canonical(samples=50, sh_degree=2)))
+    own = training.model.gaussians
+    torch.nn.init.normal_(own.colors, mean=0.5, generator=torch.Generator().manual_seed(0))
+    made = OursReconstruction(
+        training.model, training.config, torch.tensor(clip.times).double(), root.repeat(FRAMES, 1, 1), (None,) * FRAMES
+    )
+    eye = torch.tensor((3.0, 2.0, -6.0), dtype=torch.float64)
+    pose = training.model.pose(torch.tensor([2 / FRAMES]), [Key(1, 1, 1)])
+    _, posed = training.model.deformed(pose, made.weights, 1.0)
+    expected = own.seen_rgb(posed.means, posed.quats, eye, 2)
+    actual = seen_colors(made.at(clip.times[1]), root[:3, :3] @ eye + root[:3, 3])
+    torch.testing.assert_close(actual, expected, atol=1e-4, rtol=0)
 
 
 def test_a_short_fit_improves_the_silhouette(toy: tuple[Clip, Prior]) -> None:

@@ -4,13 +4,18 @@ import math
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import normalize
 
+from rewild4d.harmonics import C0, basis, rotated
 from rewild4d.ours.config import Canonical
 from rewild4d.priors.motion import quats_from_normals, sample_surface
+from rewild4d.transforms import quat_multiply, quat_to_matrix
 from rewild4d.types import OBJECT_DIAGONAL, Prior, Splats
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "colors")
 """The learnable attributes, in the order of the optimizer's groups."""
+REST_GAIN = 20.0
+"""Under Adam a twentieth of the value is a twentieth of the learning rate (3DGS's for degrees above 0)."""
 
 
 class Gaussians(nn.Module):
@@ -21,7 +26,8 @@ class Gaussians(nn.Module):
         quats: wxyz, not normalised, [n, 4].
         log_scales: [n, 3].
         logit_opacities: [n].
-        colors: RGB, kept in [0, 1] by clamping where it is used, [n, 3].
+        colors: RGB, then `REST_GAIN` times the harmonics' coefficients above degree 0 in the canonical frame,
+            [n, (degree + 1)^2, 3].
     """
 
     means: nn.Parameter
@@ -48,14 +54,53 @@ class Gaussians(nn.Module):
         return self.logit_opacities.sigmoid()
 
     def rgb(self) -> Tensor:
-        """In [0, 1], [n, 3]."""
-        return self.colors.clamp(0.0, 1.0)
+        """Colour without the harmonics, in [0, 1], [n, 3]."""
+        return self.colors[:, 0].clamp(0.0, 1.0)
+
+    def seen_rgb(self, means: Tensor, quats: Tensor, eye: Tensor, degree: int) -> Tensor:
+        """Colour from a viewpoint: its direction is turned back into the canonical frame first.
+
+        Args:
+            means: posed, no gradient flows to them, [n, 3].
+            quats: posed, unit, no gradient flows to them, [n, 4].
+            eye: camera centre in the same frame, [3].
+            degree: of the harmonics in use.
+
+        Returns:
+            Not below 0, [n, 3].
+        """
+        if degree == 0:
+            return self.rgb()
+        directions = normalize(means.detach() - eye.to(means), dim=-1)
+        canonical = torch.einsum("na,nab->nb", directions, self.turns(quats.detach()))
+        values = basis(canonical, degree)[:, 1:] / REST_GAIN
+        rest = torch.einsum("nk,nkc->nc", values, self.colors[:, 1 : (degree + 1) ** 2])
+        return (self.colors[:, 0] + rest).clamp_min(0)
+
+    def turns(self, quats: Tensor) -> Tensor:
+        """Rotation of each Gaussian from rest to an orientation, [n, 4] -> [n, 3, 3]."""
+        rest = normalize(self.quats.detach(), dim=-1)
+        return quat_to_matrix(quat_multiply(quats, rest * rest.new_tensor((1.0, -1.0, -1.0, -1.0))))
+
+    def splat_colors(self, quats: Tensor) -> Tensor:
+        """Colours as `Splats` has them, for Gaussians turned to ``quats``: RGB, or coefficients in their frame.
+
+        Args:
+            quats: unit, [n, 4].
+
+        Returns:
+            [n, (degree + 1)^2, 3].
+        """
+        if self.colors.shape[1] == 1:
+            return self.rgb()[:, None]
+        constant = (self.colors[:, :1] - 0.5) / C0
+        return rotated(torch.cat((constant, self.colors[:, 1:] / REST_GAIN), dim=1), self.turns(quats))
 
     def splats(self) -> Splats:
         """The canonical Gaussians, activated, detached."""
         with torch.no_grad():
-            quats = nn.functional.normalize(self.quats, dim=-1)
-            return Splats(self.means, quats, self.scales_log().exp(), self.opacities(), self.rgb()[:, None])
+            quats = normalize(self.quats, dim=-1)
+            return Splats(self.means, quats, self.scales_log().exp(), self.opacities(), self.splat_colors(quats))
 
 
 def initial_gaussians(prior: Prior, count: int, config: Canonical, generator: torch.Generator) -> dict[str, Tensor]:
@@ -71,11 +116,13 @@ def initial_gaussians(prior: Prior, count: int, config: Canonical, generator: to
         The five attributes by name; colours are mid-grey.
     """
     surface = sample_surface(prior, count, generator)
+    colors = torch.zeros(count, (config.sh_degree + 1) ** 2, 3)
+    colors[:, 0] = 0.5
     scales = surface.radius * torch.tensor((1.0, 1.0, config.thickness))
     return {
         "means": surface.points,
         "quats": quats_from_normals(surface.normals),
         "log_scales": scales.log().expand(count, 3),
         "logit_opacities": torch.full((count,), math.log(config.opacity / (1 - config.opacity))),
-        "colors": torch.full((count, 3), 0.5),
+        "colors": colors,
     }

@@ -35,7 +35,7 @@ def initial_colors(model: Model, supervision: Supervision) -> Tensor:
         total, count = total + colours * seen[:, None], count + seen[:, None]
     known = count[:, 0] > 0
     if not known.any():
-        return own.colors.detach().clone()
+        return own.rgb().clone()
     colours = total / count.clamp_min(1)
     sources = torch.cat((own.means[known], mirror_points(own.means[known]))).cpu().numpy()
     _, nearest = cKDTree(sources).query(own.means[~known].cpu().numpy())

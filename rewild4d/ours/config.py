@@ -16,6 +16,10 @@ class Canonical(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """Scale along the normal over the scale in the surface: flat enough for a normal, thick enough edge-on."""
     opacity: float = 0.9
     """At the start; 0.1 leaves the silhouette too weak when the pose loss begins."""
+    sh_degree: int = 0
+    """Spherical harmonics of colour, 0 to 3; lighting is not mirror-symmetric and views are few (paper: 3)."""
+    sh_every: float = 0.05
+    """Fraction after which one more degree joins (1k of 20k)."""
     max_scale: float = 0.05
     """Largest standard deviation, times the rest diagonal: one huge Gaussian hides a wrong pose."""
 

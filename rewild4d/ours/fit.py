@@ -124,7 +124,9 @@ class Training:
         )
         strength = ramp(progress, config.deform.ramp_start, config.deform.ramp_end)
         posed, deformed = model.deformed(pose, weights, strength)
-        rgb, alpha, info = self._render(deformed, opacities, model.gaussians.rgb(), target)
+        degree = min(config.canonical.sh_degree, int(progress / config.canonical.sh_every))
+        colors = model.gaussians.seen_rgb(deformed.means, deformed.quats, target.camera.center, degree)
+        rgb, alpha, info = self._render(deformed, opacities, colors, target)
 
         losses = self._image_losses(pose_alpha, rgb, alpha, target)
         if config.prior.pull and progress < config.prior.pull_until:
@@ -282,7 +284,7 @@ def train(
     total = warmup.total + config.iterations
     for index in range(start, total):
         if index == warmup.total:
-            model.gaussians.colors.data = initial_colors(model, supervision)
+            model.gaussians.colors.data[:, 0] = initial_colors(model, supervision)
         figures = warmup.step(index) if index < warmup.total else main.step(index - warmup.total)
         if index % LOG_EVERY == 0 or index + 1 == total:
             log(index + 1, total, figures)

@@ -1,5 +1,6 @@
 """What a fit leaves behind: a function from time to Gaussians in the world."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -51,7 +52,8 @@ class OursReconstruction:
         own = self.model.gaussians
         quats = nn.functional.normalize(moved.quats, dim=-1)
         posed = Splats(moved.means, quats, moved.log_scales.exp(), own.opacities(), own.rgb()[:, None])
-        return transform_splats(posed, interpolate_similarity(self.object_to_world, position).to(moved.means.device))
+        world = transform_splats(posed, interpolate_similarity(self.object_to_world, position).to(quats.device))
+        return replace(world, colors=own.splat_colors(world.quats))
 
     def camera(self, time: float) -> Camera | None:
         """The input camera of the frame nearest to a time, in the world frame."""
