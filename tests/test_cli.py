@@ -63,6 +63,7 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
         ),
         (["run", "--preset", "quik"], "unknown preset of 'ours' 'quik'. Did you mean 'quick'?"),
         (["run", "--device", "tpu"], "--device: expected auto, cpu or cuda, got 'tpu'"),
+        (["run", "--threads", "0"], "--threads: expected a number of at least 1, got 0"),
         (["run", "--data", "/no/such/folder"], "/no/such/folder: expected"),
         (["table", "--runs", "/no/such/folder"], "/no/such/folder: expected a folder of runs"),
         (["check"], "check: expected either --dataset (with --data) or --method"),

@@ -1,5 +1,6 @@
 """`run`: fit a method on a data set and score it on views it never saw."""
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +39,8 @@ class Options:
         seeds: one run for each.
         prior: "template" (fitted to the clip), "coarse:<noise>" (from the truth plus noise: for studies) or a file.
         device: auto, cpu or cuda.
+        jobs: cases at a time; 0 is one for each processor core (one in all on a GPU).
+        threads: of each case; other numbers than 1 may change the last digits.
         out: folder for runs.
         json: print the records as a JSON array, and nothing else, to standard output.
     """
@@ -51,6 +54,8 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     prior: str = "template"
     device: str = "auto"
+    jobs: int = 0
+    threads: int = 1
     out: Path = Path("runs")
     json: bool = False
 
@@ -80,6 +85,9 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
     device = pick_device(options.device)
     load_dataset(options.dataset)  # an unknown data set is the first thing to say
     protocol = find_protocol(options.dataset, options.protocol)
+    for flag, value, least in (("--jobs", options.jobs, 0), ("--threads", options.threads, 1)):
+        if value < least:
+            raise UserError(f"{flag}: expected a number of at least {least}, got {value}.")
     if not options.seeds:
         raise UserError("--seeds: expected at least one number, got none.")
     require_writable(options.out)
@@ -88,7 +96,20 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
     floors = [_floor(name) for name in protocol.floors if name != options.method]
     entry = Entry(options.method, options.preset, config, tuple(dict.fromkeys(options.seeds)))
     prior = PriorChoice(options.prior, PRIOR_PRESETS.get(options.preset, STANDARD))
-    return Plan(options.dataset, reader, root, cases, protocol, (*floors, entry), prior, device, options.out.absolute())
+    cores = 1 if device.type == "cuda" else len(os.sched_getaffinity(0))
+    return Plan(
+        dataset=options.dataset,
+        reader=reader,
+        root=root,
+        cases=cases,
+        protocol=protocol,
+        entries=(*floors, entry),
+        prior=prior,
+        device=device,
+        out=options.out.absolute(),
+        jobs=options.jobs or cores,
+        threads=options.threads,
+    )
 
 
 def open_dataset(dataset: str, data: Path | None) -> tuple[Path, DatasetReader]:
