@@ -1,6 +1,7 @@
 """The fit finds a known animal again, in a world that is turned, scaled and shifted at random."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import msgspec
@@ -16,13 +17,22 @@ from rewild4d.priors.kinematics import pose
 from rewild4d.priors.overlay import overlay
 from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.search import mask_rays, trajectory, up_directions
-from rewild4d.priors.silhouettes import outline, splat
-from rewild4d.priors.template import PARENTS, quadruped
+from rewild4d.priors.silhouettes import outline, rasterized, splat
+from rewild4d.priors.template import PARENTS, quadruped, quads
 from rewild4d.transforms import axis_angle_to_matrix, look_at, similarity, skin_points
 from rewild4d.types import Camera, Clip, Frame
 
 QUICK = PRESETS["quick"]
 WORLD_SCALE = 0.37
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """On tensors this small threads only wait for each other, and on a busy machine for long."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 def world() -> tuple[Tensor, Tensor]:
@@ -141,6 +151,23 @@ def test_one_blob_is_a_round_gaussian_of_its_projected_size() -> None:
         math.exp(-(4.5**2 - 0.5**2) / 2 / sigma2), rel=1e-3
     )
     assert torch.allclose(image, image.T, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [64, 128])
+def test_flat_gaussians_on_the_surface_have_its_outline(size: int) -> None:
+    template = quadruped()
+    eye = torch.tensor((5.0, 3.0, 6.0), dtype=torch.float64)
+    focal, half = 1.35 * size, size / 2
+    intrinsics = torch.tensor(((focal, 0, half), (0, focal, half), (0, 0, 1)), dtype=torch.float64)
+    camera = Camera(look_at(eye, 0 * eye, torch.tensor((0.0, 1.0, 0.0)).double()), intrinsics, size, size)
+    matrix = camera.world_to_camera.float()
+    vertices = (template.vertices @ matrix[:3, :3].T + matrix[:3, 3])[None, None].requires_grad_()
+    matte = rasterized(vertices, quads(), intrinsics.float()[None], size)
+    assert matte.shape == (1, 1, size, size)
+    drawn, wanted = matte[0, 0] > 0.5, torch.from_numpy(outline(template.vertices, template.faces, camera)) > 127
+    assert float((drawn & wanted).sum() / (drawn | wanted).sum()) > 0.93
+    matte.sum().backward()
+    assert vertices.grad is not None and bool(torch.isfinite(vertices.grad).all()) and float(vertices.grad.norm()) > 0
 
 
 def test_cosines_start_with_a_constant_and_damp_fast_motion() -> None:

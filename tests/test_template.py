@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from rewild4d.priors.kinematics import depth_levels, pose
-from rewild4d.priors.proportions import PROPORTIONS, Proportions
+from rewild4d.priors.proportions import PROPORTIONS, SECTIONS, Proportions
 from rewild4d.priors.template import MIRROR, PARENTS, diagonal, quadruped
 from rewild4d.transforms import mirror_points, mirror_transforms, skin_points
 
@@ -72,6 +72,21 @@ def test_measures_change_what_they_name_and_carry_gradients() -> None:
     template = quadruped(Proportions(deviations), unit=False)
     (template.vertices.square().sum() + template.bones.square().sum()).backward()
     assert deviations.grad is not None and bool((deviations.grad != 0).all())
+
+
+def test_relief_widens_one_place_of_both_sides_and_leaves_the_bones() -> None:
+    relief = torch.zeros(sum(SECTIONS), 4, requires_grad=True)
+    plain, flat = quadruped(unit=False), quadruped(Proportions(torch.zeros(len(PROPORTIONS)), relief), unit=False)
+    assert torch.equal(plain.vertices, flat.vertices)
+    wide = relief.detach().clone()
+    wide[8, 0] = 1.0
+    widened = quadruped(Proportions(torch.zeros(len(PROPORTIONS)), wide), unit=False)
+    moved = (widened.vertices - plain.vertices).abs()
+    belly = moved[:, 0] > 1e-4
+    assert float(moved[:, 1:].max()) < 1e-6 and torch.equal(plain.bones, widened.bones)
+    assert float(plain.vertices[belly, 2].abs().max()) < 1.0 and 0 < int(belly.sum()) < 300
+    flat.vertices.square().sum().backward()
+    assert relief.grad is not None and bool((relief.grad != 0).all())
 
 
 def test_turning_the_top_of_a_leg_moves_that_leg_rigidly_and_nothing_else() -> None:

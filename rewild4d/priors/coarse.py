@@ -12,7 +12,6 @@ from rewild4d.contracts import Log
 from rewild4d.priors.config import PriorConfig
 from rewild4d.priors.fit import Animal, fit_animal, make_prior
 from rewild4d.priors.hypotheses import ANGLE_SPREADS
-from rewild4d.priors.proportions import Proportions
 from rewild4d.transforms import axis_angle_to_matrix
 from rewild4d.types import OBJECT_DIAGONAL, Clip, Frame, Prior
 
@@ -62,7 +61,7 @@ def _disturb(animal: Animal, noise: float, seed: int) -> Animal:
     moved[:, :3, :3] = moved[:, :3, :3] @ axis_angle_to_matrix(turns.double())
     return replace(
         animal,
-        shape=Proportions(animal.shape.deviations + shape),
+        shape=replace(animal.shape, deviations=animal.shape.deviations + shape),
         object_to_world=moved,
         angles=animal.angles + angles * (ANGLE_SPREADS > 0),
     )

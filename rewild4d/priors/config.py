@@ -13,6 +13,8 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         blur: of both silhouettes at the first and last step, as a share of the crop: a thin leg must feel a far one.
         keep: hypotheses that survive; the best of the opposite facing is always among them while two or more do.
         joints: whether joints bend and the root moves over time, or the animal stands still.
+        rasterized: silhouettes by the benchmark's rasterizer; otherwise by its batched stand-in.
+        relief: whether the cross sections may leave what the proportions make of them.
     """
 
     size: int
@@ -21,6 +23,8 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     keep: int
     joints: bool = True
     frames: int = 24
+    rasterized: bool = False
+    relief: bool = False
 
 
 class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -32,6 +36,7 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         stages: rounds, from all starts to one winner.
         learning_rate: of Adam at the start of each round, on parameters whitened by their natural spread.
         shape_weight: of the mean squared deviation of proportions: an average animal unless the masks insist.
+        relief_weight: of the mean squared relief of the cross sections.
         angle_weight: of the squared whitened joint angles: limbs rest, and move slowly, unless the masks insist.
         root_weight: of the squared whitened root motion and tilt: a sweeping camera sees each moment once.
         gait_weight: of feet that bear weight and move forwards, when guesses are compared: outlines alone hardly tell
@@ -43,6 +48,7 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     elevations: tuple[float, ...] = (5.0, 20.0, 40.0)
     learning_rate: float = 0.06
     shape_weight: float = 0.02
+    relief_weight: float = 0.05
     angle_weight: float = 0.15
     root_weight: float = 0.2
     gait_weight: float = 0.015
@@ -53,7 +59,7 @@ STANDARD = PriorConfig(
         Stage(size=32, steps=40, blur=(0.08, 0.04), keep=6, joints=False, frames=12),
         Stage(size=48, steps=80, blur=(0.05, 0.03), keep=2),
         Stage(size=64, steps=150, blur=(0.04, 0.015), keep=2),
-        Stage(size=80, steps=250, blur=(0.02, 0.006), keep=1),
+        Stage(size=80, steps=250, blur=(0.02, 0.006), keep=1, rasterized=True, relief=True),
     )
 )
 QUICK = PriorConfig(
@@ -61,7 +67,7 @@ QUICK = PriorConfig(
         Stage(size=32, steps=30, blur=(0.08, 0.04), keep=4, joints=False, frames=12),
         Stage(size=40, steps=60, blur=(0.05, 0.03), keep=2),
         Stage(size=48, steps=60, blur=(0.04, 0.02), keep=1),
-        Stage(size=64, steps=80, blur=(0.02, 0.008), keep=1),
+        Stage(size=64, steps=80, blur=(0.02, 0.008), keep=1, rasterized=True, relief=True),
     )
 )
 PRESETS = {"quick": QUICK, "standard": STANDARD}

@@ -36,7 +36,6 @@ from rewild4d.transforms import (
 )
 from rewild4d.types import OBJECT_DIAGONAL, Clip, Frame, Prior
 
-PARAMETERS = ("scale", "turn", "shift", "shape", "angles")
 STILL_PARAMETERS = ("scale", "turn", "shift", "shape")
 
 
@@ -131,7 +130,7 @@ class _Race:
         """Line up all facings on the path, at the size that covers the masks' area."""
         local = torch.linalg.solve(self.working[:3, :3], (path - self.working[:3, 3]).T).T
         self.guesses = Hypotheses.start(facings(self.config.yaw_starts), local.float())
-        match_areas(self.guesses, self._targets(self.config.stages[0].size))
+        match_areas(self.guesses, self._targets(self.config.stages[0].size), self.config.stages[0])
 
     def _targets(self, size: int) -> Targets:
         return crop_targets(self.frames, self.moments, self.working, size, self.name)
@@ -143,16 +142,17 @@ class _Race:
         rows = torch.randperm(len(targets.masks), generator=self.generator)[:count]
         return targets.select(rows.sort().values)
 
-    def _cost(self, targets: Targets, sigma: float, joints: bool) -> Tensor:
-        shape, swing, root = self.guesses.penalties()
+    def _cost(self, targets: Targets, sigma: float, stage: Stage) -> Tensor:
+        shape, relief, swing, root = self.guesses.penalties()
         config = self.config
-        penalty = config.shape_weight * shape + config.angle_weight * swing + config.root_weight * root
-        return mismatch(self.guesses.silhouettes(targets, joints), targets, sigma) + penalty
+        penalty = config.shape_weight * shape + config.relief_weight * relief
+        penalty = penalty + config.angle_weight * swing + config.root_weight * root
+        return mismatch(self.guesses.silhouettes(targets, stage), targets, sigma) + penalty
 
     def run(self, stage: Stage) -> None:
         """One round of descent, then the cut."""
         targets = self._targets(stage.size)
-        names = PARAMETERS if stage.joints else STILL_PARAMETERS
+        names = [*STILL_PARAMETERS, *("angles",) * stage.joints, *("relief",) * stage.relief]
         leaves = [getattr(self.guesses, name).detach().requires_grad_() for name in names]
         for name, leaf in zip(names, leaves, strict=True):
             setattr(self.guesses, name, leaf)
@@ -161,7 +161,7 @@ class _Race:
             share = step / max(stage.steps - 1, 1)
             optimizer.param_groups[0]["lr"] = self.config.learning_rate * (1 - 0.85 * share)
             sigma = stage.size * (stage.blur[0] + share * (stage.blur[1] - stage.blur[0]))
-            cost = self._cost(self._draw(targets, stage.frames), sigma, stage.joints)
+            cost = self._cost(self._draw(targets, stage.frames), sigma, stage)
             if not torch.isfinite(cost).all():
                 raise FloatingPointError(f"{self.name}: the template fit's cost is not finite at step {step}: {cost}")
             optimizer.zero_grad()
@@ -170,7 +170,7 @@ class _Race:
             self.done += 1
             self.log(self.done, self.total, {"prior": float(cost.detach().min())})
         with torch.no_grad():
-            self.costs = self._cost(_spaced(targets, 2 * stage.frames), stage.size * stage.blur[1], stage.joints)
+            self.costs = self._cost(_spaced(targets, 2 * stage.frames), stage.size * stage.blur[1], stage)
             if stage.joints:
                 self.costs = self.costs + self.config.gait_weight * self.guesses.backward_gait()
         self._cut(stage.keep)
@@ -191,7 +191,7 @@ class _Race:
     def winner(self) -> Animal:
         """The best guess in the world, with the rest mesh's diagonal scaled to the object frame's."""
         best = self.guesses.select(self.costs.argmin()[None])
-        shape = Proportions(best.shape[0])
+        shape = Proportions(best.shape[0], best.relief[0])
         size = best.scales().double()[0] * diagonal(quadruped(shape, unit=False).vertices).double() / OBJECT_DIAGONAL
         roots = best.roots().double()[0]
         local = similarity(size.expand(len(roots)), roots[:, :3, :3], roots[:, :3, 3])

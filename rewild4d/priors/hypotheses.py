@@ -10,10 +10,11 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from rewild4d.priors.config import Stage
 from rewild4d.priors.kinematics import pose
-from rewild4d.priors.proportions import PROPORTIONS, Proportions
-from rewild4d.priors.silhouettes import Targets, splat
-from rewild4d.priors.template import PARENTS, quadruped
+from rewild4d.priors.proportions import PROPORTIONS, SECTIONS, Proportions
+from rewild4d.priors.silhouettes import Targets, rasterized, splat
+from rewild4d.priors.template import PARENTS, Template, quadruped, quads
 from rewild4d.transforms import axis_angle_to_matrix, rigid
 
 ANGLE_LIMIT = 1.1
@@ -60,6 +61,7 @@ class Hypotheses:
         turn: cosine series of the root's rotation, [B, K, 3].
         shift: cosine series of the root's offset from the path, [B, K, 3].
         shape: proportions, [B, P].
+        relief: of the cross sections, [B, S, 4].
         angles: cosine series of the joint angles, [B, L, J, 3].
     """
 
@@ -69,6 +71,7 @@ class Hypotheses:
     turn: Tensor
     shift: Tensor
     shape: Tensor
+    relief: Tensor
     angles: Tensor
 
     @staticmethod
@@ -83,6 +86,7 @@ class Hypotheses:
             turn=torch.zeros(batch, root, 3),
             shift=torch.zeros(batch, root, 3),
             shape=torch.zeros(batch, len(PROPORTIONS)),
+            relief=torch.zeros(batch, sum(SECTIONS), 4),
             angles=torch.zeros(batch, joints, len(PARENTS), 3),
         )
 
@@ -110,26 +114,27 @@ class Hypotheses:
         raw = torch.einsum("tk,bkja->btja", series, self.angles) * ANGLE_SPREADS
         return ANGLE_LIMIT * torch.tanh(raw / ANGLE_LIMIT)
 
-    def silhouettes(self, targets: Targets, moving: bool) -> Tensor:
-        """Soft silhouettes in the targets' crops, [B, v, s, s].
+    def silhouettes(self, targets: Targets, stage: Stage) -> Tensor:
+        """Soft silhouettes in the targets' crops, whose cameras are in the working frame, [B, v, s, s]."""
+        template = quadruped(Proportions(self.shape, self.relief), unit=False)
+        size = targets.masks.shape[-1]
+        if stage.rasterized:
+            vertices = self._seen(template, template.vertices, template.weights, targets, stage.joints)
+            return rasterized(vertices, quads(), targets.intrinsics, size)
+        blobs = self._seen(template, template.blobs, template.blob_weights, targets, stage.joints)
+        return splat(blobs, (template.blob_sizes * self.scales()[:, None])[:, None], targets.intrinsics, size)
 
-        Args:
-            targets: with cameras in the working frame.
-            moving: with joint angles; otherwise at rest.
-        """
-        template = quadruped(Proportions(self.shape), unit=False)
+    def _seen(self, template: Template, points: Tensor, weights: Tensor, targets: Targets, moving: bool) -> Tensor:
+        """Points of the template in the targets' camera coordinates, [B, n, 3] -> [B, v, n, 3]."""
         matrix = targets.world_to_camera @ self.roots()[:, targets.moments]
         scale = self.scales()[:, None]
         linear = torch.cat((matrix[..., :3] * scale[..., None, None], matrix[..., 3:]), -1)
-        if moving:
-            angles = self.joint_angles()[:, targets.moments]
-            transforms = linear[:, :, None] @ pose(angles, template.bones[:, None, :, 0], PARENTS)
-            blended = (template.blob_weights @ transforms[..., :3, :].flatten(-2)).unflatten(-1, (3, 4))
-            local = torch.einsum("bvnac,bnc->bvna", blended[..., :3], template.blobs) + blended[..., 3]
-        else:
-            local = template.blobs[:, None] @ linear[..., :3, :3].transpose(-1, -2) + linear[..., None, :3, 3]
-        sizes = (template.blob_sizes * scale)[:, None]
-        return splat(local, sizes, targets.intrinsics, targets.masks.shape[-1])
+        if not moving:
+            return points[:, None] @ linear[..., :3, :3].transpose(-1, -2) + linear[..., None, :3, 3]
+        angles = self.joint_angles()[:, targets.moments]
+        transforms = linear[:, :, None] @ pose(angles, template.bones[:, None, :, 0], PARENTS)
+        blended = (weights @ transforms[..., :3, :].flatten(-2)).unflatten(-1, (3, 4))
+        return torch.einsum("bvnac,bnc->bvna", blended[..., :3], points) + blended[..., 3]
 
     def backward_gait(self) -> Tensor:
         """Whether low feet move towards the head (against every gait, up to 1) or the tail (down to -1), [B].
@@ -147,8 +152,8 @@ class Hypotheses:
         travel = (bearing * step.abs()).sum((1, 2))
         return (bearing * step).sum((1, 2)) / (travel + STILL_STEP * bearing.sum((1, 2)))
 
-    def penalties(self) -> tuple[Tensor, Tensor, Tensor]:
-        """How unusual the proportions, the joint angles and the root's motion are, each [B].
+    def penalties(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """How unusual the proportions, the relief, the joint angles and the root's motion are, each [B].
 
         Fast terms cost more than slow ones: a moment seen by one camera says nothing of depth, its neighbours do.
         """
@@ -156,4 +161,4 @@ class Hypotheses:
         swing = self.angles.square() * (ANGLE_SPREADS > 0) * (0.3 + (pace / 4).square())[:, None, None]
         haste = torch.arange(self.shift.shape[1]).square()[:, None]
         root = self.turn.square().sum((1, 2)) + 0.5 * (self.shift.square() * haste).sum((1, 2))
-        return self.shape.square().mean(1), swing.sum(1).mean((1, 2)), root
+        return self.shape.square().mean(1), self.relief.square().mean((1, 2)), swing.sum(1).mean((1, 2)), root

@@ -60,15 +60,24 @@ PROPORTIONS: dict[str, Proportion] = {
 }
 
 
+SECTIONS = (15, 9, 9)
+"""Cross sections of the body, of a front leg and of a rear leg."""
+RELIEF_SPREAD = (0.15, 0.15, 0.05, 0.05)
+"""One standard deviation of a cross section's relief: width and height relative, shifts in object units."""
+
+
 @dataclass(frozen=True)
 class Proportions:
     """Body proportions as deviations from the average quadruped, in spreads: zeros are the average animal.
 
     Attributes:
         deviations: one column per entry of `PROPORTIONS`, float32, [..., P]; gradients flow through.
+        relief: what no measure names: logarithm of width and height, shift in y and z of each of `SECTIONS` cross
+            sections (body from the nose, front legs and rear legs from the top), in spreads, [..., S, 4]; None is none.
     """
 
     deviations: Tensor
+    relief: Tensor | None = None
 
     @staticmethod
     def average() -> "Proportions":
@@ -83,6 +92,13 @@ class Proportions:
             deviation = (value - average) / spread if additive else np.log(value / average) / spread
             deviations[list(PROPORTIONS).index(name)] = float(deviation)
         return Proportions(deviations)
+
+    def reliefs(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Relief of the body, the front legs and the rear legs: logarithms and object units, [..., s, 4]."""
+        if self.relief is None:
+            flat = self.deviations.new_zeros(*self.deviations.shape[:-1], sum(SECTIONS), 4)
+            return flat.split(SECTIONS, dim=-2)
+        return (self.relief * self.relief.new_tensor(RELIEF_SPREAD)).split(SECTIONS, dim=-2)
 
     def measures(self) -> dict[str, Tensor]:
         """Every measure by name, each [...]."""

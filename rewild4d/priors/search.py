@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.errors import UserError
+from rewild4d.priors.config import Stage
 from rewild4d.priors.hypotheses import SCALE_SPREAD, Hypotheses, cosine_series
 from rewild4d.priors.silhouettes import Targets, known_camera
 from rewild4d.transforms import similarity
@@ -151,8 +152,8 @@ def facings(count: int) -> Tensor:
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
-def match_areas(guesses: Hypotheses, targets: Targets) -> None:
+def match_areas(guesses: Hypotheses, targets: Targets, stage: Stage) -> None:
     """Set the scale of each guess so that silhouettes cover the masks' area (twice: cropping hides what sticks out)."""
     for _ in range(2):
-        drawn = guesses.silhouettes(targets, moving=False).sum((-1, -2, -3))
+        drawn = guesses.silhouettes(targets, stage).sum((-1, -2, -3))
         guesses.scale = guesses.scale + 0.5 * (targets.masks.sum() / drawn).log() / SCALE_SPREAD

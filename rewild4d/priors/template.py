@@ -9,6 +9,7 @@ The mesh is five closed tubes (nose to tail tip, and four legs) lofted through a
 quadratic B-splines, so its topology and its skinning weights never change while the proportions do.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
@@ -91,8 +92,11 @@ def _spline(controls: int, rings: int) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(basis(at)).float(), torch.from_numpy(basis.derivative()(at)).float()
 
 
-def _loft(controls: Tensor, widths: Tensor, heights: Tensor, rings: int) -> _Tube:
-    """A tube through control sections: centres [..., c, 3], half sizes [..., c]."""
+def _loft(sections: Sequence[tuple[Tensor, Tensor, Tensor]], relief: Tensor, rings: int) -> _Tube:
+    """A tube through control sections: centre [..., 3], half width and half height [...]; relief is [..., c, 4]."""
+    centers, sides, tops = zip(*sections, strict=True)
+    controls = torch.stack(centers, -2) + torch.nn.functional.pad(relief[..., 2:], (1, 0))
+    widths, heights = torch.stack(sides, -1) * relief[..., 0].exp(), torch.stack(tops, -1) * relief[..., 1].exp()
     values, slopes = _spline(controls.shape[-2], rings)
     tangents = torch.nn.functional.normalize(slopes @ controls, dim=-1)
     lateral = torch.tensor((1.0, 0.0, 0.0))
@@ -102,18 +106,25 @@ def _loft(controls: Tensor, widths: Tensor, heights: Tensor, rings: int) -> _Tub
 
 
 @cache
-def _tube_faces(rings: int, segments: int) -> Tensor:
-    """Triangles of a capped tube whose vertices are ordered as `_Tube.mesh` gives them, [f, 3]."""
+def _tube_quads(rings: int, segments: int) -> Tensor:
+    """Corners of the quadrilaterals of a tube whose vertices are ordered as `_Tube.mesh` gives them, [q, 4]."""
     ring, segment = torch.meshgrid(torch.arange(rings - 1), torch.arange(segments), indexing="ij")
     a = (ring * segments + segment).flatten()
     b = (ring * segments + (segment + 1) % segments).flatten()
+    return torch.stack((a, b, b + segments, a + segments), 1)
+
+
+@cache
+def _tube_faces(rings: int, segments: int) -> Tensor:
+    """Triangles of the same tube with its caps, [f, 3]."""
+    a, b, c, d = _tube_quads(rings, segments).unbind(1)
     around = torch.arange(segments)
     following, last = (around + 1) % segments, (rings - 1) * segments
     start, end = torch.full_like(around, rings * segments), torch.full_like(around, rings * segments + 1)
     return torch.cat(
         (
-            torch.stack((a, b, b + segments), 1),
-            torch.stack((a, b + segments, a + segments), 1),
+            torch.stack((a, b, c), 1),
+            torch.stack((a, c, d), 1),
             torch.stack((start, following, around), 1),
             torch.stack((end, last + around, last + following), 1),
         )
@@ -157,7 +168,7 @@ def _leg(m: dict[str, Tensor], end: str) -> list[Tensor]:
     ]
 
 
-def _body_tube(m: dict[str, Tensor], joints: list[Tensor]) -> _Tube:
+def _body_tube(m: dict[str, Tensor], joints: list[Tensor], relief: Tensor) -> _Tube:
     """Nose to tail tip."""
     half, zero = m["body_length"] / 2, torch.zeros_like(m["body_length"])
     nose, poll, neck, withers, _, hips, root, tail, tip = joints
@@ -179,8 +190,7 @@ def _body_tube(m: dict[str, Tensor], joints: list[Tensor]) -> _Tube:
         (tail + 0.25 * (tip - tail), m["tail_middle"], m["tail_middle"]),
         (tip, 0.4 * m["tail_middle"], 0.4 * m["tail_middle"]),
     )
-    centers, widths, heights = zip(*sections, strict=True)
-    return _loft(torch.stack(centers, -2), torch.stack(widths, -1), torch.stack(heights, -1), BODY_RINGS)
+    return _loft(sections, relief, BODY_RINGS)
 
 
 BODY_STATIONS = (0.0, 0.2, 0.5, 0.95, 1.25, 2.0, 3.0, 3.25, 4.0, 4.75, 5.5, 6.0, 6.5, 7.25, 8.0)
@@ -189,7 +199,7 @@ LEG_STATIONS = (-0.3, 0.1, 0.6, 1.0, 1.5, 2.0, 2.5, 2.85, 3.0)
 """Bone coordinate of each leg section: 0 to 1 is the top bone; below zero the vertex hangs on the body bone."""
 
 
-def _leg_tube(m: dict[str, Tensor], joints: list[Tensor], end: str) -> _Tube:
+def _leg_tube(m: dict[str, Tensor], joints: list[Tensor], end: str, relief: Tensor) -> _Tube:
     """From inside the body to the toes."""
     top, knee, hock, foot = joints
     thigh, shank, paw = m[f"{end}_thigh"], m[f"{end}_shank"], m["paw"]
@@ -205,8 +215,7 @@ def _leg_tube(m: dict[str, Tensor], joints: list[Tensor], end: str) -> _Tube:
         (foot, 0.9 * paw, paw),
         (foot + 0.7 * forward + 0.1 * (foot - hock), 0.5 * paw, 0.6 * paw),
     )
-    centers, widths, heights = zip(*sections, strict=True)
-    return _loft(torch.stack(centers, -2), torch.stack(widths, -1), torch.stack(heights, -1), LEG_RINGS)
+    return _loft(sections, relief, LEG_RINGS)
 
 
 def _chain_weights(stations: tuple[float, ...], rings: int, bones: tuple[int, ...], first: float) -> Tensor:
@@ -234,6 +243,14 @@ def _skinning() -> tuple[tuple[Tensor, ...], Tensor]:
     return (body, *legs), torch.cat(faces)
 
 
+@cache
+def quads() -> Tensor:
+    """Corners of the quadrilaterals of the whole mesh, its caps left out, int64, [q, 4]."""
+    body, leg = _tube_quads(BODY_RINGS, BODY_SEGMENTS), _tube_quads(LEG_RINGS, LEG_SEGMENTS)
+    first, each = BODY_RINGS * BODY_SEGMENTS + 2, LEG_RINGS * LEG_SEGMENTS + 2
+    return torch.cat((body, *(first + k * each + leg for k in range(4))))
+
+
 def quadruped(shape: Proportions | None = None, *, unit: bool = True) -> Template:
     """Build the template; differentiable in the proportions.
 
@@ -244,10 +261,12 @@ def quadruped(shape: Proportions | None = None, *, unit: bool = True) -> Templat
     Returns:
         The template, symmetric about x = 0, chest centre near the origin.
     """
-    m = (shape or Proportions.average()).measures()
+    shape = shape or Proportions.average()
+    m, reliefs = shape.measures(), shape.reliefs()
     spine = _spine(m)
     front, rear = _leg(m, "front"), _leg(m, "rear")
-    body, left = _body_tube(m, spine), [_leg_tube(m, front, "front"), _leg_tube(m, rear, "rear")]
+    body = _body_tube(m, spine, reliefs[0])
+    left = [_leg_tube(m, front, "front", reliefs[1]), _leg_tube(m, rear, "rear", reliefs[2])]
     ring_weights, faces = _skinning()
 
     meshes = [body.mesh(BODY_SEGMENTS), *(leg.mesh(LEG_SEGMENTS) for leg in left)]
