@@ -28,6 +28,7 @@ class Gaussians(nn.Module):
         logit_opacities: [n].
         colors: RGB, then `REST_GAIN` times the harmonics' coefficients above degree 0 in the canonical frame,
             [n, (degree + 1)^2, 3].
+        blur: standard deviation added to every Gaussian, scalar.
     """
 
     means: nn.Parameter
@@ -35,19 +36,25 @@ class Gaussians(nn.Module):
     log_scales: nn.Parameter
     logit_opacities: nn.Parameter
     colors: nn.Parameter
+    blur: Tensor
 
     def __init__(self, values: dict[str, Tensor], max_scale: float) -> None:
         super().__init__()
         for name in NAMES:
             self.register_parameter(name, nn.Parameter(values[name].detach().clone().float().contiguous()))
         self.max_log_scale = math.log(max_scale * OBJECT_DIAGONAL)
+        self.register_buffer("blur", torch.zeros(()))
 
     def __len__(self) -> int:
         return self.means.shape[0]
 
     def scales_log(self) -> Tensor:
-        """Log scales under the cap, [n, 3]."""
+        """Log scales under the cap, without the blur, [n, 3]."""
         return self.log_scales.clamp(max=self.max_log_scale)
+
+    def scales(self, log_scales: Tensor) -> Tensor:
+        """Standard deviations with the blur, [n, 3] -> [n, 3]."""
+        return ((2 * log_scales).exp() + self.blur.square()).sqrt()
 
     def opacities(self) -> Tensor:
         """In (0, 1), [n]."""
@@ -100,7 +107,7 @@ class Gaussians(nn.Module):
         """The canonical Gaussians, activated, detached."""
         with torch.no_grad():
             quats = normalize(self.quats, dim=-1)
-            return Splats(self.means, quats, self.scales_log().exp(), self.opacities(), self.splat_colors(quats))
+            return Splats(self.means, quats, self.scales(self.scales_log()), self.opacities(), self.splat_colors(quats))
 
 
 def initial_gaussians(prior: Prior, count: int, config: Canonical, generator: torch.Generator) -> dict[str, Tensor]:

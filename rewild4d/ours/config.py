@@ -16,6 +16,9 @@ class Canonical(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """Scale along the normal over the scale in the surface: flat enough for a normal, thick enough edge-on."""
     opacity: float = 0.9
     """At the start; 0.1 leaves the silhouette too weak when the pose loss begins."""
+    blur_pixels: float = 0.5
+    """Blur of every Gaussian in space, in input pixels at the animal: a sharper view shows holes without it. Trained at
+    128 and seen at 256 pixels, held-out views of a horse rose from 21.6 to 22.6 dB (one seed, 800 steps)."""
     sh_degree: int = 0
     """Spherical harmonics of colour, 0 to 3; lighting is not mirror-symmetric and views are few (paper: 3)."""
     sh_every: float = 0.05
@@ -69,7 +72,7 @@ class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     time_noise_until: float = 0.5
     """Fraction at which the jitter ends."""
     tied: bool = False
-    """Pose of a flipped image = mirror image of that of the image, not its own; 0.2 dB worse on one horse, one seed."""
+    """Pose of a flipped image = mirror image of that of the image, not its own: twice the evidence for each pose."""
 
 
 class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -103,9 +106,10 @@ class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     blend_until: float = 0.35
     """Fraction at which the blend reaches zero (7k of 20k)."""
     pull: float = 0.3
-    """Weight of the squared distance to the prior's poses, falling linearly to zero at `pull_until` (paper: open)."""
+    """Weight of the squared distance to the prior's poses, falling linearly to zero at `pull_until` (paper: open). A
+    fitted prior's root is better than what single views teach the network: 5 to 50 gave +0.2 dB on a wolf (one seed)."""
     pull_until: float = 1.0
-    """Fraction at which the pull ends (paper: 4k of 20k)."""
+    """Fraction at which the pull ends (paper: 4k of 20k); above 1 it is still on at the end."""
 
 
 class WarmUp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

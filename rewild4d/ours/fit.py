@@ -149,7 +149,7 @@ class Training:
         camera = target.camera
         log_scales = posed.log_scales.detach() if detach_scales else posed.log_scales
         image, alpha, info = rasterize(
-            posed.means, posed.quats, log_scales.exp(), opacities, features,
+            posed.means, posed.quats, self.model.gaussians.scales(log_scales), opacities, features,
             camera.world_to_camera[None], camera.intrinsics[None], camera.width, camera.height,
         )  # fmt: skip
         return image[0], alpha[0], info
@@ -271,6 +271,7 @@ def train(
     supervision = Supervision(clip, prior, config.image_size, device)
     small = Supervision(clip, prior, min(config.image_size, config.warmup.size), device)
     model = build_model(config, prior, generator).to(device)
+    model.gaussians.blur.fill_(config.canonical.blur_pixels * supervision.pixel())
     warmup = WarmUp(model, small, prior, config, generator)
     main = Training(model, supervision, small, config, generator)
     identity = fit_digest(config, clip, prior, seed)

@@ -51,7 +51,7 @@ class OursReconstruction:
         _, moved = self.model.deformed(pose, self.weights, strength)
         own = self.model.gaussians
         quats = nn.functional.normalize(moved.quats, dim=-1)
-        posed = Splats(moved.means, quats, moved.log_scales.exp(), own.opacities(), own.rgb()[:, None])
+        posed = Splats(moved.means, quats, own.scales(moved.log_scales), own.opacities(), own.rgb()[:, None])
         world = transform_splats(posed, interpolate_similarity(self.object_to_world, position).to(quats.device))
         return replace(world, colors=own.splat_colors(world.quats))
 

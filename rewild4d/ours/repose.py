@@ -83,7 +83,7 @@ def repose(model: Model, supervision: Supervision, config: Repose, side: int, ge
     with torch.no_grad():
         start = joint_transforms(supervision.prior_quats[side], supervision.prior_shifts[side], model.pivots)
         weights = model.field.sample(model.field.probabilities(), own.means)
-        rest, scales = nn.functional.normalize(own.quats, dim=-1), own.scales_log().exp()
+        rest, scales = nn.functional.normalize(own.quats, dim=-1), own.scales(own.scales_log())
         features, opacities = own.rgb().clone(), own.opacities()
         means = own.means.detach()
     change = Correction(start, model.pivots, model.parents.tolist(), config)

@@ -96,6 +96,11 @@ class Supervision:
         frame = torch.tensor([key.frame for key in keys])
         return self.prior_quats[side, frame], self.prior_shifts[side, frame]
 
+    def pixel(self) -> float:
+        """Side of a pixel at the object frame's origin, median over the frames, in that frame's units."""
+        cameras = [self._targets[Key(1, 1, index)].camera for index in range(self.frames)]
+        return float(torch.stack([each.world_to_camera[2, 3] / each.intrinsics[0, 0] for each in cameras]).median())
+
     def draw(self, generator: torch.Generator) -> Key:
         """One view: the group first, then a frame of it, then one of its two images, each uniformly."""
         group, frame, view = (int(torch.randint(count, (), generator=generator)) for count in (2, self.frames, 2))
