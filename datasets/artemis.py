@@ -37,9 +37,10 @@ __all__ = ["Artemis", "ArtemisWriter"]
 
 
 class Artemis:
-    """Reader of one animal's folder, or of a folder of animals (contracts.DatasetReader).
+    """Artemis / DFA folders: one animal, or a folder of animals.
 
-    A case is "<animal>/<motion>", with "@side", "@oblique" or "@frontal" behind it where a fixed camera has placements.
+    Keeps contracts.DatasetReader. A case is "<animal>/<motion>", with "@side", "@oblique" or "@frontal" behind it where
+    a fixed camera has placements.
 
     Raises:
         UserError: no such folder, or neither an animal nor a folder of animals.

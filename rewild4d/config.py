@@ -1,6 +1,9 @@
 """Settings: a preset file, then flags, into one frozen msgspec.Struct per method."""
 
+import contextlib
 import dataclasses
+import io
+import re
 import tomllib
 import typing
 from collections.abc import Iterator
@@ -52,17 +55,31 @@ def parse_flags(options_type: type[T], arguments: list[str], *, prog: str, descr
         description: shown on top of the help.
 
     Raises:
-        UserError: a flag that does not exist.
-        SystemExit: --help (0) or a value of the wrong type (2).
+        UserError: a flag that does not exist, or a value of the wrong type.
+        SystemExit: --help.
     """
-    options, unknown = tyro.cli(
-        options_type, args=arguments, prog=prog, description=description, return_unknown_args=True
-    )
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            options, unknown = tyro.cli(
+                options_type, args=arguments, prog=prog, description=description, return_unknown_args=True
+            )
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise UserError(f"{_first_words(said.getvalue())}; see {prog} --help.") from None
     if unknown and unknown[0].startswith("-"):
         raise unknown_name("option", unknown[0].split("=")[0], _flags(options_type))
     if unknown:
         raise UserError(f"{prog}: expected options only, got '{unknown[0]}'; see {prog} --help.")
     return options
+
+
+def _first_words(box: str) -> str:
+    """What the parser complains of, out of the frame that it draws around it."""
+    sections = re.split(r"^[ ╭╰├]*[-─]{2}.*$", box, flags=re.MULTILINE)
+    sentences = [" ".join(section.replace("│", " ").split()) for section in sections]
+    return next((sentence for sentence in sentences if len(sentence.split()) > 2), box.strip())
 
 
 def with_method_flags(options_type: type, config: msgspec.Struct) -> type:

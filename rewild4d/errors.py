@@ -4,6 +4,10 @@ import difflib
 from collections.abc import Iterable
 
 
+MOST_LISTED = 30
+"""More names than these are not listed where a close one can be suggested."""
+
+
 class UserError(Exception):
     """What a person gave cannot be used. The message names the path, what was expected and what came."""
 
@@ -16,7 +20,8 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
         name: what the user gave.
         known: every valid name.
     """
-    names = sorted(known)
+    names = sorted(set(known))
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     hint = f" Did you mean '{close[0]}'?" if close else ""
-    return UserError(f"unknown {kind} '{name}'.{hint} Available: {', '.join(names) or 'none'}.")
+    listed = f" Available: {', '.join(names) or 'none'}." if len(names) <= MOST_LISTED or not close else ""
+    return UserError(f"unknown {kind} '{name}'.{hint}{listed}")

@@ -24,7 +24,7 @@ def main(arguments: list[str]) -> int:
     print("data sets")
     for name in names("datasets"):
         made = "; built-in animals are made where --data is left out" if name in BUILTIN else ""
-        print(f"  {name:<12} {(load_dataset(name).__doc__ or '').strip().splitlines()[0]}{made}")
+        print(f"  {name:<12} {(load_dataset(name).__doc__ or '').strip().splitlines()[0].rstrip('.')}{made}")
     print("protocols")
     for name, protocol in load_protocols().items():
         print(f"  {name:<24} {protocol.title}" + (" (default)" if protocol.default else ""))

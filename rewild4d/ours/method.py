@@ -16,7 +16,11 @@ from rewild4d.types import Clip, Prior
 class Ours:
     """Part-aware canonical Gaussians with mirrored supervision (contracts.Method)."""
 
-    info: ClassVar[MethodInfo] = MethodInfo(title="Ours", paper="this project's design", licence="MIT")
+    info: ClassVar[MethodInfo] = MethodInfo(
+        title="ours",
+        paper="Progressive Pose-Guided 4D Animal Reconstruction from Monocular Video; its code is not public",
+        licence="MIT",
+    )
     Config: ClassVar[type[OursConfig]] = OursConfig
 
     def fit(
