@@ -77,9 +77,10 @@ def parse_flags(options_type: type[T], arguments: list[str], *, prog: str, descr
 
 def _first_words(box: str) -> str:
     """What the parser complains of, out of the frame that it draws around it."""
-    sections = re.split(r"^[ ╭╰├]*[-─]{2}.*$", box, flags=re.MULTILINE)
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", box)
+    sections = re.split(r"^.*(?:──|-----).*$", plain, flags=re.MULTILINE)
     sentences = [" ".join(section.replace("│", " ").split()) for section in sections]
-    return next((sentence for sentence in sentences if len(sentence.split()) > 2), box.strip())
+    return next((sentence for sentence in sentences if len(sentence.split()) > 2), plain.strip())
 
 
 def with_method_flags(options_type: type, config: msgspec.Struct) -> type:

@@ -3,7 +3,6 @@
 import difflib
 from collections.abc import Iterable
 
-
 MOST_LISTED = 30
 """More names than these are not listed where a close one can be suggested."""
 

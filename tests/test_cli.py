@@ -61,7 +61,10 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
             ["run", "--method", "prior-only", "--gausians", "3"],
             "unknown option '--gausians'. Did you mean '--gaussians'?",
         ),
-        (["run", "--method", "prior-only", "--gaussians", "many"], "Error parsing --gaussians: invalid literal for int()"),
+        (
+            ["run", "--method", "prior-only", "--gaussians", "many"],
+            "Error parsing --gaussians: invalid literal for int",
+        ),
         (["run", "--preset", "quik"], "unknown preset of 'ours' 'quik'. Did you mean 'quick'?"),
         (["run", "--device", "tpu"], "--device: expected auto, cpu or cuda, got 'tpu'"),
         (["run", "--threads", "0"], "--threads: expected a number of at least 1, got 0"),
