@@ -44,10 +44,10 @@ def save_pictures(reconstruction: Reconstruction, clip: Clip, truth: Truth, fold
 
 def comparison(reconstruction: Reconstruction, clip: Clip, truth: Truth) -> Tensor:
     """The comparison picture, [3, H, W]."""
-    panels = []
+    panels, times = [], [frame.time for frame in truth.held_out]
     for row in range(ROWS):
         frame = clip.frames[row * len(clip.frames) // ROWS]
-        held = [i for i, time in enumerate(_times(truth)) if abs(time - frame.time) < 1e-6]
+        held = [i for i, time in enumerate(times) if abs(time - frame.time) < 1e-6]
         images = [frame.over(1.0), _shot(reconstruction, frame)]
         if held:
             other = truth.held_out[held[(len(held) // 3 + row * len(held) // (2 * ROWS)) % len(held)]]
@@ -83,7 +83,7 @@ def canonical(splats: Splats, weights: Tensor) -> Tensor:
     colored = Splats(splats.means, splats.quats, splats.scales, splats.opacities, (weights @ palette)[:, None])
     center = splats.means.double().median(0).values
     up, ahead = torch.tensor((0.0, 1.0, 0.0)).double(), torch.tensor((0.0, 0.0, 1.0)).double()
-    focal = PANEL * 2.2
+    focal = PANEL * 1.9
     intrinsics = torch.tensor(((focal, 0, PANEL / 2), (0, focal, PANEL / 2), (0, 0, 1.0))).double()
     panels = []
     for direction, top in (((1, 0.1, 0), up), ((0.8, 0.4, 0.8), up), ((0, 0.1, 1), up), ((0, 1, 0), ahead)):
@@ -117,11 +117,6 @@ def _shot(reconstruction: Reconstruction, frame: Frame) -> Tensor:
 def _over_white(splats: Splats, camera: Camera) -> Tensor:
     color, alpha = render(splats, camera)
     return (color + 1 - alpha).clamp(0, 1)
-
-
-def _times(truth: Truth) -> list[float]:
-    times = getattr(truth.held_out, "times", None)
-    return list(times) if times is not None else [frame.time for frame in truth.held_out]
 
 
 def _widen(image: Tensor) -> Tensor:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from rewild4d.machine import PACKAGES
+
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 SETUPTOOLS = PROJECT["tool"]["setuptools"]
@@ -23,6 +25,7 @@ def test_every_folder_with_an_init_is_mapped() -> None:
     found = {str(file.parent.relative_to(ROOT)) for file in ROOT.rglob("__init__.py") if not skipped & set(file.parts)}
     assert found == set(SETUPTOOLS["package-dir"].values())
     assert set(SETUPTOOLS["packages"]) == set(SETUPTOOLS["package-dir"])
+    assert {"rewild4d", *(f"rewild4d.{name}" for name in PACKAGES)} == set(SETUPTOOLS["packages"])
 
 
 def test_the_repository_root_is_off_the_path() -> None:
