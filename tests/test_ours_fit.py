@@ -125,7 +125,7 @@ def start(toy: tuple[Clip, Prior], config: Config) -> Training:
     model = build_model(config, toy[1], generator)
     for layer in (model.network.head, model.deform.out):
         torch.nn.init.normal_(layer.weight, std=0.01, generator=generator)
-    return Training(model, supervision, supervision, config, generator)
+    return Training(model, supervision, config, generator)
 
 
 def test_the_mirrored_groups(toy: tuple[Clip, Prior]) -> None:
@@ -230,6 +230,17 @@ def test_harmonics_mean_the_same_in_training_and_in_the_world(toy: tuple[Clip, P
     expected = own.seen_rgb(posed.means, posed.quats, eye, 2)
     actual = seen_colors(made.at(clip.times[1]), root[:3, :3] @ eye + root[:3, 3])
     torch.testing.assert_close(actual, expected, atol=1e-4, rtol=0)
+
+
+def test_no_gaussian_is_narrower_than_half_a_pixel(toy: tuple[Clip, Prior]) -> None:
+    made = Ours().fit(*toy, config=TINY, seed=0, device=CPU, log=quiet, workdir=None)
+    # Every camera is sqrt(12^2 + 3^2) from the origin.
+    pixel = math.hypot(12, 3) / (2.2 * HEIGHT)
+    assert float(made.model.gaussians.blur) == pytest.approx(0.5 * pixel, rel=1e-5)
+    with torch.no_grad():
+        made.model.gaussians.log_scales.fill_(-9.0)
+    for splats in (made.canonical(), made.at(0.15)):
+        assert splats.scales.min() >= 0.5 * pixel * 0.999
 
 
 def test_a_short_fit_improves_the_silhouette(toy: tuple[Clip, Prior]) -> None:

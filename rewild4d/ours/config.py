@@ -107,7 +107,7 @@ class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """Fraction at which the blend reaches zero (7k of 20k)."""
     pull: float = 0.3
     """Weight of the squared distance to the prior's poses, falling linearly to zero at `pull_until` (paper: open). A
-    fitted prior's root is better than what single views teach the network: 5 to 50 gave +0.2 dB on a wolf (one seed)."""
+    fitted prior's root is better than what single views teach: 50 for 5 gave +0.2 dB on a wolf (one seed)."""
     pull_until: float = 1.0
     """Fraction at which the pull ends (paper: 4k of 20k); above 1 it is still on at the end."""
 
@@ -136,41 +136,6 @@ class WarmUp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """Learning rate on silhouettes."""
     pull: float = 0.3
     """Weight of the pull to the prior's poses, falling linearly to zero."""
-
-
-class Repose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The second look at the poses: fitted again to the images with the learnt Gaussians, all else frozen."""
-
-    at: tuple[float, ...] = ()
-    """Fractions at which it happens; the fitted poses take the place of the prior's from there on."""
-    steps: int = 100
-    """Steps of Adam."""
-    frames: int = 24
-    """Frames a step."""
-    blur: tuple[float, float] = (0.03, 0.01)
-    """Blur of the difference image at the first and last step, times the side of the animal's box."""
-    colour: float = 1.0
-    """Weight of the squared colour difference against that of the mattes."""
-    rate: float = 0.05
-    """Learning rate on whitened parameters, falling to zero over the second half."""
-    penalty: float = 1e-3
-    """Weight of the squared whitened change."""
-    turn_spread: float = 0.1
-    """Natural size of the change of the root's rotation, radians."""
-    shift_spread: float = 0.02
-    """Natural size of the change of the root's place, times the rest diagonal."""
-    joint_spread: tuple[float, float, float] = (0.25, 0.06, 0.06)
-    """Natural size of the change of a joint's rotation about the object's axes, radians: x flexes, y and z turn out."""
-    root_terms: float = 0.25
-    """Terms of the root's cosine series a frame."""
-    joint_terms: float = 0.5
-    """Terms of a joint's."""
-    copy_steps: int = 100
-    """Steps that teach the network the fitted poses."""
-    copies: int = 48
-    """Poses a step of those."""
-    copy_rate: float = 2e-3
-    """Learning rate of those."""
 
 
 class Loss(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -285,7 +250,6 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     deform: Deform = Deform()
     prior: PriorUse = PriorUse()
     warmup: WarmUp = WarmUp()
-    repose: Repose = Repose()
     loss: Loss = Loss()
     geometry: Geometry = Geometry()
     rates: Rates = Rates()

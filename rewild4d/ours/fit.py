@@ -19,7 +19,6 @@ from rewild4d.ours.geometry_losses import compact_loss, neighbours, rigid_loss, 
 from rewild4d.ours.losses import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.pose import blend_poses, pose_distance
-from rewild4d.ours.repose import look_again
 from rewild4d.ours.schedule import exponential, fade, ramp
 from rewild4d.ours.skeleton import neighbour_keys, skeleton_losses
 from rewild4d.ours.symmetry import Key, Supervision, Target
@@ -40,11 +39,8 @@ class Training:
         network_optimizer: groups skinning, pose, deform.
     """
 
-    def __init__(
-        self, model: Model, supervision: Supervision, small: Supervision, config: Config, generator: torch.Generator
-    ) -> None:
+    def __init__(self, model: Model, supervision: Supervision, config: Config, generator: torch.Generator) -> None:
         self.model, self.supervision, self.config, self.generator = model, supervision, config, generator
-        self.small = small
         own, rates = model.gaussians, config.rates
         self.gaussian_optimizer = torch.optim.Adam(
             [{"params": [getattr(own, name)], "lr": _fixed_rate(rates, name)} for name in NAMES], eps=1e-15, fused=True
@@ -64,8 +60,6 @@ class Training:
     def step(self, index: int) -> dict[str, float]:
         """One iteration; returns the figures for the log."""
         progress = index / self.config.iterations
-        if index in [round(at * self.config.iterations) for at in self.config.repose.at]:
-            self._look_again()
         self._set_rates(progress)
         key = self.supervision.draw(self.generator)
         target = self.supervision.target(key)
@@ -86,12 +80,6 @@ class Training:
         return {"loss": float(loss.detach()), "gaussians": len(self.model.gaussians)} | {
             name: float(value.detach()) for name, value in losses.items()
         }
-
-    def _look_again(self) -> None:
-        """Fit the poses again; Adam's moments of the pose network belong to the old ones."""
-        look_again(self.model, self.supervision, self.small, self.config.repose, self.generator)
-        for parameter in self.groups["pose"]:
-            self.network_optimizer.state.pop(parameter, None)
 
     def losses(self, key: Key, target: Target, index: int) -> tuple[dict[str, Tensor], RasterInfo | None]:
         """All weighted losses of one view.
@@ -225,7 +213,6 @@ class Training:
             "network_optimizer": self.network_optimizer.state_dict(),
             "density": [self.density.gradient, self.density.seen, self.density.radius],
             "near": self.near,
-            "poses": [self.supervision.prior_quats, self.supervision.prior_shifts],
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -243,8 +230,6 @@ class Training:
             part.to(device).clone() for part in state["density"]
         )
         self.near = state["near"]
-        for views in (self.supervision, self.small):
-            views.prior_quats, views.prior_shifts = (part.to(device) for part in state["poses"])
 
 
 def train(
@@ -273,7 +258,7 @@ def train(
     model = build_model(config, prior, generator).to(device)
     model.gaussians.blur.fill_(config.canonical.blur_pixels * supervision.pixel())
     warmup = WarmUp(model, small, prior, config, generator)
-    main = Training(model, supervision, small, config, generator)
+    main = Training(model, supervision, config, generator)
     identity = fit_digest(config, clip, prior, seed)
     saved = _resume(workdir, identity)
     start = 0

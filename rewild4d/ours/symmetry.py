@@ -70,21 +70,9 @@ class Supervision:
                 self._targets[Key(group, view, index)] = Target(colour.contiguous(), matte.contiguous(), camera, side)
         chosen = torch.stack((prior.transforms[rows], prior.transforms_flip[rows])).float()
         pivots = prior.bones[:, 0].float()
-        self.set_poses(chosen.to(device), pivots.to(device))
-
-    def set_poses(self, transforms: Tensor, pivots: Tensor) -> None:
-        """Take rest -> posed transforms for v = +1 and -1, [2, T, J, 4, 4], in place of the prior's."""
-        self.prior_quats = matrix_to_quat(transforms[..., :3, :3])
-        moved = (transforms[..., :3, :3] @ pivots[..., None])[..., 0] + transforms[..., :3, 3]
-        self.prior_shifts = moved - pivots
-
-    @property
-    def symmetric(self) -> bool:
-        """Whether the prior's cameras for mirror images are the mirrored cameras, to a hair's breadth."""
-        pairs = [
-            (self._targets[Key(1, -1, i)].camera, self._targets[Key(-1, -1, i)].camera) for i in range(self.frames)
-        ]
-        return all(torch.allclose(a.world_to_camera, b.world_to_camera, atol=1e-4) for a, b in pairs)
+        self.prior_quats = matrix_to_quat(chosen[..., :3, :3]).to(device)
+        moved = (chosen[..., :3, :3] @ pivots[..., None])[..., 0] + chosen[..., :3, 3]
+        self.prior_shifts = (moved - pivots).to(device)
 
     def target(self, key: Key) -> Target:
         """Image, matte and camera of one view."""
