@@ -16,7 +16,7 @@ from rewild4d.priors.hypotheses import Hypotheses, cosine_series
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.overlay import overlay
 from rewild4d.priors.proportions import Proportions
-from rewild4d.priors.search import mask_rays, trajectory, up_directions
+from rewild4d.priors.search import mask_rays, single_view, trajectory, up_directions
 from rewild4d.priors.silhouettes import outline, rasterized, splat
 from rewild4d.priors.template import PARENTS, quadruped, quads
 from rewild4d.transforms import axis_angle_to_matrix, look_at, similarity, skin_points
@@ -84,6 +84,7 @@ def test_a_known_animal_is_found_again() -> None:
     found = prior.object_to_world[:, :3, :3].mean(0)
     assert angle(found[:, 2], truth[:3, 2]) < 10 and angle(found[:, 1], up) < 10
     assert prior.quality["mask_iou"] > 0.8 and prior.quality["facing_margin"] > 0
+    assert prior.quality["starts"] == 8 and {f"start_{k:02d}_cost" for k in range(8)} < prior.quality.keys()
     assert float(found[:, 1].norm()) == pytest.approx(WORLD_SCALE, rel=0.1)
     extent = prior.vertices.amax(0) - prior.vertices.amin(0)
     assert float(extent.norm()) == pytest.approx(5.0, abs=1e-4)
@@ -140,6 +141,24 @@ def test_one_camera_that_does_not_move_leaves_several_ups_and_a_finite_path() ->
     elevation = math.degrees(math.atan2(2.5, 9))
     assert len(ups) == 3 and min(angle(found, world()[1]) for found in ups) < abs(20 - elevation) + 1
     assert torch.isfinite(trajectory(rays, 4)).all()
+
+
+def test_only_a_single_direction_of_view_is_a_gaze_and_it_is_told_in_the_working_frame() -> None:
+    truth = world()[0]
+    still, ring = (mask_rays(walking_clip(4, kind).frames, list(range(4)), "") for kind in ("fixed", "sweep"))
+    assert single_view(ring, truth) is None
+    gaze = single_view(still, truth)
+    # the camera stands at (9 sin 0.8, 2.5, 9 cos 0.8) in the animal's frame and looks at its middle
+    inward = -torch.tensor((9 * math.sin(0.8), 2.5, 9 * math.cos(0.8)))
+    assert gaze is not None and float(gaze.norm()) == pytest.approx(1.0, abs=1e-5) and angle(gaze, inward) < 5
+
+
+def test_heading_is_free_but_leaning_and_turning_over_time_cost() -> None:
+    guesses = Hypotheses.start(torch.eye(3).expand(3, 3, 3), torch.zeros(8, 3))
+    guesses.turn[0, 0, 1] = guesses.turn[1, 0, 0] = guesses.turn[2, 1, 1] = 1.0
+    assert guesses.penalties()[3].tolist() == pytest.approx([0.0, 1.0, 1.0])
+    turned = torch.tensor((math.sin(0.35), 0.0, math.cos(0.35)))
+    assert torch.allclose(guesses.heading()[0], turned, atol=1e-5)
 
 
 def test_one_blob_is_a_round_gaussian_of_its_projected_size() -> None:

@@ -39,6 +39,8 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         relief_weight: of the mean squared relief of the cross sections.
         angle_weight: of the squared whitened joint angles: limbs rest, and move slowly, unless the masks insist.
         root_weight: of the squared whitened root motion and tilt: a sweeping camera sees each moment once.
+        view_weight: of the squared cosine between heading and a single direction of view: seen from one side only, a
+            turned animal looks like a shorter one, and its outline hardly changes near the broadside.
         gait_weight: of feet that bear weight and move forwards, when guesses are compared: outlines alone hardly tell
             the head of a bushy-tailed animal.
     """
@@ -48,9 +50,10 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     elevations: tuple[float, ...] = (5.0, 20.0, 40.0)
     learning_rate: float = 0.06
     shape_weight: float = 0.02
-    relief_weight: float = 0.05
+    relief_weight: float = 0.015
     angle_weight: float = 0.15
     root_weight: float = 0.2
+    view_weight: float = 0.01
     gait_weight: float = 0.015
 
 

@@ -21,6 +21,7 @@ from rewild4d.priors.search import (
     facings,
     mask_rays,
     match_areas,
+    single_view,
     trajectory,
     up_directions,
     working_frame,
@@ -66,7 +67,8 @@ def fit_template(clip: Clip, *, config: PriorConfig, seed: int, log: Log) -> Pri
         log: progress.
 
     Returns:
-        A prior with one pose per frame; `quality` holds mask_iou, cost and facing_margin.
+        A prior with one pose per frame; `quality` holds mask_iou, cost, facing_margin, starts (their number) and
+        start_00_cost, ... (after the first stage).
 
     Raises:
         UserError: a frame has no camera, or no mask shows anything.
@@ -88,12 +90,15 @@ def fit_animal(
     generator = torch.Generator().manual_seed(seed)
     best: list[_Race] = []
     for index, up in enumerate(ups):
-        race = _Race(frames, moments, name, working_frame(rays, path, up), config, generator, log, total)
+        working = working_frame(rays, path, up)
+        race = _Race(frames, moments, name, working, single_view(rays, working), config, generator, log, total)
         race.done = index * config.stages[0].steps
         race.begin(path)
         race.run(config.stages[0])
         best.append(race)
+    starts = torch.cat([race.start_costs for race in best]).tolist()
     leader = min(best, key=lambda race: float(race.costs.min()))
+    leader.figures |= {"starts": float(len(starts))} | {f"start_{k:02d}_cost": cost for k, cost in enumerate(starts)}
     leader.done = len(ups) * config.stages[0].steps
     for stage in config.stages[1:]:
         leader.run(stage)
@@ -115,15 +120,16 @@ class _Race:
         moments: Sequence[int],
         name: str,
         working: Tensor,
+        gaze: Tensor | None,
         config: PriorConfig,
         generator: torch.Generator,
         log: Log,
         total: int,
     ) -> None:
         self.frames, self.moments, self.name = frames, moments, name
-        self.working, self.config, self.generator = working, config, generator
+        self.working, self.gaze, self.config, self.generator = working, gaze, config, generator
         self.log, self.total, self.done = log, total, 0
-        self.costs = torch.zeros(0)
+        self.costs = self.start_costs = torch.zeros(0)
         self.figures: dict[str, float] = {}
 
     def begin(self, path: Tensor) -> None:
@@ -147,6 +153,8 @@ class _Race:
         config = self.config
         penalty = config.shape_weight * shape + config.relief_weight * relief
         penalty = penalty + config.angle_weight * swing + config.root_weight * root
+        if self.gaze is not None:
+            penalty = penalty + config.view_weight * (self.guesses.heading() @ self.gaze).square()
         return mismatch(self.guesses.silhouettes(targets, stage), targets, sigma) + penalty
 
     def run(self, stage: Stage) -> None:
@@ -173,12 +181,14 @@ class _Race:
             self.costs = self._cost(_spaced(targets, 2 * stage.frames), stage.size * stage.blur[1], stage)
             if stage.joints:
                 self.costs = self.costs + self.config.gait_weight * self.guesses.backward_gait()
+        if not len(self.start_costs):
+            self.start_costs = self.costs
         self._cut(stage.keep)
 
     def _cut(self, keep: int) -> None:
         """Keep the best, and the best that faces away from it while there is room."""
         order = self.costs.argsort()
-        heads = self.guesses.roots().detach()[:, :, :3, 2].mean(1)
+        heads = self.guesses.heading().detach()
         away = [int(row) for row in order if heads[row] @ heads[order[0]] < 0]
         if away:
             self.figures["facing_margin"] = float(self.costs[away[0]] - self.costs[order[0]])

@@ -108,6 +108,10 @@ class Hypotheses:
         turns = axis_angle_to_matrix((series @ self.turn) * torch.tensor(TURN_SPREAD))
         return rigid(self.facing[:, None] @ turns, self.path + SHIFT_SPREAD * (series @ self.shift))
 
+    def heading(self) -> Tensor:
+        """Mean direction from tail to head, [B, 3]."""
+        return torch.nn.functional.normalize(self.roots()[..., :3, 2].mean(1), dim=-1)
+
     def joint_angles(self) -> Tensor:
         """Axis-angle vectors in radians, [B, T, J, 3]."""
         series = cosine_series(len(self.path), self.angles.shape[1])
@@ -156,9 +160,11 @@ class Hypotheses:
         """How unusual the proportions, the relief, the joint angles and the root's motion are, each [B].
 
         Fast terms cost more than slow ones: a moment seen by one camera says nothing of depth, its neighbours do.
+        Where the animal heads on the whole costs nothing: the starts only sample it.
         """
         pace = torch.arange(self.angles.shape[1])
         swing = self.angles.square() * (ANGLE_SPREADS > 0) * (0.3 + (pace / 4).square())[:, None, None]
         haste = torch.arange(self.shift.shape[1]).square()[:, None]
-        root = self.turn.square().sum((1, 2)) + 0.5 * (self.shift.square() * haste).sum((1, 2))
+        lean = torch.cat((self.turn[:, :1, [0, 2]].flatten(1), self.turn[:, 1:].flatten(1)), dim=1)
+        root = lean.square().sum(1) + 0.5 * (self.shift.square() * haste).sum((1, 2))
         return self.shape.square().mean(1), self.relief.square().mean((1, 2)), swing.sum(1).mean((1, 2)), root

@@ -144,6 +144,13 @@ def working_frame(rays: Rays, path: Tensor, up: Tensor) -> Tensor:
     return similarity(size, rotation, path.mean(0))
 
 
+def single_view(rays: Rays, working: Tensor) -> Tensor | None:
+    """The one direction all cameras look in, in the working frame, [3]; None where directions spread."""
+    if spread(rays.directions) >= WIDE_BASELINE:
+        return None
+    return torch.nn.functional.normalize(working[:3, :3].T @ rays.directions.mean(0), dim=0).float()
+
+
 def facings(count: int) -> Tensor:
     """Turns about y by even shares of the circle, [count, 3, 3]."""
     angle = torch.arange(count) * (2 * torch.pi / count)
