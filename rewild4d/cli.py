@@ -1,5 +1,6 @@
 """The command line: a thin skin over callables. Results go to standard output, everything else to standard error."""
 
+import os
 import sys
 from collections.abc import Callable
 
@@ -40,6 +41,10 @@ def main(arguments: list[str] | None = None) -> None:
         if words[0] not in COMMANDS:
             raise unknown_name("command", words[0], COMMANDS)
         status = COMMANDS[words[0]][0](words[1:])
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader of our output has had enough, as in `| head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        status = 0
     except UserError as error:
         print(f"rewild4d-bench: {error}", file=sys.stderr)
         status = 2
