@@ -24,7 +24,7 @@ lint: setup
 
 # The top folders install as subpackages, so the type checker reads a built copy.
 types: setup
-	rm -rf build/types
+	rm -rf build
 	$(BIN)/pip install --quiet --no-deps --target build/types .
 	$(BIN)/mypy
 
