@@ -176,6 +176,23 @@ def test_gradients_stay_in_their_branch(toy: tuple[Clip, Prior]) -> None:
     assert slopes(appearance, model.network.anchors)[0].abs().max() > 0
 
 
+def test_a_change_of_scale_by_the_deformation_costs_its_square(toy: tuple[Clip, Prior]) -> None:
+    training = start(toy, TINY)
+    deform, key = training.model.deform, Key(1, 1, 1)
+    target, last = training.supervision.target(key), TINY.iterations - 1
+    with torch.no_grad():
+        deform.out.weight.zero_()
+        deform.out.bias.zero_()
+    assert training.losses(key, target, last)[0]["steady"] == 0
+    with torch.no_grad():
+        deform.out.bias[-3:] = 0.5
+    # The ramp is at its end, so the offset is the same on each of three axes.
+    offset = TINY.deform.max_log_scale * math.tanh(0.5)
+    assert training.losses(key, target, last)[0]["steady"].item() == pytest.approx(0.1 * offset**2, rel=1e-4)
+    off = msgspec.structs.replace(TINY, geometry=msgspec.structs.replace(TINY.geometry, steady=0.0))
+    assert "steady" not in start(toy, off).losses(key, target, last)[0]
+
+
 def test_a_killed_fit_resumes_to_the_same_bits(toy: tuple[Clip, Prior], tmp_path: Path) -> None:
     whole = train(*toy, TINY, 0, CPU, quiet, None)
 

@@ -187,6 +187,8 @@ class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     horse, one seed, 1,500 steps, against a run that also had more Gaussians."""
     rigid_neighbours: int = 5
     """Neighbours a Gaussian is compared with."""
+    steady: float = 0.1
+    """Deformed branch: squared change of log scale. Unchecked, scales grow while the deformation shrinks them again."""
 
 
 class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

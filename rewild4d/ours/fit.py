@@ -178,6 +178,8 @@ class Training:
             if self.near is None:
                 self.near = neighbours(own.means, config.rigid_neighbours)
             losses["rigid"] = config.rigid * rigid_loss(own.means, deformed.means, self.near)
+        if config.steady:
+            losses["steady"] = config.steady * (deformed.log_scales - posed.log_scales).square().mean()
         return losses
 
     def _set_rates(self, progress: float) -> None:
