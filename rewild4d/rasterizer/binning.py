@@ -7,7 +7,8 @@ place before that last sort (Gaussian by Gaussian) is its `slot`: the backward p
 
 import numpy as np
 
-from rewild4d.rasterizer.compiling import kernel
+from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.simd import bits_gt, fma, load, maximum, minimum, splat
 from rewild4d.rasterizer.projection import (
     CENTER_X,
     CENTER_Y,
@@ -19,7 +20,6 @@ from rewild4d.rasterizer.projection import (
     XY,
     YY,
 )
-from rewild4d.rasterizer.simd import bits_gt, fma, load, maximum, minimum, splat
 
 TILE, BLOCK, BLOCKS = 16, 4, 16
 """A tile is 16 x 16 pixels: sixteen blocks of 4 x 4, numbered row by row."""

@@ -9,20 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from rewild4d.rasterizer.binning import BLOCK, BLOCKS, TILE
-from rewild4d.rasterizer.compiling import kernel
-from rewild4d.rasterizer.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
-from rewild4d.rasterizer.projection import (
-    CENTER_X,
-    CENTER_Y,
-    LOG2_MIN_ALPHA,
-    LOG_OPACITY,
-    RECORD,
-    XX,
-    XY,
-    YY,
-)
-from rewild4d.rasterizer.simd import (
+from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.simd import (
     LANES,
     bits_gt,
     columns_of_block,
@@ -38,6 +26,18 @@ from rewild4d.rasterizer.simd import (
     store,
     store_block,
     take_ticket,
+)
+from rewild4d.rasterizer.binning import BLOCK, BLOCKS, TILE
+from rewild4d.rasterizer.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
+from rewild4d.rasterizer.projection import (
+    CENTER_X,
+    CENTER_Y,
+    LOG2_MIN_ALPHA,
+    LOG_OPACITY,
+    RECORD,
+    XX,
+    XY,
+    YY,
 )
 
 WEAKEST = np.float32(LOG2_MIN_ALPHA)

@@ -9,21 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from rewild4d.rasterizer.binning import BLOCK, BLOCKS
-from rewild4d.rasterizer.blending import (
-    LEAST_LEFT,
-    STRONGEST_ALPHA,
-    WEAKEST,
-    exponent_at,
-    form,
-    offsets,
-    open_tile,
-    tile_place,
-)
-from rewild4d.rasterizer.compiling import kernel
-from rewild4d.rasterizer.conventions import MAX_ALPHA
-from rewild4d.rasterizer.projection import LOG_OPACITY, RECORD, XX, XY, YY
-from rewild4d.rasterizer.simd import (
+from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.simd import (
     LANES,
     divide,
     exp2,
@@ -42,6 +29,19 @@ from rewild4d.rasterizer.simd import (
     store,
     take_ticket,
 )
+from rewild4d.rasterizer.binning import BLOCK, BLOCKS
+from rewild4d.rasterizer.blending import (
+    LEAST_LEFT,
+    STRONGEST_ALPHA,
+    WEAKEST,
+    exponent_at,
+    form,
+    offsets,
+    open_tile,
+    tile_place,
+)
+from rewild4d.rasterizer.conventions import MAX_ALPHA
+from rewild4d.rasterizer.projection import LOG_OPACITY, RECORD, XX, XY, YY
 
 MOMENTS = 6
 """Sums of q, q dx, q dy, q dx^2, q dx dy, q dy^2 that come before the channel sums in a slot, q = dL/dalpha alpha."""

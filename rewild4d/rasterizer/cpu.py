@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from rewild4d.kernels.threads import run, spans, thread_count
 from rewild4d.rasterizer.binning import (
     BLOCK_LEFT,
     BLOCK_TOP,
@@ -25,7 +26,6 @@ from rewild4d.rasterizer.blending import blend
 from rewild4d.rasterizer.blending_backward import blend_backward, gather_slots, slot_width
 from rewild4d.rasterizer.conventions import RasterInfo
 from rewild4d.rasterizer.projection import CHUNK, RECORD, project, project_backward
-from rewild4d.rasterizer.threads import run, spans, thread_count
 
 SERIAL_BELOW = 512
 """Gaussians for which waking a second thread costs more than it saves."""

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from rewild4d.rasterizer.compiling import kernel
+from rewild4d.kernels.compiling import kernel
 from rewild4d.rasterizer.conventions import FRUSTUM_MARGIN, MIN_ALPHA, MIN_COMPENSATION
 
 # Columns of a record.

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -10,26 +11,28 @@ import numba
 from rewild4d.files import cache_folder
 
 
-def _source_digest() -> str:
+@cache
+def _sources_digest(folder: Path) -> str:
     # numba looks at the time stamp of one function's own file; helpers and constants live in others.
     sha = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in (*sorted(Path(__file__).parent.glob("*.py")), *sorted(folder.glob("*.py"))):
         sha.update(path.read_bytes())
     return sha.hexdigest()[:16]
 
 
 _config: Any = numba.config
-_CACHE = Path(_config.CACHE_DIR or cache_folder() / "kernels") / _source_digest()
+_CACHE = Path(_config.CACHE_DIR or cache_folder() / "kernels")
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function on its first call, without the GIL, and keep the machine code in the cache folder.
 
-    Where no cache folder can be written the kernel is compiled anew in every process.
+    It may call kernels of its own folder and of this one. Where no cache folder can be written it is compiled anew in
+    every process.
     """
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
     before = _config.CACHE_DIR
-    _config.CACHE_DIR = str(_CACHE)
+    _config.CACHE_DIR = str(_CACHE / _sources_digest(Path(function.__code__.co_filename).parent))
     try:
         return numba.njit(cache=True, **options)(function)
     except (RuntimeError, OSError):
