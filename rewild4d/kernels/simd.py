@@ -161,7 +161,8 @@ def store_block(typing: Any, array: Any, index: Any, stride: Any, value: Any) ->
     return signature(types.void, array, types.intp, types.intp, lanes_type), generate
 
 
-def _call(builder: Any, name: str, args: Any, result: Any = _VECTOR) -> Any:
+def llvm_call(builder: Any, name: str, args: Any, result: Any = _VECTOR) -> Any:
+    """A call of one of LLVM's own functions, while code is generated."""
     function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(result, [arg.type for arg in args]), name)
     return builder.call(function, args)
 
@@ -171,7 +172,7 @@ def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
     """Compute a * b + c, rounded once."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _call(builder, "llvm.fma.v16f32", args)
+        return llvm_call(builder, "llvm.fma.v16f32", args)
 
     return signature(lanes_type, lanes_type, lanes_type, lanes_type), generate
 
@@ -244,7 +245,7 @@ def exp2(typing: Any, x: Any) -> Any:
         fraction = builder.fsub(args[0], builder.fsub(shifted, magic))
         value = _constant(coefficients[0])
         for coefficient in coefficients[1:]:
-            value = _call(builder, "llvm.fma.v16f32", [value, fraction, _constant(coefficient)])
+            value = llvm_call(builder, "llvm.fma.v16f32", [value, fraction, _constant(coefficient)])
         exponent = builder.shl(builder.bitcast(shifted, _INTEGERS), ir.Constant(_INTEGERS, [23] * LANES))
         return builder.bitcast(builder.add(builder.bitcast(value, _INTEGERS), exponent), _VECTOR)
 

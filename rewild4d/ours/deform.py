@@ -6,6 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from rewild4d.ours.config import Deform as DeformConfig
+from rewild4d.ours.fused.deformation import Reach, deform
+from rewild4d.ours.fused.layers import layout, padded
 from rewild4d.ours.pose import seed_linears
 from rewild4d.transforms import quat_multiply
 from rewild4d.types import OBJECT_DIAGONAL
@@ -50,6 +52,8 @@ class DeformNetwork(nn.Module):
         Returns:
             Deformed Gaussians.
         """
+        if posed.means.dtype == torch.float32 and posed.means.device.type == "cpu" and parts.shape[1] <= 16:
+            return Posed(*self._fused(features, parts, posed, strength))
         query = torch.cat((parts, self._place(posed)), dim=-1)
         hidden = self._attend(query, features) + self.skip(query)
         hidden = hidden + self.down(torch.relu(self.up(torch.relu(hidden))))
@@ -72,13 +76,43 @@ class DeformNetwork(nn.Module):
 
     def _attend(self, query: Tensor, features: Tensor) -> Tensor:
         """Multi-head cross-attention over the parts, [n, inputs] and [J, K] -> [n, width]."""
+        asked, asked_bias, mixed = self._attention(features)
+        shares = torch.addmm(asked_bias, query, asked.T).view(len(query), self.config.heads, -1).softmax(dim=-1)
+        return torch.addmm(self.project.bias, shares.flatten(1), mixed.T)
+
+    def _attention(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The attention over the parts as matrices: scores from a query [H J, inputs], their bias [H J], and the hidden
+        features from the shares [width, H J]; from [J, K]."""
         heads, width = self.config.heads, self.config.width
         size = width // heads
-        key = self.key(features).view(-1, heads, size).permute(1, 2, 0)
-        value = self.value(features).view(-1, heads, size).transpose(0, 1)
-        ask = self.query.weight.view(heads, size, -1)
-        scores_matrix = torch.einsum("hsi,hsj->ihj", ask, key).flatten(1)
-        scores_bias = torch.einsum("hs,hsj->hj", self.query.bias.view(heads, size), key).flatten()
-        scores = torch.addmm(scores_bias, query, scores_matrix).view(len(query), heads, -1) * size**-0.5
-        mixed = torch.einsum("hjs,whs->hjw", value, self.project.weight.view(width, heads, size)).flatten(0, 1)
-        return torch.addmm(self.project.bias, scores.softmax(dim=-1).flatten(1), mixed)
+        key = self.key(features).view(-1, heads, size)
+        value = self.value(features).view(-1, heads, size)
+        asked = torch.einsum("jhs,hsi->hji", key, self.query.weight.view(heads, size, -1)).flatten(0, 1)
+        bias = torch.einsum("jhs,hs->hj", key, self.query.bias.view(heads, size)).flatten()
+        mixed = torch.einsum("jhs,whs->whj", value, self.project.weight.view(width, heads, size)).flatten(1)
+        return asked * size**-0.5, bias * size**-0.5, mixed
+
+    def _fused(self, features: Tensor, parts: Tensor, posed: Posed, strength: float) -> tuple[Tensor, Tensor, Tensor]:
+        asked, asked_bias, mixed = self._attention(features)
+        sizes = layout(self.inputs, len(asked), self.config.width, self.config.heads)
+        pairs = (
+            (asked, asked_bias),
+            (self.skip.weight, self.skip.bias + self.project.bias),
+            (mixed, None),
+            (self.up.weight, self.up.bias),
+            (self.down.weight, self.down.bias),
+            (self.out.weight, self.out.bias),
+        )
+        flat = torch.cat([piece for matrix, bias in pairs for piece in _padded(matrix, bias)])
+        place = 2 / OBJECT_DIAGONAL
+        config = self.config
+        reach = Reach(place, config.frequencies, parts.shape[1], float(strength), config.reach, config.max_log_scale)
+        return deform(flat, sizes, reach, parts, *posed)
+
+
+def _padded(matrix: Tensor, bias: Tensor | None) -> tuple[Tensor, Tensor]:
+    """A matrix and the bias behind it as `layers.Layout` has them, flat."""
+    rows, columns = matrix.shape
+    more = padded(rows) - rows
+    wide = nn.functional.pad(matrix, (0, padded(columns) - columns, 0, more))
+    return wide.flatten(), matrix.new_zeros(padded(rows)) if bias is None else nn.functional.pad(bias, (0, more))

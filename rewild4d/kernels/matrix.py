@@ -1,0 +1,167 @@
+"""Small dense products inside kernels: tiles of 8 rows by up to 48 columns whose sums never leave the registers.
+
+A matrix is a 1D float32 array, the index of its first element and the distances between rows and columns, so one
+routine serves a matrix and its transpose. Rows of the result and of the right factor are multiples of sixteen floats.
+"""
+
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba.core import types
+from numba.core.typing import signature
+
+from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.simd import LANES, intrinsic, llvm_call
+
+ROWS = 8
+"""Rows of a tile; the left factor and the result have a multiple of it."""
+VECTORS = 3
+"""Vectors in a row of a tile: 24 sums, 3 loads and 8 broadcasts a step leave the multiplier as the limit."""
+
+_FLOAT, _WORD = ir.FloatType(), ir.IntType(64)
+_VECTOR = ir.VectorType(_FLOAT, LANES)
+_INTEGERS = ir.VectorType(ir.IntType(32), LANES)
+
+
+def _data(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    return context.make_array(kind)(context, builder, value).data
+
+
+def _vector_at(builder: Any, data: Any, place: Any) -> Any:
+    return builder.bitcast(builder.gep(data, [place]), _VECTOR.as_pointer())
+
+
+def _broadcast(builder: Any, number: Any) -> Any:
+    one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), number, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(one, one, ir.Constant(_INTEGERS, [0] * LANES))
+
+
+def _tile(vectors: int) -> Any:
+    """An intrinsic that adds A B to a tile of C of 8 rows and ``vectors`` vectors."""
+
+    @intrinsic
+    def tile(
+        typing: Any, a: Any, a_first: Any, a_row: Any, a_step: Any, b: Any, b_first: Any, b_row: Any, depth: Any,
+        c: Any, c_first: Any, c_row: Any,
+    ) -> Any:  # fmt: skip
+        def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            left, right, out = (_data(context, builder, sig.args[i], args[i]) for i in (0, 4, 8))
+            a_first, a_row, a_step, b_first, b_row, depth, c_first, c_row = (args[i] for i in (1, 2, 3, 5, 6, 7, 9, 10))
+            row_starts = [builder.add(a_first, builder.mul(a_row, ir.Constant(_WORD, r))) for r in range(ROWS)]
+            places = [
+                _vector_at(
+                    builder,
+                    out,
+                    builder.add(c_first, builder.add(builder.mul(c_row, _word(r)), _word(v * LANES))),
+                )
+                for r in range(ROWS)
+                for v in range(vectors)
+            ]
+            start = [builder.load(place, align=4) for place in places]
+            before = builder.block
+            loop, after = builder.append_basic_block("step"), builder.append_basic_block("done")
+            builder.cbranch(builder.icmp_signed(">", depth, _word(0)), loop, after)
+            builder.position_at_end(loop)
+            step = builder.phi(_WORD)
+            step.add_incoming(_word(0), before)
+            sums = [builder.phi(_VECTOR) for _ in places]
+            for total, first in zip(sums, start, strict=True):
+                total.add_incoming(first, before)
+            line = builder.add(b_first, builder.mul(step, b_row))
+            columns = [
+                builder.load(_vector_at(builder, right, builder.add(line, _word(v * LANES))), align=4)
+                for v in range(vectors)
+            ]
+            along = builder.mul(step, a_step)
+            new = []
+            for r in range(ROWS):
+                factor = _broadcast(builder, builder.load(builder.gep(left, [builder.add(row_starts[r], along)])))
+                new += [
+                    llvm_call(builder, "llvm.fma.v16f32", [factor, columns[v], sums[r * vectors + v]])
+                    for v in range(vectors)
+                ]
+            following = builder.add(step, _word(1))
+            step.add_incoming(following, loop)
+            for total, value in zip(sums, new, strict=True):
+                total.add_incoming(value, loop)
+            builder.cbranch(builder.icmp_signed("<", following, depth), loop, after)
+            builder.position_at_end(after)
+            results = [builder.phi(_VECTOR) for _ in places]
+            for result, value, first in zip(results, new, start, strict=True):
+                result.add_incoming(value, loop)
+                result.add_incoming(first, before)
+            for place, result in zip(places, results, strict=True):
+                builder.store(result, place, align=4)
+            return context.get_dummy_value()
+
+        integer = types.intp
+        return signature(
+            types.void, a, integer, integer, integer, b, integer, integer, integer, c, integer, integer
+        ), generate
+
+    return tile
+
+
+def _word(value: int) -> Any:
+    return ir.Constant(_WORD, value)
+
+
+_tile1, _tile2, _tile3 = _tile(1), _tile(2), _tile(3)
+
+
+@kernel
+def add_product(
+    a: np.ndarray, a_first: int, a_row: int, a_step: int, b: np.ndarray, b_first: int, b_row: int, depth: int,
+    c: np.ndarray, c_first: int, c_row: int, rows: int, columns: int,
+) -> None:  # fmt: skip
+    """C += A B.
+
+    Args:
+        a: holds A [rows, depth] at a_first, its rows a_row apart and its columns a_step.
+        b: holds B [depth, columns] at b_first, its rows b_row apart.
+        c: holds C [rows, columns] at c_first, its rows c_row apart.
+        rows: a multiple of 8.
+        columns: a multiple of 16.
+    """
+    for column in range(0, columns, VECTORS * LANES):
+        left = columns - column
+        for row in range(0, rows, ROWS):
+            place = c_first + row * c_row + column
+            if left >= 3 * LANES:
+                _tile3(a, a_first + row * a_row, a_row, a_step, b, b_first + column, b_row, depth, c, place, c_row)
+            elif left >= 2 * LANES:
+                _tile2(a, a_first + row * a_row, a_row, a_step, b, b_first + column, b_row, depth, c, place, c_row)
+            else:
+                _tile1(a, a_first + row * a_row, a_row, a_step, b, b_first + column, b_row, depth, c, place, c_row)
+
+
+@intrinsic
+def transpose_tile(typing: Any, source: Any, first: Any, row: Any, target: Any, place: Any, step: Any) -> Any:
+    """Write the transpose of the 16 x 16 tile of ``source`` at ``first`` (rows ``row`` apart) to ``target``."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        given, made = _data(context, builder, sig.args[0], args[0]), _data(context, builder, sig.args[3], args[3])
+        lines = [
+            builder.load(_vector_at(builder, given, builder.add(args[1], builder.mul(args[2], _word(i)))), align=4)
+            for i in range(LANES)
+        ]
+        # Stage s exchanges bit s of the row number with bit s of the lane number.
+        for bit in (1, 2, 4, 8):
+            low = [lane if not lane & bit else LANES + (lane ^ bit) for lane in range(LANES)]
+            high = [lane | bit if not lane & bit else LANES + lane for lane in range(LANES)]
+            swapped = list(lines)
+            for i in range(LANES):
+                if not i & bit:
+                    pair = lines[i], lines[i | bit]
+                    swapped[i] = builder.shuffle_vector(*pair, ir.Constant(_INTEGERS, low))
+                    swapped[i | bit] = builder.shuffle_vector(*pair, ir.Constant(_INTEGERS, high))
+            lines = swapped
+        for i, line in enumerate(lines):
+            builder.store(
+                line, _vector_at(builder, made, builder.add(args[4], builder.mul(args[5], _word(i)))), align=4
+            )
+        return context.get_dummy_value()
+
+    integer = types.intp
+    return signature(types.void, source, integer, integer, target, integer, integer), generate
