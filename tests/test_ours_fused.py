@@ -8,12 +8,15 @@ from torch import Tensor
 
 from rewild4d.ours.config import Deform
 from rewild4d.ours.deform import DeformNetwork, Posed
+from rewild4d.ours.losses import colour_losses, silhouette_loss, union_window
+from rewild4d.ours.symmetry import Target
+from rewild4d.types import Camera
 
 Make = Callable[[torch.dtype], tuple[list[Tensor], dict[str, Tensor]]]
 
 
 def normal(*shape: int, seed: int) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def unit(*shape: int, seed: int) -> Tensor:
@@ -89,3 +92,30 @@ def test_deformation_is_the_same_bits_for_any_number_of_threads() -> None:
         torch.set_num_threads(before)
     for other in found[1:]:
         assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+
+
+def matte(height: int, width: int, center: tuple[float, float], radius: float) -> Tensor:
+    """A soft disc, exactly 0 far outside and 0.99 inside, [1, h, w]."""
+    rows, columns = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    distance = ((rows - center[0]).square() + (columns - center[1]).square()).sqrt()
+    return (0.5 + (radius - distance) / 6).clamp(0, 0.99)[None]
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "center", "radius"),
+    [(70, 90, (33.0, 47.0), 14.0), (40, 35, (3.0, 30.0), 12.0), (30, 17, (15.0, 8.0), 40.0)],
+)
+def test_image_losses(height: int, width: int, center: tuple[float, float], radius: float) -> None:
+    def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
+        mask = matte(height, width, center, radius)
+        alpha = matte(height, width, (center[0] + 2, center[1] - 3), 0.9 * radius)
+        colours = [torch.rand(3, height, width, generator=torch.Generator().manual_seed(i)).double() for i in (1, 2)]
+        camera = Camera(torch.eye(4), torch.eye(3), width, height)
+        target = Target((colours[0] * mask).to(dtype), mask.to(dtype), camera, 1.3 * radius)
+        given = leaves(dtype, rgb=colours[1] * alpha, alpha=alpha)
+        window = union_window([given["alpha"], target.mask], 10)
+        background = torch.tensor((0.2, 0.9, 0.5), dtype=dtype)
+        losses = [*colour_losses(given["rgb"], given["alpha"], target, background, window)]
+        return [*losses, silhouette_loss(given["alpha"], target, window)], given
+
+    check_twins(make)

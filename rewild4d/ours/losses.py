@@ -10,6 +10,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
+from rewild4d.ours.fused.images import colour_sums, matte_loss
 from rewild4d.ours.symmetry import Target
 
 WINDOW, SIGMA = 11, 1.5
@@ -39,6 +40,8 @@ def union_window(alphas: list[Tensor], margin: int) -> Window:
 
 def silhouette_loss(alpha: Tensor, target: Target, window: Window) -> Tensor:
     """BCE + Dice of a rendered matte, alpha [1, h, w] clamped at 1e-5, Dice smoothing 1; scalar."""
+    if _fits(alpha):
+        return matte_loss(alpha, target.mask, _corner_and_size(window), target.side**2)
     rendered, truth = alpha[:, *window], target.mask[:, *window]
     inside = rendered.clamp(1e-5, 1 - 1e-5)
     bce = -(truth * inside.log() + (1 - truth) * (1 - inside).log()).sum() / target.side**2
@@ -61,11 +64,26 @@ def colour_losses(
     Returns:
         Two scalars.
     """
+    area = 3 * target.side**2
+    inner = _inner(window, alpha)
+    if _fits(rgb):
+        bounds = (inner[0].start, inner[0].stop, inner[1].start, inner[1].stop)
+        sums = colour_sums(rgb, alpha, target.rgb, target.mask, background, _corner_and_size(window), bounds)
+        return sums[0] / area, sums[1] / area
     behind = background[:, None, None]
     x = rgb[:, *window] + (1 - alpha[:, *window]) * behind
     y = target.rgb[:, *window] + (1 - target.mask[:, *window]) * behind
-    area = 3 * target.side**2
-    return (x - y).abs().sum() / area, (1 - ssim_map(x, y)[:, *_inner(window, alpha)]).sum() / area
+    return (x - y).abs().sum() / area, (1 - ssim_map(x, y)[:, *inner]).sum() / area
+
+
+def _fits(image: Tensor) -> bool:
+    """Whether the fused kernels take it."""
+    return image.dtype == torch.float32 and image.device.type == "cpu"
+
+
+def _corner_and_size(window: Window) -> tuple[int, int, int, int]:
+    rows, columns = window
+    return rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start
 
 
 def _inner(window: Window, alpha: Tensor) -> Window:
@@ -86,22 +104,21 @@ def ssim_map(x: Tensor, y: Tensor) -> Tensor:
     """
     channels, height, width = x.shape
     stacked = torch.cat((x, y, x * x, y * y, x * y))
-    blurred = (
-        blur_matrix(height, SIGMA, WINDOW // 2, x.device) @ stacked @ blur_matrix(width, SIGMA, WINDOW // 2, x.device).T
-    )
+    down, across = (blur_matrix(size, SIGMA, WINDOW // 2, x.device, x.dtype) for size in (height, width))
+    blurred = down @ stacked @ across.T
     mean_x, mean_y, xx, yy, xy = blurred.split(channels)
     product, squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
     return ((2 * product + C1) * (2 * (xy - product) + C2)) / ((squares + C1) * (xx + yy - squares + C2))
 
 
 @cache
-def blur_matrix(size: int, sigma: float, radius: int, device: torch.device) -> Tensor:
+def blur_matrix(size: int, sigma: float, radius: int, device: torch.device, dtype: torch.dtype) -> Tensor:
     """Banded matrix that convolves a column of pixels with a normalised Gaussian, zero padding, [size, size]."""
     place = torch.arange(size, dtype=torch.float64)
     offset = place[:, None] - place
     kernel = torch.exp(-(torch.arange(-radius, radius + 1, dtype=torch.float64) ** 2) / (2 * sigma**2)).sum()
     band = torch.exp(-(offset**2) / (2 * sigma**2)) * (offset.abs() <= radius) / kernel
-    return band.float().to(device)
+    return band.to(device, dtype)
 
 
 def blurred(image: Tensor, sigma: float) -> Tensor:
@@ -109,6 +126,6 @@ def blurred(image: Tensor, sigma: float) -> Tensor:
     if sigma < 0.3:
         return image
     radius = math.ceil(3 * sigma)
-    rows = blur_matrix(image.shape[0], sigma, radius, image.device)
-    columns = blur_matrix(image.shape[1], sigma, radius, image.device)
+    rows = blur_matrix(image.shape[0], sigma, radius, image.device, image.dtype)
+    columns = blur_matrix(image.shape[1], sigma, radius, image.device, image.dtype)
     return rows @ image @ columns.T
