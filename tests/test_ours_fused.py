@@ -6,10 +6,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from rewild4d.ours.config import Deform
+from rewild4d.ours.canonical import Gaussians
+from rewild4d.ours.config import Config, Deform, Skinning
 from rewild4d.ours.deform import DeformNetwork, Posed
+from rewild4d.ours.fused.skinning import skin_both
 from rewild4d.ours.losses import colour_losses, silhouette_loss, union_window
+from rewild4d.ours.model import Model
+from rewild4d.ours.pose import joint_transforms
+from rewild4d.ours.skinning import SkinningField, build_field
 from rewild4d.ours.symmetry import Target
+from rewild4d.priors.template import MIRROR, PARENTS, quadruped
 from rewild4d.types import Camera
 
 Make = Callable[[torch.dtype], tuple[list[Tensor], dict[str, Tensor]]]
@@ -117,5 +123,79 @@ def test_image_losses(height: int, width: int, center: tuple[float, float], radi
         background = torch.tensor((0.2, 0.9, 0.5), dtype=dtype)
         losses = [*colour_losses(given["rgb"], given["alpha"], target, background, window)]
         return [*losses, silhouette_loss(given["alpha"], target, window)], given
+
+    check_twins(make)
+
+
+@pytest.fixture(scope="module")
+def field() -> SkinningField:
+    template = quadruped()
+    return build_field(template.vertices, template.weights, torch.tensor(MIRROR), Skinning(resolution=9, sweeps=1))
+
+
+def test_sampled_skinning_weights(field: SkinningField) -> None:
+    points = 2 * normal(1500, 3, seed=1)  # some lie outside the cube
+
+    def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
+        given = leaves(dtype, table=unit(9**3, 20, seed=2))
+        # The buffers' own precision decides the voxel, so both start from single precision.
+        return [field.to(dtype).sample(given["table"], points.float().to(dtype))], given
+
+    check_twins(make)
+
+
+def test_skinning_of_both_branches() -> None:
+    template, count = quadruped(), 1300
+    quats = unit(20, 4, seed=1)
+    weights = normal(count, 20, seed=3).mul(2).softmax(dim=-1)
+
+    def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
+        values = {
+            "means": normal(count, 3, seed=4),
+            "quats": normal(count, 4, seed=5),
+            "log_scales": normal(count, 3, seed=6) - 4,
+            "logit_opacities": normal(count, seed=7),
+            "colors": normal(count, 1, 3, seed=8),
+        }
+        config = Config(deform=Deform(width=16))
+        generator = torch.Generator().manual_seed(0)
+        grid = SkinningField(torch.zeros(8, 20), torch.zeros(3), torch.ones(3), torch.tensor(MIRROR), False)
+        skeleton = template.bones[:, 0].float(), torch.tensor(PARENTS), torch.tensor(MIRROR)
+        model = Model(config, Gaussians(values, 1.0), grid, *skeleton, generator).to(dtype)
+        for name, value in values.items():
+            getattr(model.gaussians, name).data = value.to(dtype)
+        given = leaves(dtype, quats=quats, shifts=normal(20, 3, seed=2), weights=weights)
+        transforms = joint_transforms(given["quats"], given["shifts"], model.pivots)
+        branches = model.skin(given["weights"], given["quats"], transforms)
+        own = {name: getattr(model.gaussians, name) for name in ("means", "quats", "log_scales")}
+        return [tensor for branch in branches for tensor in branch], given | {f"own {k}": v for k, v in own.items()}
+
+    check_twins(make)
+
+
+def test_the_second_branch_does_not_reach_the_joints() -> None:
+    given = leaves(torch.float32, means=normal(50, 3, seed=1), quats=unit(50, 4, seed=2))
+    joints = leaves(torch.float32, transforms=normal(20, 4, 4, seed=3), quats=unit(20, 4, seed=4))
+    weights = normal(50, 20, seed=5).softmax(dim=-1).float()
+    for own, reached in ((slice(0, 2), True), (slice(2, 4), False)):
+        made = skin_both(given["means"], given["quats"], weights, joints["transforms"], joints["quats"])[own]
+        slopes = torch.autograd.grad((made[0].sum() + made[1][:, 1].sum()), [*joints.values(), *given.values()])
+        assert all((slope.abs().max() > 0) == reached for slope in slopes[:2])
+        assert all(slope.abs().max() > 0 for slope in slopes[2:])
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_seen_colours(degree: int) -> None:
+    count = 1100
+
+    def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
+        values = {"means": torch.zeros(count, 3), "log_scales": torch.zeros(count, 3)}
+        values |= {"quats": normal(count, 4, seed=1), "logit_opacities": torch.zeros(count)}
+        values["colors"] = normal(count, 16, 3, seed=2) + 0.5
+        own = Gaussians(values, 1.0).to(dtype)
+        own.colors.data, own.quats.data = values["colors"].to(dtype), values["quats"].to(dtype)
+        means, quats = normal(count, 3, seed=3).to(dtype), unit(count, 4, seed=4).to(dtype)
+        eye = torch.tensor((1.0, -3.0, 7.0), dtype=torch.float64)
+        return [own.seen_rgb(means, quats, eye, degree)], {"colors": own.colors}
 
     check_twins(make)

@@ -8,6 +8,7 @@ from torch.nn.functional import normalize
 
 from rewild4d.harmonics import C0, basis, rotated
 from rewild4d.ours.config import Canonical
+from rewild4d.ours.fused.harmonics import seen_rgb
 from rewild4d.priors.motion import quats_from_normals, sample_surface
 from rewild4d.transforms import quat_multiply, quat_to_matrix
 from rewild4d.types import OBJECT_DIAGONAL, Prior, Splats
@@ -78,6 +79,8 @@ class Gaussians(nn.Module):
         """
         if degree == 0:
             return self.rgb()
+        if means.dtype == torch.float32 and means.device.type == "cpu":
+            return seen_rgb(self.colors, means, quats, self.quats, eye, degree, REST_GAIN)
         directions = normalize(means.detach() - eye.to(means), dim=-1)
         canonical = torch.einsum("na,nab->nb", directions, self.turns(quats.detach()))
         values = basis(canonical, degree)[:, 1:] / REST_GAIN

@@ -30,7 +30,7 @@ def initial_colors(model: Model, supervision: Supervision) -> Tensor:
     for frame in range(supervision.frames):
         key = Key(1, 1, frame)
         pose = model.pose(torch.tensor([(frame + 1) / supervision.frames]), [key])
-        posed = model.skin(weights, pose.quats[0], model.transforms(pose)[0])
+        posed = model.skin(weights, pose.quats[0], model.transforms(pose)[0])[1]
         colours, seen = project_colors(posed.means, quat_to_matrix(posed.quats)[..., 2], supervision.target(key))
         total, count = total + colours * seen[:, None], count + seen[:, None]
     known = count[:, 0] > 0

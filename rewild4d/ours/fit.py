@@ -106,12 +106,12 @@ class Training:
         opacities = model.gaussians.opacities()
 
         transforms = model.transforms(poses)
-        live = model.skin(weights, pose.quats[0], transforms[own[0]])
+        live, posed = model.skin(weights, pose.quats[0], transforms[own[0]])
         _, pose_alpha, _ = self._render(
             live, opacities.detach(), opacities.new_zeros(len(opacities), 1), target, detach_scales=True
         )
         strength = ramp(progress, config.deform.ramp_start, config.deform.ramp_end)
-        posed, deformed = model.deformed(pose, weights, strength)
+        deformed = model.deformed(pose, weights, posed, strength)
         degree = min(config.canonical.sh_degree, int(progress / config.canonical.sh_every))
         colors = model.gaussians.seen_rgb(deformed.means, deformed.quats, target.camera.center, degree)
         rgb, alpha, info = self._render(deformed, opacities, colors, target)

@@ -6,6 +6,7 @@ from torch import Tensor, nn
 from rewild4d.ours.canonical import Gaussians, initial_gaussians
 from rewild4d.ours.config import Config
 from rewild4d.ours.deform import DeformNetwork, Posed
+from rewild4d.ours.fused.skinning import skin_both
 from rewild4d.ours.pose import Pose, PoseNetwork, joint_transforms, time_code
 from rewild4d.ours.skinning import SkinningField, build_field
 from rewild4d.ours.symmetry import Key
@@ -66,35 +67,45 @@ class Model(nn.Module):
         """Rest -> posed transforms of a batch of poses, [B, J, 4, 4]."""
         return joint_transforms(pose.quats, pose.shifts, self.pivots)
 
-    def skin(self, weights: Tensor, quats: Tensor, transforms: Tensor) -> Posed:
-        """Blended skinning of the canonical Gaussians.
+    def skin(self, weights: Tensor, quats: Tensor, transforms: Tensor) -> tuple[Posed, Posed]:
+        """Blended skinning of the canonical Gaussians, for the pose branch and for the appearance branch.
+
+        Both have the same values; gradients of the second do not reach the joints.
 
         Args:
             weights: of each Gaussian, [n, J].
             quats: rotation of each joint, [J, 4].
             transforms: rest -> posed, [J, 4, 4].
         """
-        own = self.gaussians
+        own, log_scales = self.gaussians, self.gaussians.scales_log()
+        if own.means.dtype == torch.float32 and own.means.device.type == "cpu":
+            live_means, live_quats, means, turned = skin_both(own.means, own.quats, weights, transforms, quats)
+            return Posed(live_means, live_quats, log_scales), Posed(means, turned, log_scales)
         rest = nn.functional.normalize(own.quats, dim=-1)
-        return Posed(skin_points(own.means, weights, transforms), skin_quats(rest, weights, quats), own.scales_log())
+        live, still = (
+            Posed(skin_points(own.means, weights, matrices), skin_quats(rest, weights, turns), log_scales)
+            for matrices, turns in ((transforms, quats), (transforms.detach(), quats.detach()))
+        )
+        return live, still
 
-    def deformed(self, pose: Pose, weights: Tensor, strength: float) -> tuple[Posed, Posed]:
-        """The appearance branch: skinned by a detached pose, then deformed.
+    def deformed(self, pose: Pose, weights: Tensor, posed: Posed, strength: float) -> Posed:
+        """Skinned Gaussians after the deformation network.
 
         Args:
-            pose: of one code.
+            pose: of one code; its features steer the network.
             weights: of each Gaussian, [n, J].
+            posed: skinned Gaussians of the appearance branch.
             strength: of the deformation, in [0, 1].
-
-        Returns:
-            Skinned and deformed Gaussians.
         """
-        quats, shifts = pose.quats[0].detach(), pose.shifts[0].detach()
-        posed = self.skin(weights, quats, joint_transforms(quats, shifts, self.pivots))
         if strength == 0 or not self.config.deform.enabled:
-            return posed, posed
+            return posed
         features = pose.features[0].detach() if self.config.deform.detach_features else pose.features[0]
-        return posed, self.deform(features, weights.detach() @ self.network.anchors, posed, strength)
+        return self.deform(features, weights.detach() @ self.network.anchors, posed, strength)
+
+    def moved(self, pose: Pose, weights: Tensor, strength: float) -> tuple[Posed, Posed]:
+        """Skinned Gaussians, and the same deformed, of the appearance branch at a pose of one code."""
+        posed = self.skin(weights, pose.quats[0], self.transforms(pose)[0])[1]
+        return posed, self.deformed(pose, weights, posed, strength)
 
 
 def build_model(config: Config, prior: Prior, generator: torch.Generator) -> Model:

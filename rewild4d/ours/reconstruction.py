@@ -48,7 +48,7 @@ class OursReconstruction:
         position = frame_position(self.times, time)
         pose = self._pose(torch.tensor([position]))
         strength = ramp(1.0, self.config.deform.ramp_start, self.config.deform.ramp_end)
-        _, moved = self.model.deformed(pose, self.weights, strength)
+        _, moved = self.model.moved(pose, self.weights, strength)
         own = self.model.gaussians
         quats = nn.functional.normalize(moved.quats, dim=-1)
         posed = Splats(moved.means, quats, own.scales(moved.log_scales), own.opacities(), own.rgb()[:, None])

@@ -6,6 +6,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from rewild4d.ours.config import Skinning
+from rewild4d.ours.fused.skinning import sample_grid
 
 
 class SkinningField(nn.Module):
@@ -50,6 +51,8 @@ class SkinningField(nn.Module):
         Returns:
             Rows on the simplex, [n, J].
         """
+        if probabilities.dtype == torch.float32 and probabilities.device.type == "cpu":
+            return sample_grid(probabilities, points, self.origin, self.pitch, self.resolution)
         last = self.resolution - 1
         place = ((points.detach() - self.origin) / self.pitch).clamp(0, last)
         base = place.floor().clamp(max=last - 1)

@@ -1,0 +1,150 @@
+"""Colour of every Gaussian from one viewpoint, its direction turned back into the canonical frame first.
+
+The twin in plain torch is `Gaussians.seen_rgb` (ours/canonical.py).
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from rewild4d.harmonics import C1, C2, C3
+from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.simd import take_ticket
+from rewild4d.kernels.threads import run, thread_count
+
+CHUNK = 1024
+"""Gaussians a unit of work holds."""
+
+
+@kernel
+def _cross(a: tuple, b: tuple) -> tuple:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@kernel
+def _direction(means: np.ndarray, quats: np.ndarray, rest: np.ndarray, n: int, eye: np.ndarray) -> tuple:
+    """Unit direction from the eye to a Gaussian, as the Gaussian saw it at rest."""
+    x, y, z = means[n, 0] - eye[0], means[n, 1] - eye[1], means[n, 2] - eye[2]
+    inverse = 1 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
+    p, s = quats[n], rest[n]
+    # The quaternion rest conj(posed) turns back; it may have any length.
+    w = s[0] * p[0] + s[1] * p[1] + s[2] * p[2] + s[3] * p[3]
+    axis = (
+        -s[0] * p[1] + s[1] * p[0] - s[2] * p[3] + s[3] * p[2],
+        -s[0] * p[2] + s[1] * p[3] + s[2] * p[0] - s[3] * p[1],
+        -s[0] * p[3] - s[1] * p[2] + s[2] * p[1] + s[3] * p[0],
+    )
+    scale = 2 / max(w * w + axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2], 1e-24)
+    once = _cross(axis, (x, y, z))
+    twice = _cross(axis, once)
+    return (
+        (x + scale * (w * once[0] + twice[0])) * inverse,
+        (y + scale * (w * once[1] + twice[1])) * inverse,
+        (z + scale * (w * once[2] + twice[2])) * inverse,
+    )
+
+
+@kernel
+def _basis(direction: tuple, degree: int, values: np.ndarray) -> None:
+    """Values of the basis functions above degree 0."""
+    x, y, z = direction
+    values[0], values[1], values[2] = -C1 * y, C1 * z, -C1 * x
+    if degree > 1:
+        xx, yy, zz = x * x, y * y, z * z
+        values[3], values[4] = C2[0] * x * y, C2[1] * y * z
+        values[5], values[6] = C2[2] * (2 * zz - xx - yy), C2[3] * x * z
+        values[7] = C2[4] * (xx - yy)
+        if degree > 2:
+            values[8], values[9] = C3[0] * y * (3 * xx - yy), C3[1] * x * y * z
+            values[10], values[11] = C3[2] * y * (4 * zz - xx - yy), C3[3] * z * (2 * zz - 3 * xx - 3 * yy)
+            values[12], values[13] = C3[4] * x * (4 * zz - xx - yy), C3[5] * z * (xx - yy)
+            values[14] = C3[6] * x * (xx - 3 * yy)
+
+
+@kernel
+def _forward(
+    tickets: np.ndarray, colors: np.ndarray, means: np.ndarray, quats: np.ndarray, rest: np.ndarray, eye: np.ndarray,
+    degree: int, gain: float, seen: np.ndarray,
+) -> None:  # fmt: skip
+    values = np.empty(15, np.float32)
+    count = (degree + 1) ** 2 - 1
+    while True:
+        begin = take_ticket(tickets) * CHUNK
+        if begin >= len(means):
+            return
+        for n in range(begin, min(begin + CHUNK, len(means))):
+            _basis(_direction(means, quats, rest, n, eye), degree, values)
+            for channel in range(3):
+                total = np.float32(0)
+                for k in range(count):
+                    total += values[k] * colors[n, k + 1, channel]
+                seen[n, channel] = max(colors[n, 0, channel] + total / np.float32(gain), np.float32(0))
+
+
+@kernel
+def _backward(
+    tickets: np.ndarray, means: np.ndarray, quats: np.ndarray, rest: np.ndarray, eye: np.ndarray, degree: int,
+    gain: float, seen: np.ndarray, slope: np.ndarray, on_colors: np.ndarray,
+) -> None:  # fmt: skip
+    values = np.empty(15, np.float32)
+    count = (degree + 1) ** 2 - 1
+    while True:
+        begin = take_ticket(tickets) * CHUNK
+        if begin >= len(means):
+            return
+        for n in range(begin, min(begin + CHUNK, len(means))):
+            _basis(_direction(means, quats, rest, n, eye), degree, values)
+            on_colors[n] = 0
+            for channel in range(3):
+                if seen[n, channel] > 0:
+                    on_colors[n, 0, channel] = slope[n, channel]
+                    for k in range(count):
+                        on_colors[n, k + 1, channel] = values[k] * slope[n, channel] / np.float32(gain)
+
+
+def seen_rgb(
+    colors: Tensor, means: Tensor, quats: Tensor, rest: Tensor, eye: Tensor, degree: int, gain: float
+) -> Tensor:
+    """Colours from a viewpoint; float32, CPU. Gradients reach the colours alone.
+
+    Args:
+        colors: RGB, then ``gain`` times the coefficients above degree 0, [n, k, 3].
+        means: posed, [n, 3].
+        quats: posed, any length, [n, 4].
+        rest: canonical, any length, [n, 4].
+        eye: [3].
+        degree: in use, 1 to 3.
+        gain: of the coefficients.
+
+    Returns:
+        Not below 0, [n, 3].
+    """
+    return _Seen.apply(colors, means, quats, rest, eye, degree, gain)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().float().contiguous().numpy()
+
+
+class _Seen(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, colors: Tensor, means: Tensor, quats: Tensor, rest: Tensor, eye: Tensor, degree: int, gain: float
+    ) -> Tensor:
+        seen = torch.empty_like(means)
+        given = *map(_array, (means, quats, rest, eye)), degree, gain
+        run(_forward, [(np.zeros(1, np.int64), _array(colors), *given, seen.numpy())] * thread_count())
+        ctx.given, ctx.seen, ctx.shape = given, seen.numpy(), colors.shape
+        return seen
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+        on_colors = torch.empty(ctx.shape)
+        call = np.zeros(1, np.int64), *ctx.given, ctx.seen, _array(slope), on_colors.numpy()
+        run(_backward, [call] * thread_count())
+        return on_colors, None, None, None, None, None, None

@@ -1,0 +1,325 @@
+"""Blended skinning for both branches at once: one forward pass, and one backward pass that keeps their gradients apart.
+
+The twin in plain torch is `transforms.skin_points` and `skin_quats`, called once for each branch.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
+from rewild4d.kernels.threads import run, thread_count
+
+CHUNK = 1024
+"""Gaussians a unit of work holds; gradients of the joints are summed over these, whatever the number of threads."""
+
+
+@kernel
+def _leader(weights: np.ndarray, n: int) -> int:
+    """The joint of the largest weight, the first of equals."""
+    best = 0
+    for joint in range(1, weights.shape[1]):
+        if weights[n, joint] > weights[n, best]:
+            best = joint
+    return best
+
+
+@kernel
+def _unit(quats: np.ndarray, n: int) -> tuple:
+    """A quaternion of length one, and one over its length before."""
+    a, b, c, d = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
+    inverse = np.float32(1 / max(math.sqrt(a * a + b * b + c * c + d * d), 1e-12))
+    return a * inverse, b * inverse, c * inverse, d * inverse, inverse
+
+
+@kernel
+def _times(p: tuple, q: tuple) -> tuple:
+    return (
+        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
+    )
+
+
+@kernel
+def _conjugate(q: tuple) -> tuple:
+    return q[0], -q[1], -q[2], -q[3]
+
+
+@kernel
+def _unit_slope(unit: tuple, slope: tuple) -> tuple:
+    """Gradient of a quaternion from that of its unit quaternion, given with one over the length."""
+    inverse = unit[4]
+    along = unit[0] * slope[0] + unit[1] * slope[1] + unit[2] * slope[2] + unit[3] * slope[3]
+    return (
+        (slope[0] - along * unit[0]) * inverse, (slope[1] - along * unit[1]) * inverse,
+        (slope[2] - along * unit[2]) * inverse, (slope[3] - along * unit[3]) * inverse,
+    )  # fmt: skip
+
+
+@kernel
+def _blend(weights: np.ndarray, n: int, leader: int, rows: np.ndarray, blended: np.ndarray) -> None:
+    """The weighted sum of the joints' rows, with the signs that suit the leader."""
+    joints = weights.shape[1]
+    total = splat(np.float32(0))
+    for joint in range(joints):
+        total = fma(splat(weights[n, joint]), load(rows, (leader * joints + joint) * LANES), total)
+    store(blended, 0, total)
+
+
+@kernel
+def _forward(
+    tickets: np.ndarray, means: np.ndarray, quats: np.ndarray, weights: np.ndarray, rows: np.ndarray,
+    new_means: np.ndarray, new_quats: np.ndarray,
+) -> None:  # fmt: skip
+    blended = np.empty(LANES, np.float32)
+    while True:
+        begin = take_ticket(tickets) * CHUNK
+        if begin >= len(means):
+            return
+        for n in range(begin, min(begin + CHUNK, len(means))):
+            _blend(weights, n, _leader(weights, n), rows, blended)
+            x, y, z = means[n, 0], means[n, 1], means[n, 2]
+            for i in range(3):
+                new_means[n, i] = (
+                    blended[4 * i] * x + blended[4 * i + 1] * y + blended[4 * i + 2] * z + blended[4 * i + 3]
+                )
+            w, i, j, k, _ = _unit(blended[12:].reshape(1, 4), 0)
+            a, b, c, d, _ = _unit(quats, n)
+            turned = _times((w, i, j, k), (a, b, c, d))
+            for i in range(4):
+                new_quats[n, i] = turned[i]
+
+
+@kernel
+def _backward(
+    tickets: np.ndarray, means: np.ndarray, quats: np.ndarray, weights: np.ndarray, rows: np.ndarray,
+    signs: np.ndarray, g_live: np.ndarray, g_live_quats: np.ndarray, g_still: np.ndarray, g_still_quats: np.ndarray,
+    on_means: np.ndarray, on_quats: np.ndarray, on_weights: np.ndarray, on_rows: np.ndarray,
+) -> None:  # fmt: skip
+    """Set the gradients; on_rows [chunks, J x 16] gets the live branch's alone."""
+    joints = weights.shape[1]
+    blended, slope, live = np.empty(LANES, np.float32), np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    products = np.empty(LANES, np.float32)
+    while True:
+        chunk = take_ticket(tickets)
+        if chunk * CHUNK >= len(means):
+            return
+        mine = on_rows[chunk]
+        for n in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(means))):
+            leader = _leader(weights, n)
+            _blend(weights, n, leader, rows, blended)
+            turn, rest = _unit(blended[12:].reshape(1, 4), 0), _unit(quats, n)
+            g = g_live_quats[n, 0], g_live_quats[n, 1], g_live_quats[n, 2], g_live_quats[n, 3]
+            on_live = _unit_slope(turn, _times(g, _conjugate(rest)))
+            both = (
+                g[0] + g_still_quats[n, 0], g[1] + g_still_quats[n, 1],
+                g[2] + g_still_quats[n, 2], g[3] + g_still_quats[n, 3],
+            )  # fmt: skip
+            on_turn = _unit_slope(turn, _times(both, _conjugate(rest)))
+            on_rest = _unit_slope(rest, _times(_conjugate(turn), both))
+            for i in range(4):
+                live[12 + i], slope[12 + i], on_quats[n, i] = on_live[i], on_turn[i], on_rest[i]
+            for i in range(3):
+                on_means[n, i] = 0
+            for i in range(3):
+                one, other = g_live[n, i], g_live[n, i] + g_still[n, i]
+                for j in range(3):
+                    live[4 * i + j], slope[4 * i + j] = one * means[n, j], other * means[n, j]
+                    on_means[n, j] += other * blended[4 * i + j]
+                live[4 * i + 3], slope[4 * i + 3] = one, other
+            by_weight, by_row = load(slope, 0), load(live, 0)
+            for joint in range(joints):
+                pair = (leader * joints + joint) * LANES
+                store(products, 0, by_weight * load(rows, pair))
+                total = np.float32(0)
+                for i in range(LANES):
+                    total += products[i]
+                on_weights[n, joint] = total
+                share = splat(weights[n, joint]) * load(signs, pair)
+                store(mine, joint * LANES, fma(by_row, share, load(mine, joint * LANES)))
+
+
+def _tables(transforms: Tensor, quats: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (twelve of the matrix, four of the rotation) and their signs, for each leader and joint, [J, J, 16]."""
+    joints = len(quats)
+    rows = torch.cat((transforms.detach()[:, :3].reshape(joints, 12), quats.detach()), dim=1)
+    signs = torch.ones(joints, joints, LANES)
+    opposite = quats.detach() @ quats.detach().T < 0
+    signs[..., 12:] = torch.where(opposite, -1.0, 1.0)[..., None]
+    return (signs * rows).numpy().ravel(), signs.numpy().ravel()
+
+
+def skin_both(
+    means: Tensor, quats: Tensor, weights: Tensor, transforms: Tensor, joint_quats: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Skinned positions and orientations, twice the same values; float32, CPU.
+
+    Args:
+        means: rest positions, [n, 3].
+        quats: rest orientations, any length, [n, 4].
+        weights: [n, J].
+        transforms: rest -> posed, [J, 4, 4].
+        joint_quats: their rotations, [J, 4].
+
+    Returns:
+        Means [n, 3] and unit quats [n, 4] whose gradients reach the joints, then two whose gradients do not.
+    """
+    return _Skin.apply(means, quats, weights, transforms, joint_quats)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
+
+
+class _Skin(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, quats: Tensor, weights: Tensor, transforms: Tensor, joint_quats: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        rows, signs = _tables(transforms, joint_quats)
+        new_means, new_quats = torch.empty_like(means), torch.empty_like(quats)
+        given = tuple(map(_array, (means, quats, weights)))
+        call = np.zeros(1, np.int64), *given, rows, new_means.numpy(), new_quats.numpy()
+        run(_forward, [call] * thread_count())
+        ctx.given, ctx.tables = given, (rows, signs)
+        return new_means, new_quats, new_means.clone(), new_quats.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor, ...]:
+        made = tuple(torch.empty(array.shape) for array in ctx.given)
+        joints, chunks = ctx.given[2].shape[1], max(1, -(-len(ctx.given[0]) // CHUNK))
+        on_rows = np.zeros((chunks, joints * LANES), np.float32)
+        call = (
+            np.zeros(1, np.int64), *ctx.given, *ctx.tables, *map(_array, slopes), *(each.numpy() for each in made),
+            on_rows,
+        )  # fmt: skip
+        run(_backward, [call] * thread_count())
+        total = torch.from_numpy(on_rows.sum(axis=0)).view(joints, LANES)
+        on_transforms = torch.zeros(joints, 4, 4)
+        on_transforms[:, :3] = total[:, :12].view(joints, 3, 4)
+        return *made, on_transforms, total[:, 12:].contiguous()
+
+
+@kernel
+def _corner(points: np.ndarray, n: int, axis: int, origin: np.ndarray, pitch: np.ndarray, last: int) -> tuple:
+    """Voxel below a point along one axis, and the share of the one above; outside the cube the border counts."""
+    place = min(max((points[n, axis] - origin[axis]) / pitch[axis], np.float32(0)), np.float32(last))
+    base = min(int(place), last - 1)
+    return base, place - np.float32(base)
+
+
+@kernel
+def _sample_forward(
+    tickets: np.ndarray, table: np.ndarray, points: np.ndarray, origin: np.ndarray, pitch: np.ndarray, size: int,
+    weights: np.ndarray,
+) -> None:  # fmt: skip
+    joints = weights.shape[1]
+    while True:
+        begin = take_ticket(tickets) * CHUNK
+        if begin >= len(points):
+            return
+        for n in range(begin, min(begin + CHUNK, len(points))):
+            x, ahead_x = _corner(points, n, 0, origin, pitch, size - 1)
+            y, ahead_y = _corner(points, n, 1, origin, pitch, size - 1)
+            z, ahead_z = _corner(points, n, 2, origin, pitch, size - 1)
+            weights[n] = 0
+            for i in range(2):
+                for j in range(2):
+                    for k in range(2):
+                        share = (ahead_x if i else 1 - ahead_x) * (ahead_y if j else 1 - ahead_y)
+                        share = np.float32(share * (ahead_z if k else 1 - ahead_z))
+                        row = ((x + i) * size + y + j) * size + z + k
+                        for joint in range(joints):
+                            weights[n, joint] += share * table[row, joint]
+
+
+@kernel
+def _sort_by_plane(
+    points: np.ndarray, origin: np.ndarray, pitch: np.ndarray, size: int, order: np.ndarray, starts: np.ndarray
+) -> None:
+    """Points by the voxel plane below them along x; starts [size + 1]."""
+    starts[:] = 0
+    for n in range(len(points)):
+        starts[_corner(points, n, 0, origin, pitch, size - 1)[0] + 1] += 1
+    for plane in range(size):
+        starts[plane + 1] += starts[plane]
+    cursor = starts.copy()
+    for n in range(len(points)):
+        plane = _corner(points, n, 0, origin, pitch, size - 1)[0]
+        order[cursor[plane]] = n
+        cursor[plane] += 1
+
+
+@kernel
+def _sample_backward(
+    tickets: np.ndarray, points: np.ndarray, origin: np.ndarray, pitch: np.ndarray, size: int, order: np.ndarray,
+    starts: np.ndarray, slope: np.ndarray, on_table: np.ndarray,
+) -> None:  # fmt: skip
+    """Set on_table plane by plane: first from the points below a plane, then from those above it, each in order."""
+    joints = slope.shape[1]
+    while True:
+        plane = take_ticket(tickets)
+        if plane >= size:
+            return
+        on_table[plane * size * size : (plane + 1) * size * size] = 0
+        for upper in (1, 0):
+            if plane < upper:
+                continue
+            for at in range(starts[plane - upper], starts[plane - upper + 1]):
+                n = order[at]
+                ahead_x = _corner(points, n, 0, origin, pitch, size - 1)[1]
+                y, ahead_y = _corner(points, n, 1, origin, pitch, size - 1)
+                z, ahead_z = _corner(points, n, 2, origin, pitch, size - 1)
+                along = ahead_x if upper else 1 - ahead_x
+                for j in range(2):
+                    for k in range(2):
+                        share = along * (ahead_y if j else 1 - ahead_y)
+                        share = np.float32(share * (ahead_z if k else 1 - ahead_z))
+                        row = (plane * size + y + j) * size + z + k
+                        for joint in range(joints):
+                            on_table[row, joint] += share * slope[n, joint]
+
+
+def sample_grid(table: Tensor, points: Tensor, origin: Tensor, pitch: Tensor, size: int) -> Tensor:
+    """Trilinear samples of a cubic grid of vectors; float32, CPU.
+
+    Args:
+        table: x slowest, [size^3, J]; differentiable.
+        points: [n, 3].
+        origin: of the first voxel's centre, [3].
+        pitch: [3].
+        size: voxels along each axis, at least 2.
+
+    Returns:
+        [n, J].
+    """
+    return _Sample.apply(table, points, origin, pitch, size)
+
+
+class _Sample(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, points: Tensor, origin: Tensor, pitch: Tensor, size: int) -> Tensor:
+        weights = table.new_empty(len(points), table.shape[1])
+        place = *map(_array, (points, origin, pitch)), size
+        run(_sample_forward, [(np.zeros(1, np.int64), _array(table), *place, weights.numpy())] * thread_count())
+        ctx.place = place
+        return weights
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+        points, size = ctx.place[0], ctx.place[3]
+        order, starts = np.empty(len(points), np.int32), np.empty(size + 1, np.int64)
+        _sort_by_plane(*ctx.place, order, starts)
+        on_table = torch.empty(size**3, slope.shape[1])
+        call = np.zeros(1, np.int64), *ctx.place, order, starts, _array(slope), on_table.numpy()
+        run(_sample_backward, [call] * thread_count())
+        return on_table, None, None, None, None
