@@ -10,6 +10,7 @@ from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.config import Config, Deform, Skinning
 from rewild4d.ours.deform import DeformNetwork, Posed
 from rewild4d.ours.fused.skinning import skin_both
+from rewild4d.ours.geometry_losses import compact_loss, tv_loss
 from rewild4d.ours.losses import colour_losses, silhouette_loss, union_window
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import joint_transforms
@@ -197,5 +198,25 @@ def test_seen_colours(degree: int) -> None:
         means, quats = normal(count, 3, seed=3).to(dtype), unit(count, 4, seed=4).to(dtype)
         eye = torch.tensor((1.0, -3.0, 7.0), dtype=torch.float64)
         return [own.seen_rgb(means, quats, eye, degree)], {"colors": own.colors}
+
+    check_twins(make)
+
+
+def test_total_variation() -> None:
+    def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
+        given = leaves(dtype, table=normal(7**3, 20, seed=1).softmax(dim=-1))
+        return [tv_loss(given["table"], 7, 0.05)[None]], given
+
+    check_twins(make)
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0])
+def test_compactness(power: float) -> None:
+    weights, opacities = normal(1500, 20, seed=1).mul(3).softmax(dim=-1), normal(1500, seed=2).sigmoid()
+    weights[:, 7] = 0  # a part without mass is left out
+
+    def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
+        given = leaves(dtype, points=normal(1500, 3, seed=3) * torch.tensor((1.0, 2.0, 3.0)))
+        return [compact_loss(given["points"], weights.to(dtype), opacities.to(dtype), power)[None]], given
 
     check_twins(make)

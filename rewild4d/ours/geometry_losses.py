@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import huber_loss, normalize
 
 from rewild4d.ours.deform import Posed
+from rewild4d.ours.fused.regularisers import compactness, variation
 from rewild4d.ours.pose import Pose, aligned
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import look_at, quat_multiply, quat_to_matrix
@@ -23,12 +24,19 @@ def tv_loss(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
         resolution: R.
         delta: x^2 / 2 inside, delta (|x| - delta / 2) outside.
     """
+    if _fits(probabilities):
+        return variation(probabilities, resolution, delta)
     grid = probabilities.view(resolution, resolution, resolution, -1)
     terms = [
         huber_loss(grid.narrow(axis, 1, resolution - 1), grid.narrow(axis, 0, resolution - 1), delta=delta)
         for axis in range(3)
     ]
     return torch.stack(terms).mean()
+
+
+def _fits(tensor: Tensor) -> bool:
+    """Whether the fused kernels take it."""
+    return tensor.dtype == torch.float32 and tensor.device.type == "cpu"
 
 
 def compact_loss(points: Tensor, weights: Tensor, opacities: Tensor, power: float) -> Tensor:
@@ -44,6 +52,8 @@ def compact_loss(points: Tensor, weights: Tensor, opacities: Tensor, power: floa
         opacities: [n].
         power: exponent on the weights.
     """
+    if _fits(points):
+        return compactness(points, weights, opacities, power)
     mass = weights.detach() ** power * opacities.detach()[:, None]
     total = mass.sum(0)
     mass, total = mass[:, total >= 1], total[total >= 1]
