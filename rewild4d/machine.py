@@ -13,7 +13,18 @@ from rewild4d import __version__
 from rewild4d.errors import UserError
 from rewild4d.files import digest
 
-PACKAGES = ("baselines", "benchmarks", "commands", "datasets", "kernels", "leaderboard", "metrics", "ours", "priors", "rasterizer")
+PACKAGES = (
+    "baselines",
+    "benchmarks",
+    "commands",
+    "datasets",
+    "kernels",
+    "leaderboard",
+    "metrics",
+    "ours",
+    "priors",
+    "rasterizer",
+)
 
 
 @cache

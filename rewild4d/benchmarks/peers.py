@@ -1,8 +1,8 @@
 """Rasterizers to compare with: what installs from PyPI and computes on a CPU, and our own dense definition.
 
-Of the splat rasterizers on PyPI only gsplat has parts that run without a GPU: `gsplat.cuda._torch_impl`, the torch twin
-of its kernels. Three of its steps need CUDA and are given here, in gsplat's favour: the list of useful (pixel, Gaussian)
-pairs is made beforehand and costs no time, and two functions of nerfacc, which blend along that list, are torch.
+Of the splat rasterizers on PyPI only gsplat has parts that run without a GPU: `gsplat.cuda._torch_impl`, the torch
+twin of its kernels. What it takes from CUDA is given here, in its favour: the list of useful (pixel, Gaussian) pairs is
+made beforehand and costs no time, and two functions of nerfacc, which blend along that list, are written in torch.
 """
 
 import math
@@ -64,7 +64,7 @@ def installed(peers: tuple[Peer, ...]) -> dict[str, str]:
 
 
 def psnr(image: Tensor, other: Tensor) -> float:
-    """Peak signal to noise ratio of two images of one shape with values in [0, 1], dB; infinite where they are equal."""
+    """Peak signal to noise ratio in dB of two images with values in [0, 1]; infinite where they are equal."""
     error = float((image.double() - other.double()).square().mean())
     return 10 * math.log10(1 / error) if error > 0 else math.inf
 

@@ -37,8 +37,9 @@ DISTANCE, AZIMUTH = 12.0, math.radians(40)
 
 FRAMES, FPS = 8, 10.0
 
-PROGRESS = 0.3
-"""Share of the iterations at which a step is timed: every loss acts and the deformation is fully there."""
+PROGRESS = 0.175
+"""Share of the iterations at which a step is timed: under `paper` the deformation is fully there (0.15), colour has its
+last degree (0.15), and the pull to the prior (until 0.2) and the geometric losses (until 0.5) still act."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,10 @@ class SplatScene:
 
     def render(self, gaussians: tuple[Tensor, ...] | None = None, backend: str = "auto") -> tuple[Tensor, Tensor]:
         """Image [3, size, size] on black and alpha [size, size], of these Gaussians or of others in their place."""
+        means, quats, scales, opacities, colors = gaussians or self.gaussians
         image, alpha, _ = rasterize(
-            *(gaussians or self.gaussians), self.world_to_camera, self.intrinsics, self.size, self.size, backend=backend
+            means, quats, scales, opacities, colors, self.world_to_camera, self.intrinsics, self.size, self.size,
+            backend=backend,
         )  # fmt: skip
         return image[0], alpha[0, 0]
 

@@ -3,12 +3,15 @@
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from tqdm import tqdm
+
+Name = TypeVar("Name", bound=Hashable)
 
 BUDGET = 10.0
 """Seconds after which a contender takes no further turn; it always has the first two."""
@@ -38,13 +41,13 @@ def summary(times: list[float]) -> Sample:
 
 
 def measure(
-    contenders: Mapping[str, Callable[[], object]],
+    contenders: Mapping[Name, Callable[[], object]],
     repeats: int,
     title: str,
     *,
     budget: float = BUDGET,
     clock: Callable[[], float] = time.perf_counter,
-) -> dict[str, Sample]:
+) -> dict[Name, Sample]:
     """Time all contenders in rounds; in each round every one has a turn.
 
     A turn is a call that is not timed, because the last contender left its own data in the caches, and one that is.
@@ -59,7 +62,7 @@ def measure(
     Returns:
         A sample for each contender.
     """
-    times: dict[str, list[float]] = {name: [] for name in contenders}
+    times: dict[Name, list[float]] = {name: [] for name in contenders}
     spent = dict.fromkeys(contenders, 0.0)
     with progress(title, repeats) as bar:
         for _ in range(repeats):
