@@ -70,8 +70,9 @@ def psnr(image: Tensor, other: Tensor) -> float:
 
 
 def _dense_reference(scene: SplatScene) -> Render:
-    if len(scene) * scene.size**2 > MOST_DENSE:
-        raise NotTimed(f"dense: Gaussians x pixels over {MOST_DENSE:.0e} do not fit into memory")
+    dense = len(scene) * scene.size**2
+    if dense > MOST_DENSE:
+        raise NotTimed(f"not timed: {dense:.1e} Gaussians x pixels, more than {MOST_DENSE:.0e}, need too much memory")
     return lambda gaussians: scene.render(gaussians, backend="reference")[0]
 
 

@@ -49,23 +49,24 @@ def scene_rows(scene: SplatScene, repeats: int, peers: Sequence[Peer], title: st
     count, size = len(scene), scene.size
     blends = count_blends(scene)
     rows = [Row(subject="scene", quantity="useful blends", value=blends, unit="1", gaussians=count, size=size)]
+    admitted = {peer: _admit(peer, scene) for peer in peers}
     contenders = _calls(OURS, lambda gaussians: scene.render(gaussians)[0], scene)
-    for peer in peers:
-        calls, found = _admit(peer, scene)
+    for calls, _ in admitted.values():
         contenders |= calls
-        rows += found
-    notes = {peer.name: peer.note for peer in peers}
     arithmetic: Contenders = {(FLOOR, str(chains)): partial(multiply_adds, chains) for chains in CHAINS}
     samples = measure(contenders | arithmetic, repeats, title)
+
+    def timed(subject: str, note: str = "") -> list[Row]:
+        return [timed_row(*key, samples[key], count, size, note) for key in contenders if key[0] == subject]
+
     gflops = max(multiply_adds_flops(chains) / samples[FLOOR, str(chains)].median / 1e6 for chains in CHAINS)
     rows.append(Row(subject=FLOOR, quantity="multiply-adds", value=gflops, unit="GFLOP/s", gaussians=count, size=size))
     for quantity, flops in ((FORWARD, FLOPS_FORWARD), (BOTH, FLOPS_BOTH)):
         floor = floor_ms(blends, flops, gflops)
         rows.append(Row(subject=FLOOR, quantity=quantity, value=floor, unit="ms", gaussians=count, size=size))
-    rows += [
-        timed_row(subject, quantity, samples[subject, quantity], count, size, notes.get(subject, ""))
-        for subject, quantity in contenders
-    ]
+    rows += timed(OURS)
+    for peer, (_, found) in admitted.items():
+        rows += [*found, *timed(peer.name, peer.note)]
     return rows
 
 

@@ -30,8 +30,8 @@ REPORTED = Row(
     note="reported: 10,000 iterations at 512² in 13 minutes",
 )
 
-PROFILED = 8
-"""Least number of steps that the profiler looks at."""
+PROFILED = 4
+"""Most turns that the profiler looks at: reading its log takes longer than the steps."""
 
 SPAN = 10
 """Turns after which the index goes back, so that long measurements stay at one place of the schedule."""
@@ -60,7 +60,7 @@ def bench_step(count: int, sizes: Sequence[int], repeats: int, preset: str, prob
     ]
     rows.append(REPORTED)
     for size, stepper in steppers.items():
-        rows += stepper.operators()
+        rows += stepper.operators(min(repeats, PROFILED))
         if probe:
             rows.append(probes.step_row(count, size, preset))
     return rows + render_rows(count, max(sizes), repeats, preset)
@@ -84,9 +84,8 @@ class Stepper:
             self.training.step(self.first + self.taken % (SPAN * self.period))
             self.taken += 1
 
-    def operators(self) -> list[Row]:
+    def operators(self, turns: int) -> list[Row]:
         """Which of torch's operators and of our autograd functions take the time, as shares of all."""
-        turns = -(-PROFILED // self.period)
         with (
             progress(f"profile of a step at {self.size}²", turns) as bar,
             profile(activities=[ProfilerActivity.CPU]) as profiler,

@@ -129,7 +129,7 @@ def _text(value: float | None) -> str:
 
 
 def _table(head: list[str], lines: list[list[str]]) -> str:
-    """Columns of numbers lean to the right: those whose first cell has a digit."""
-    first = lines[0] if lines else head
-    rule = ["---:" if cell[:1].isdigit() else "---" for cell in first]
+    """Columns that hold a number lean to the right."""
+    columns = zip(*lines, strict=True) if lines else [()] * len(head)
+    rule = ["---:" if any(cell[:1].isdigit() for cell in column) else "---" for column in columns]
     return "\n".join("| " + " | ".join(row) + " |" for row in [head, rule, *lines])
