@@ -10,15 +10,16 @@ from pathlib import Path
 import msgspec
 import pytest
 import torch
+from numba import njit
 
 from rewild4d import cli
-from rewild4d.benchmarks import floor, peers, raster_bench
-from rewild4d.benchmarks.first_image import compiled_kernels
+from rewild4d.benchmarks import first_image, floor, peers, probes, raster_bench
 from rewild4d.benchmarks.results import BOTH, FLOOR, FORWARD, OURS, Result, Row, default_path
 from rewild4d.benchmarks.scenes import SplatScene, coverage, splat_scene, step_config, training
 from rewild4d.benchmarks.step_bench import REPORTED, loss_period
 from rewild4d.benchmarks.tables import markdown
 from rewild4d.benchmarks.timing import Sample, measure, summary, threads
+from rewild4d.transforms import quat_to_matrix
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +48,7 @@ def brute_force(scene: SplatScene) -> list[tuple[int, int]]:
     means, quats, scales, opacities, _ = (tensor.double() for tensor in scene.gaussians)
     matrix, pinhole = scene.world_to_camera[0].double(), scene.intrinsics[0].double()
     local = means @ matrix[:3, :3].T + matrix[:3, 3]
-    turns = torch.linalg.matrix_exp(_cross(_axis_angles(quats)))
+    turns = quat_to_matrix(quats)
     covariances = []
     for point, turn, scale in zip(local, turns, scales, strict=True):
         jacobian = torch.autograd.functional.jacobian(lambda p: (pinhole @ p)[:2] / p[2], point)
@@ -70,16 +71,6 @@ def brute_force(scene: SplatScene) -> list[tuple[int, int]]:
             left *= 1 - alpha
             found.append((pixel, index))
     return found
-
-
-def _axis_angles(quats: torch.Tensor) -> torch.Tensor:
-    quats = torch.nn.functional.normalize(quats, dim=-1)
-    half = torch.atan2(quats[:, 1:].norm(dim=-1), quats[:, 0])
-    return 2 * half[:, None] * torch.nn.functional.normalize(quats[:, 1:], dim=-1)
-
-
-def _cross(vectors: torch.Tensor) -> torch.Tensor:
-    return torch.linalg.cross(torch.eye(3).to(vectors).expand(len(vectors), 3, 3), vectors[:, None], dim=-1)
 
 
 def test_useful_blends_are_counted_exactly(scene: SplatScene) -> None:
@@ -325,10 +316,11 @@ def test_bench_alone_tells_its_use(capsys: pytest.CaptureFixture[str]) -> None:
     assert "usage: rewild4d-bench bench rasterizer|step" in capsys.readouterr().out
 
 
-def test_compiled_kernels_are_counted(scene: SplatScene) -> None:
-    from numba import njit
-
-    before = compiled_kernels()
+def test_a_first_image_tells_time_and_compiled_kernels(
+    scene: SplatScene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    probes._save(scene, tmp_path / "scene.pt")
+    before = first_image.compiled_kernels()
 
     def plus_one(x: int) -> int:
         return x + 1
@@ -336,4 +328,23 @@ def test_compiled_kernels_are_counted(scene: SplatScene) -> None:
     plus_one.__module__ = "rewild4d.rasterizer.imagined"
     made = njit(plus_one)
     made.stats.cache_misses["int64"] += 1
-    assert compiled_kernels() == before + 1
+    first_image.main(str(tmp_path / "scene.pt"))
+    found = json.loads(capsys.readouterr().out)
+    assert found["compiled"] >= before + 1
+    seconds, image, compiled = probes._start_rows("cold start", found | {"seconds": 7.0})
+    assert (seconds.value, seconds.unit) == (7.0, "s")
+    assert (image.quantity, image.value) == ("cold start: first image", found["first_image"])
+    assert (compiled.quantity, compiled.value) == ("cold start: kernels compiled", found["compiled"])
+
+
+def test_peak_memory_is_above_what_was_held() -> None:
+    def work() -> None:
+        torch.ones(2**24)  # 64 MiB
+
+    found = probes._peak(work)
+    if not found:
+        pytest.skip("this system does not tell a process its peak")
+    assert 60 <= found["peak"] - found["before"] <= 90
+    row = probes._memory_row({"before": 100.0, "peak": 142.0}, 1000, 64)
+    assert (row.value, row.unit, row.repeats) == (42.0, "MiB", 1)
+    assert probes._memory_row({}, 1000, 64).value is None
