@@ -194,6 +194,7 @@ def test_the_raster_table_is_arithmetic() -> None:
                 row("ghost", FORWARD, None, note="not installed: pip install ghost"),
                 row("ghost", BOTH, None, note="not installed: pip install ghost"),
                 row(OURS, "peak memory", 42.5, "MiB", "above the rest"),
+                row(OURS, "kernels compiled", 39, "1"),
             ],
         )
     )
@@ -202,6 +203,7 @@ def test_the_raster_table_is_arithmetic() -> None:
     against = ["30.0", "60.0", f"{30 / 2:.1f} x", f"{60 / 5:.1f} x", "81.0"]
     assert cells(text, "10,000", "256²", "snail") == against
     assert cells(text, "10,000", "256²", "ghost") == ["not installed: pip install ghost", "", "", "", ""]
+    assert cells(text, "kernels compiled")[2] == "39"
     assert cells(text, "peak memory") == ["10,000", "256²", "42.5 MiB", "above the rest"]
     assert "snail: starts in the lead." in text and "ghost: not installed" not in text
     assert text.startswith("**bench rasterizer** on abacus, Linux, 2 threads; torch 1.2, gsplat 9.9; rewild4d 0 (abc)")

@@ -118,7 +118,11 @@ def _with_unit(row: Row) -> str:
 
 
 def _number(row: Row | None) -> str:
-    return "" if row is None else _text(row.value)
+    if row is None:
+        return ""
+    if row.unit == "1" and row.value is not None and row.value == round(row.value):
+        return f"{row.value:,.0f}"  # a count
+    return _text(row.value)
 
 
 def _text(value: float | None) -> str:
