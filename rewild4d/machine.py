@@ -15,6 +15,7 @@ from rewild4d.files import digest
 
 PACKAGES = (
     "baselines",
+    "benchmarks",
     "commands",
     "datasets",
     "kernels",

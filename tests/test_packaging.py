@@ -44,6 +44,13 @@ def test_imports_are_absolute_and_run_one_way() -> None:
         "rewild4d/transforms.py": ("rewild4d.ours", "rewild4d.baselines", "rewild4d.datasets", "rewild4d.metrics"),
         "rewild4d/rasterizer/": ("rewild4d.ours", "rewild4d.baselines", "rewild4d.datasets", "rewild4d.metrics"),
         "rewild4d/ours/": ("rewild4d.baselines", "rewild4d.datasets", "rewild4d.leaderboard", "rewild4d.runner"),
+        "rewild4d/benchmarks/": (
+            "rewild4d.baselines",
+            "rewild4d.commands",
+            "rewild4d.datasets",
+            "rewild4d.metrics",
+            "rewild4d.runner",
+        ),
         "baselines/": ("rewild4d.datasets", "rewild4d.leaderboard", "rewild4d.runner", "rewild4d.ours"),
         "datasets/": (
             "rewild4d.ours",

@@ -1,0 +1,1 @@
+"""What is timed, how, and against what: the `bench` command's inside. Runs on the CPU."""

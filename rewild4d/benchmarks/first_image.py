@@ -1,0 +1,35 @@
+"""A process that does nothing but import the rasterizer and render one image with gradients.
+
+`python -m rewild4d.benchmarks.first_image FILE` prints, as JSON, what `probes.py` puts into rows. It imports no more
+than a user of the rasterizer would.
+"""
+
+import gc
+import json
+import sys
+import time
+
+import torch
+from numba.core.dispatcher import Dispatcher
+
+from rewild4d.rasterizer import rasterize
+
+
+def compiled_kernels() -> int:
+    """How many of our kernels this process had to compile because numba's cache did not hold them."""
+    kernels = [each for each in gc.get_objects() if issubclass(type(each), Dispatcher)]  # proxies are left asleep
+    ours = [each for each in kernels if each.py_func.__module__.startswith("rewild4d.")]
+    return sum(sum(each.stats.cache_misses.values()) for each in ours)
+
+
+def main(file: str) -> None:
+    gaussians, world_to_camera, intrinsics, size = torch.load(file, weights_only=True)
+    means, quats, scales, opacities, colors = (tensor.requires_grad_() for tensor in gaussians)
+    begin = time.perf_counter()
+    image, _, _ = rasterize(means, quats, scales, opacities, colors, world_to_camera, intrinsics, size, size)
+    image.sum().backward()
+    print(json.dumps({"first_image": time.perf_counter() - begin, "compiled": compiled_kernels()}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,134 @@
+"""Rasterizers to compare with: what installs from PyPI and computes on a CPU, and our own dense definition.
+
+Of the splat rasterizers on PyPI only gsplat has parts that run without a GPU: `gsplat.cuda._torch_impl`, the torch
+twin of its kernels. What it takes from CUDA is given here, in its favour: the list of useful (pixel, Gaussian) pairs is
+made beforehand and costs no time, and two functions of nerfacc, which blend along that list, are written in torch.
+"""
+
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module, metadata
+from types import ModuleType
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from torch import Tensor
+
+from rewild4d.benchmarks.floor import EPS2D, list_blends
+from rewild4d.benchmarks.scenes import SplatScene
+
+Render = Callable[[tuple[Tensor, ...]], Tensor]
+"""From a scene's five tensors to its image on black, [3, size, size], differentiable."""
+
+MOST_DENSE = 20_000_000
+"""Gaussians times pixels beyond which the dense reference would fill the memory."""
+
+SAME_PSNR = 50.0
+"""Least PSNR (dB) against our image for a peer's time to be compared with ours."""
+
+
+class NotTimed(Exception):
+    """A peer cannot be timed here; the message says why."""
+
+
+@dataclass(frozen=True)
+class Peer:
+    """One competitor.
+
+    Attributes:
+        name: as the table prints it.
+        package: on PyPI; "" for what is part of rewild4d.
+        prepare: gives its renderer for a scene, or raises `NotTimed`.
+        note: what its time leaves out.
+    """
+
+    name: str
+    package: str
+    prepare: Callable[[SplatScene], Render]
+    note: str = ""
+
+
+def installed(peers: tuple[Peer, ...]) -> dict[str, str]:
+    """Versions of the peers' packages that are here."""
+    versions = {}
+    for peer in peers:
+        if peer.package:
+            try:
+                versions[peer.package] = metadata.version(peer.package)
+            except metadata.PackageNotFoundError:
+                continue
+    return versions
+
+
+def psnr(image: Tensor, other: Tensor) -> float:
+    """Peak signal to noise ratio in dB of two images with values in [0, 1]; infinite where they are equal."""
+    error = float((image.double() - other.double()).square().mean())
+    return 10 * math.log10(1 / error) if error > 0 else math.inf
+
+
+def _dense_reference(scene: SplatScene) -> Render:
+    dense = len(scene) * scene.size**2
+    if dense > MOST_DENSE:
+        raise NotTimed(f"not timed: {dense:.1e} Gaussians x pixels, more than {MOST_DENSE:.0e}, need too much memory")
+    return lambda gaussians: scene.render(gaussians, backend="reference")[0]
+
+
+def _gsplat_twin(scene: SplatScene) -> Render:
+    try:
+        twin = import_module("gsplat.cuda._torch_impl")
+    except ModuleNotFoundError as error:
+        if error.name == "gsplat":
+            raise NotTimed("not installed: pip install gsplat") from error
+        raise NotTimed(f"gsplat is installed, but needs {error.name}: pip install {error.name}") from error
+    except Exception as error:  # a foreign package may fail in any way while it looks for CUDA
+        raise NotTimed(f"gsplat is installed, but does not import: {error}") from error
+    blends = list_blends(scene)
+    chosen, pixels = torch.from_numpy(blends.gaussians), torch.from_numpy(blends.pixels)
+    images, size = torch.zeros_like(pixels), scene.size
+
+    def render(gaussians: tuple[Tensor, ...]) -> Tensor:
+        means, quats, scales, opacities, colors = gaussians
+        covariances, _ = twin._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+        _, centers, _, conics, _ = twin._fully_fused_projection(
+            means, covariances, scene.world_to_camera, scene.intrinsics, size, size, eps2d=EPS2D
+        )
+        with patch.dict(sys.modules, nerfacc=_nerfacc()):
+            image, _ = twin.accumulate(
+                centers, conics, opacities[None], colors[None], chosen, pixels, images, size, size
+            )
+        return image[0].permute(2, 0, 1)
+
+    return render
+
+
+def _nerfacc() -> ModuleType:
+    """The two functions of nerfacc that gsplat's twin blends with; nerfacc's own need CUDA."""
+    module: Any = ModuleType("nerfacc")
+    module.render_weight_from_alpha = _weights
+    module.accumulate_along_rays = _accumulate
+    return module
+
+
+def _weights(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
+    """Weight and transmittance of each entry; entries of one pixel follow each other, front to back, [M] each."""
+    logs = torch.log1p(-alphas.double())  # summed over the whole image, so in double precision
+    before = logs.cumsum(0) - logs
+    counts = torch.bincount(ray_indices, minlength=n_rays)
+    first = (counts.cumsum(0) - counts)[ray_indices]
+    transmittance = (before - before[first]).exp().to(alphas)
+    return alphas * transmittance, transmittance
+
+
+def _accumulate(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_rays: int) -> Tensor:
+    """Weighted sums per pixel, [n_rays, C]; of the weights alone without values."""
+    terms = weights[:, None] if values is None else weights[:, None] * values
+    return terms.new_zeros(n_rays, terms.shape[1]).index_add(0, ray_indices, terms)
+
+
+PEERS = (
+    Peer("gsplat's torch twin", "gsplat", _gsplat_twin, "its list of pairs is given and costs no time"),
+    Peer("dense torch reference", "", _dense_reference),
+)

@@ -1,0 +1,110 @@
+"""`bench rasterizer`: forward and backward of the one rasterizer, of its peers, and the arithmetic floor."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from rewild4d.benchmarks import probes
+from rewild4d.benchmarks.floor import (
+    CHAINS,
+    FLOPS_BOTH,
+    FLOPS_FORWARD,
+    count_blends,
+    floor_ms,
+    multiply_adds,
+    multiply_adds_flops,
+)
+from rewild4d.benchmarks.peers import PEERS, SAME_PSNR, NotTimed, Peer, Render, psnr
+from rewild4d.benchmarks.results import BOTH, FLOOR, FORWARD, OURS, Row, timed_row
+from rewild4d.benchmarks.scenes import SplatScene, splat_scene
+from rewild4d.benchmarks.timing import measure
+
+Contenders = dict[tuple[str, str], Callable[[], object]]
+"""Calls to time, by subject and quantity."""
+
+
+def bench_rasterizer(
+    counts: Sequence[int], sizes: Sequence[int], repeats: int, peers: Sequence[Peer] = PEERS, probe: bool = True
+) -> list[Row]:
+    """Time every number of Gaussians at every image side.
+
+    Args:
+        counts: numbers of Gaussians.
+        sizes: sides of the square images in pixels.
+        repeats: rounds of measurement for each scene.
+        peers: whom to compare with.
+        probe: measure start-up and memory too (of the largest scene), in processes of their own.
+    """
+    scenes = [(count, size) for count in counts for size in sizes]
+    rows: list[Row] = []
+    for place, (count, size) in enumerate(scenes, 1):
+        rows += scene_rows(splat_scene(count, size), repeats, peers, f"[{place}/{len(scenes)}] {count:,} at {size}²")
+    return rows + (probes.raster_rows(max(counts), max(sizes)) if probe else [])
+
+
+def scene_rows(scene: SplatScene, repeats: int, peers: Sequence[Peer], title: str) -> list[Row]:
+    """Everything that is measured on one scene."""
+    count, size = len(scene), scene.size
+    blends = count_blends(scene)
+    rows = [Row(subject="scene", quantity="useful blends", value=blends, unit="1", gaussians=count, size=size)]
+    admitted = {peer: _admit(peer, scene) for peer in peers}
+    contenders = _calls(OURS, lambda gaussians: scene.render(gaussians)[0], scene)
+    for calls, _ in admitted.values():
+        contenders |= calls
+    arithmetic: Contenders = {(FLOOR, str(chains)): partial(multiply_adds, chains) for chains in CHAINS}
+    samples = measure(contenders | arithmetic, repeats, title)
+
+    def timed(subject: str, note: str = "") -> list[Row]:
+        return [timed_row(*key, samples[key], count, size, note) for key in contenders if key[0] == subject]
+
+    gflops = max(multiply_adds_flops(chains) / samples[FLOOR, str(chains)].median / 1e6 for chains in CHAINS)
+    rows.append(Row(subject=FLOOR, quantity="multiply-adds", value=gflops, unit="GFLOP/s", gaussians=count, size=size))
+    for quantity, flops in ((FORWARD, FLOPS_FORWARD), (BOTH, FLOPS_BOTH)):
+        floor = floor_ms(blends, flops, gflops)
+        rows.append(Row(subject=FLOOR, quantity=quantity, value=floor, unit="ms", gaussians=count, size=size))
+    rows += timed(OURS)
+    for peer, (_, found) in admitted.items():
+        rows += [*found, *timed(peer.name, peer.note)]
+    return rows
+
+
+def _admit(peer: Peer, scene: SplatScene) -> tuple[Contenders, list[Row]]:
+    """The calls of a peer whose image is ours, and rows that say how alike it is or why it is not timed."""
+
+    def row(quantity: str, value: float | None, unit: str, note: str = "") -> Row:
+        return Row(
+            subject=peer.name, quantity=quantity, value=value, unit=unit, gaussians=len(scene), size=scene.size,
+            repeats=int(value is not None), note=note,
+        )  # fmt: skip
+
+    try:
+        render = peer.prepare(scene)
+        with torch.no_grad():
+            alike = psnr(render(scene.gaussians), scene.render()[0])
+    except Exception as error:
+        if not (peer.package or isinstance(error, NotTimed)):
+            raise
+        # Foreign code of another version may fail in any way: that is a line in the table, not the end of the run.
+        reason = str(error) if isinstance(error, NotTimed) else f"failed: {type(error).__name__}: {error}"
+        return {}, [row(quantity, None, "ms", reason) for quantity in (FORWARD, BOTH)]
+    parity = row("PSNR against rewild4d", min(alike, 200.0), "dB")  # equal images have no finite one
+    if alike < SAME_PSNR:
+        reason = f"not timed: another image ({alike:.0f} dB)"
+        return {}, [parity, *(row(quantity, None, "ms", reason) for quantity in (FORWARD, BOTH))]
+    return _calls(peer.name, render, scene), [parity]
+
+
+def _calls(name: str, render: Render, scene: SplatScene) -> Contenders:
+    leaves = tuple(tensor.clone().requires_grad_() for tensor in scene.gaussians)
+    gradient = torch.rand(3, scene.size, scene.size, generator=torch.Generator().manual_seed(0))
+
+    def forward() -> Tensor:
+        with torch.no_grad():
+            return render(scene.gaussians)
+
+    def both() -> tuple[Tensor, ...]:
+        return torch.autograd.grad(render(leaves), leaves, gradient)
+
+    return {(name, FORWARD): forward, (name, BOTH): both}

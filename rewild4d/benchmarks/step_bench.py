@@ -1,0 +1,156 @@
+"""`bench step`: one training step of `ours`, what it spends its time on, and how fast its result renders."""
+
+import math
+from collections.abc import Callable, Sequence
+
+import msgspec
+import torch
+from torch import Tensor
+from torch.profiler import ProfilerActivity, profile
+
+from rewild4d.benchmarks import probes
+from rewild4d.benchmarks.results import OURS, Row, timed_row
+from rewild4d.benchmarks.scenes import posed_clip, step_config, training
+from rewild4d.benchmarks.timing import Sample, measure, progress
+from rewild4d.harmonics import seen_colors
+from rewild4d.ours.config import Config, WarmUp
+from rewild4d.ours.method import Ours
+from rewild4d.rasterizer import rasterize
+from rewild4d.types import Camera, Splats
+
+STEP, CACHED, UNCACHED = "step", "rendering, frames cached", "rendering, frames not cached"
+
+REPORTED = Row(
+    subject="the paper, one A6000",
+    quantity=STEP,
+    value=13 * 60 * 1000 / 10_000,
+    unit="ms",
+    size=512,
+    repeats=0,
+    note="reported: 10,000 iterations at 512² in 13 minutes",
+)
+
+PROFILED = 4
+"""Most turns that the profiler looks at: reading its log takes longer than the steps."""
+
+SPAN = 10
+"""Turns after which the index goes back, so that long measurements stay at one place of the schedule."""
+
+OPERATORS = 12
+"""Operators that are listed one by one."""
+
+
+def bench_step(count: int, sizes: Sequence[int], repeats: int, preset: str, probe: bool = True) -> list[Row]:
+    """Time steps at every image side, in turns; profile them; render the result.
+
+    Args:
+        count: Gaussians.
+        sizes: sides of the square frames in pixels.
+        repeats: rounds of measurement.
+        preset: of `ours`.
+        probe: measure memory too, in processes of their own.
+
+    Raises:
+        UserError: no such preset.
+    """
+    steppers = {size: Stepper(count, size, preset) for size in sizes}
+    samples = measure({size: stepper.turn for size, stepper in steppers.items()}, repeats, "training step")
+    rows = [
+        timed_row(OURS, STEP, _per(samples[size], stepper.period), count, size) for size, stepper in steppers.items()
+    ]
+    rows.append(REPORTED)
+    for size, stepper in steppers.items():
+        rows += stepper.operators(min(repeats, PROFILED))
+        if probe:
+            rows.append(probes.step_row(count, size, preset))
+    return rows + render_rows(count, max(sizes), repeats, preset)
+
+
+class Stepper:
+    """A training that goes on from turn to turn.
+
+    Attributes:
+        period: steps of one turn: some losses act in every n-th step only, so that single steps are not alike.
+    """
+
+    def __init__(self, count: int, size: int, preset: str) -> None:
+        self.count, self.size = count, size
+        self.training, self.first = training(size, count, preset)
+        self.period, self.taken = loss_period(self.training.config), 0
+
+    def turn(self) -> None:
+        """Take `period` steps."""
+        for _ in range(self.period):
+            self.training.step(self.first + self.taken % (SPAN * self.period))
+            self.taken += 1
+
+    def operators(self, turns: int) -> list[Row]:
+        """Which of torch's operators and of our autograd functions take the time, as shares of all."""
+        with (
+            progress(f"profile of a step at {self.size}²", turns) as bar,
+            profile(activities=[ProfilerActivity.CPU]) as profiler,
+        ):
+            for _ in range(turns):
+                self.turn()
+                bar.update()
+        steps = turns * self.period
+        found = sorted(profiler.key_averages(), key=lambda event: -event.self_cpu_time_total)
+        total = sum(event.self_cpu_time_total for event in found)
+        return [
+            Row(
+                subject=event.key,
+                quantity="share of a step",
+                value=event.self_cpu_time_total / total,
+                unit="1",
+                gaussians=self.count,
+                size=self.size,
+                repeats=steps,
+                note=f"{event.count / steps:.3g} calls a step",
+            )
+            for event in found[:OPERATORS]
+        ]
+
+
+def loss_period(config: Config) -> int:
+    """After how many steps the same losses act again."""
+    return math.lcm(config.geometry.smooth_every, config.geometry.tv_every)
+
+
+def render_rows(count: int, size: int, repeats: int, preset: str) -> list[Row]:
+    """Frames a second of a fitted clip: its Gaussians made for each frame anew, or kept."""
+    clip, prior = posed_clip(size, count)
+    config = msgspec.structs.replace(
+        step_config(size, count, preset), iterations=1, warmup=WarmUp(iterations=0, regress=0)
+    )
+    with progress("a fitted clip", 1) as bar:  # the quality of the fit is nothing to the time of its rendering
+        made = Ours().fit(
+            clip, prior, config=config, seed=0, device=torch.device("cpu"), log=lambda *_: None, workdir=None
+        )
+        bar.update()
+    views = [(frame.time, frame.camera) for frame in clip.frames if frame.camera is not None]
+    kept = [made.at(time) for time, _ in views]
+
+    def cached() -> list[Tensor]:
+        return [_render(splats, camera) for splats, (_, camera) in zip(kept, views, strict=True)]
+
+    def uncached() -> list[Tensor]:
+        return [_render(made.at(time), camera) for time, camera in views]
+
+    calls: dict[str, Callable[[], object]] = {CACHED: cached, UNCACHED: uncached}
+    samples = measure(calls, repeats, f"rendering at {size}²")
+    return [timed_row(OURS, name, _per(sample, len(views)), count, size) for name, sample in samples.items()]
+
+
+@torch.no_grad()
+def _render(splats: Splats, camera: Camera) -> Tensor:
+    """A frame as a viewer wants it: colours as this camera sees them, on black, [3, h, w]."""
+    image, _, _ = rasterize(
+        splats.means, splats.quats, splats.scales, splats.opacities, seen_colors(splats, camera.center),
+        camera.world_to_camera[None], camera.intrinsics[None], camera.width, camera.height,
+    )  # fmt: skip
+    return image[0]
+
+
+def _per(sample: Sample, parts: int) -> Sample:
+    """The time of one of several equal parts."""
+    return Sample(sample.median / parts, sample.minimum / parts, sample.spread / parts, sample.repeats)

@@ -1,0 +1,139 @@
+"""Markdown tables of a result; ratios are made here, from the rows."""
+
+from collections.abc import Sequence
+
+from rewild4d.benchmarks.results import BOTH, FLOOR, FORWARD, OURS, Result, Row
+
+
+def markdown(result: Result) -> str:
+    """What a result says: where it was measured, and its tables."""
+    tables = {"rasterizer": _raster_tables, "step": _step_tables}[result.benchmark](result.rows)
+    timed = [row for row in result.rows if row.unit == "ms" and row.value is not None]
+    notes = list(dict.fromkeys(f"{row.subject}: {row.note}." for row in timed if row.note))
+    return "\n\n".join([_place(result), *tables, *notes])
+
+
+def _place(result: Result) -> str:
+    machine = result.machine
+    versions = {name: machine[name] for name in ("python", "torch", "numpy", "numba") if name in machine} | result.peers
+    listed = ", ".join(f"{name} {version}" for name, version in versions.items())
+    return (
+        f"**bench {result.benchmark}** on {machine.get('processor', 'an unknown processor')}, "
+        f"{machine.get('system', '')}, {_plural(result.threads, 'thread')}; {listed}; "
+        f"rewild4d {result.code['version']} ({result.code['sources']}); {result.started}"
+    )
+
+
+def _plural(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def _raster_tables(rows: Sequence[Row]) -> list[str]:
+    """Scenes in lines: ours and the floor, then each peer; below them what processes of their own showed."""
+    places = dict.fromkeys(_place_of(row) for row in rows if row.quantity == FORWARD)
+    peers = [name for name in dict.fromkeys(row.subject for row in rows if row.quantity == FORWARD)
+             if name not in (OURS, FLOOR)]  # fmt: skip
+    ours = _table(
+        ["Gaussians", "image", "useful blends", "forward, ms", "forward+backward, ms", "floor forward, ms",
+         "floor forward+backward, ms", "GFLOP/s", "forward / floor", "forward+backward / floor"],
+        [
+            [*_scene(place), *(
+                _number(_find(rows, subject, quantity, place))
+                for subject, quantity in (("scene", "useful blends"), (OURS, FORWARD), (OURS, BOTH), (FLOOR, FORWARD),
+                                          (FLOOR, BOTH), (FLOOR, "multiply-adds"))
+            ), *(_ratio(_find(rows, OURS, quantity, place), _find(rows, FLOOR, quantity, place))
+                 for quantity in (FORWARD, BOTH))]
+            for place in places
+        ],
+    )  # fmt: skip
+    against = _table(
+        ["Gaussians", "image", "peer", "forward, ms", "forward+backward, ms", "forward / ours",
+         "forward+backward / ours", "PSNR against ours, dB"],
+        [[*_scene(place), peer, *_against(rows, peer, place)] for place in places for peer in peers],
+    )  # fmt: skip
+    alone = [row for row in rows if row.subject == OURS and row.quantity not in (FORWARD, BOTH)]
+    return [ours, *([against] if peers else []), *([_list(alone)] if alone else [])]
+
+
+def _against(rows: Sequence[Row], peer: str, place: tuple[int | None, int | None]) -> list[str]:
+    found = [_find(rows, peer, quantity, place) for quantity in (FORWARD, BOTH)]
+    if found[0] is not None and found[0].value is None:
+        return [found[0].note, "", "", "", _number(_find(rows, peer, "PSNR against rewild4d", place))]
+    ratios = [_ratio(row, _find(rows, OURS, quantity, place)) for row, quantity in
+              zip(found, (FORWARD, BOTH), strict=True)]  # fmt: skip
+    return [*map(_number, found), *ratios, _number(_find(rows, peer, "PSNR against rewild4d", place))]
+
+
+def _step_tables(rows: Sequence[Row]) -> list[str]:
+    """Times of a step and of a frame, with steps or frames a second; then the operators of each image side."""
+    timed = [row for row in rows if row.unit == "ms"]
+    times = _table(
+        ["what", "whose", "Gaussians", "image", "ms", "least, ms", "quartiles apart, ms", "a second"],
+        [
+            [row.quantity, row.subject, *_scene(_place_of(row)), _number(row), _text(row.minimum), _text(row.spread),
+             _text(1000 / row.value if row.value else None)]
+            for row in timed
+        ],
+    )  # fmt: skip
+    shares = [row for row in rows if row.quantity == "share of a step"]
+    tables = []
+    for size in dict.fromkeys(row.size for row in shares):
+        chosen = [row for row in shares if row.size == size]
+        lines = [[row.subject, f"{100 * (row.value or 0):.1f} %", row.note] for row in chosen]
+        tables.append(_table([f"operator, at {size}²", "own time", "how often"], lines))
+    memory = [row for row in rows if row.quantity == "peak memory"]
+    return [times, *tables, *([_list(memory)] if memory else [])]
+
+
+def _list(rows: Sequence[Row]) -> str:
+    """One number a line."""
+    return _table(
+        ["what", "Gaussians", "image", "value", "note"],
+        [[row.quantity, *_scene(_place_of(row)), _with_unit(row), row.note] for row in rows],
+    )
+
+
+def _place_of(row: Row) -> tuple[int | None, int | None]:
+    return row.gaussians, row.size
+
+
+def _scene(place: tuple[int | None, int | None]) -> list[str]:
+    count, size = place
+    return ["" if count is None else f"{count:,}", "" if size is None else f"{size}²"]
+
+
+def _find(rows: Sequence[Row], subject: str, quantity: str, place: tuple[int | None, int | None]) -> Row | None:
+    wanted = (subject, quantity, place)
+    return next((row for row in rows if (row.subject, row.quantity, _place_of(row)) == wanted), None)
+
+
+def _ratio(row: Row | None, base: Row | None) -> str:
+    if row is None or base is None or row.value is None or not base.value:
+        return ""
+    return f"{_text(row.value / base.value)} x"
+
+
+def _with_unit(row: Row) -> str:
+    return _number(row) + ("" if row.unit == "1" else f" {row.unit}")
+
+
+def _number(row: Row | None) -> str:
+    if row is None:
+        return ""
+    if row.unit == "1" and row.value is not None and row.value == round(row.value):
+        return f"{row.value:,.0f}"  # a count
+    return _text(row.value)
+
+
+def _text(value: float | None) -> str:
+    """Three digits; all of a larger number's."""
+    if value is None:
+        return "-"
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:#.3g}".rstrip(".") if value else "0"
+
+
+def _table(head: list[str], lines: list[list[str]]) -> str:
+    """Columns that hold a number lean to the right."""
+    columns = zip(*lines, strict=True) if lines else [()] * len(head)
+    rule = ["---:" if any(cell[:1].isdigit() for cell in column) else "---" for column in columns]
+    return "\n".join("| " + " | ".join(row) + " |" for row in [head, rule, *lines])

@@ -1,0 +1,143 @@
+"""`bench`: time the rasterizer or a training step on this machine, print a table and leave the data."""
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rewild4d.benchmarks.peers import PEERS, installed
+from rewild4d.benchmarks.raster_bench import bench_rasterizer
+from rewild4d.benchmarks.results import Result, Row, default_path, to_json, write_result
+from rewild4d.benchmarks.step_bench import bench_step
+from rewild4d.benchmarks.tables import markdown
+from rewild4d.benchmarks.timing import threads
+from rewild4d.commands.run import require_writable
+from rewild4d.config import load_preset, parse_flags
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.ours.config import Config
+
+RASTERIZER = """Time the rasterizer on the CPU, forward and with backward, against peers from PyPI that run on a CPU and
+against the least time that the arithmetic itself would take here. Contenders take turns within one run."""
+
+STEP = """Time one training step of `ours` on the CPU with every loss acting, show where its time goes, and how fast
+what it fits is rendered."""
+
+
+@dataclass(frozen=True)
+class RasterizerOptions:
+    """Flags of `bench rasterizer`.
+
+    Attributes:
+        gaussians: how many the scenes have.
+        sizes: sides of the square images in pixels; every number of Gaussians is timed at every size.
+        repeats: rounds of measurement for each scene.
+        peers: time the peers too.
+        probes: measure start-up times and peak memory too, in processes of their own.
+        threads: that compute; torch's own number where it is left out.
+        out: file for the data; leaderboard/speed/rasterizer-<processor>-<day>.json where it is left out.
+        json: print the data as JSON, and nothing else, to standard output.
+    """
+
+    gaussians: tuple[int, ...] = (10_000, 30_000, 100_000)
+    sizes: tuple[int, ...] = (256, 512)
+    repeats: int = 20
+    peers: bool = True
+    probes: bool = True
+    threads: int | None = None
+    out: Path | None = None
+    json: bool = False
+
+
+@dataclass(frozen=True)
+class StepOptions:
+    """Flags of `bench step`.
+
+    Attributes:
+        gaussians: how many the model has.
+        sizes: sides of the square frames in pixels; clips are rendered at the largest.
+        repeats: rounds of measurement.
+        preset: of `ours`; its image size and number of Gaussians are those above.
+        probes: measure peak memory too, in processes of their own.
+        threads: that compute; torch's own number where it is left out.
+        out: file for the data; leaderboard/speed/step-<processor>-<day>.json where it is left out.
+        json: print the data as JSON, and nothing else, to standard output.
+    """
+
+    gaussians: int = 20_000
+    sizes: tuple[int, ...] = (512, 256)
+    repeats: int = 20
+    preset: str = "paper"
+    probes: bool = True
+    threads: int | None = None
+    out: Path | None = None
+    json: bool = False
+
+
+def main(arguments: list[str]) -> int:
+    if arguments[:1] in (["-h"], ["--help"]) or not arguments:
+        print("usage: rewild4d-bench bench rasterizer|step [options]      (bench rasterizer --help tells its options)")
+        return 0 if arguments else 2
+    benchmarks: dict[str, Callable[[list[str]], int]] = {"rasterizer": _rasterizer, "step": _step}
+    if arguments[0] not in benchmarks:
+        raise unknown_name("benchmark", arguments[0], benchmarks)
+    return benchmarks[arguments[0]](arguments)
+
+
+def _rasterizer(arguments: list[str]) -> int:
+    options = parse_flags(
+        RasterizerOptions, arguments[1:], prog="rewild4d-bench bench rasterizer", description=RASTERIZER
+    )
+    _check(options, options.gaussians)
+    settings: dict[str, int | str | list[int]] = {
+        "gaussians": list(options.gaussians), "sizes": list(options.sizes), "repeats": options.repeats,
+    }  # fmt: skip
+    peers = PEERS if options.peers else ()
+    return _report(
+        arguments, options, settings, installed(peers),
+        lambda: bench_rasterizer(options.gaussians, options.sizes, options.repeats, peers, options.probes),
+    )  # fmt: skip
+
+
+def _step(arguments: list[str]) -> int:
+    options = parse_flags(StepOptions, arguments[1:], prog="rewild4d-bench bench step", description=STEP)
+    _check(options, (options.gaussians,))
+    load_preset("ours", Config, options.preset)  # an unknown preset is said before anything is measured
+    settings: dict[str, int | str | list[int]] = {
+        "gaussians": options.gaussians, "sizes": list(options.sizes), "repeats": options.repeats,
+        "preset": options.preset,
+    }  # fmt: skip
+    return _report(
+        arguments, options, settings, {},
+        lambda: bench_step(options.gaussians, options.sizes, options.repeats, options.preset, options.probes),
+    )  # fmt: skip
+
+
+def _check(options: RasterizerOptions | StepOptions, gaussians: Sequence[int]) -> None:
+    least = {"--gaussians": (gaussians, 100), "--sizes": (options.sizes, 16), "--repeats": ((options.repeats,), 1)}
+    if options.threads is not None:
+        least["--threads"] = ((options.threads,), 1)
+    for flag, (values, smallest) in least.items():
+        if not values or min(values) < smallest:
+            found = " ".join(map(str, values)) or "none"
+            raise UserError(f"{flag}: expected at least one number, none below {smallest}, got {found}.")
+
+
+def _report(
+    arguments: list[str],
+    options: RasterizerOptions | StepOptions,
+    settings: dict[str, int | str | list[int]],
+    peers: dict[str, str],
+    measure: Callable[[], list[Row]],
+) -> int:
+    """Measure, write the data, print the table."""
+    path = options.out or default_path(arguments[0])
+    require_writable(path.parent)
+    with threads(options.threads) as count:
+        result = Result(
+            benchmark=arguments[0], command=["bench", *arguments], threads=count, settings=settings, peers=peers,
+            rows=measure(),
+        )  # fmt: skip
+    write_result(result, path)
+    print(to_json(result) if options.json else markdown(result))
+    print(f"\ndata: {path}", file=sys.stderr)
+    return 0
