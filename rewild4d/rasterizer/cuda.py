@@ -17,8 +17,8 @@ from rewild4d.transforms import quat_to_matrix
 TILE, MOMENTS = triton_blend.SIDE.value, triton_blend.MOMENTS.value
 WARPS = 8
 """A thread a pixel: the scans along a group of Gaussians then stay within one thread."""
-BLEND_PART, BACKWARD_PART = 16, 4
-"""Most channels that a program holds in registers at a time."""
+MOST_CHANNELS = 16
+"""What one program blends; for more of them the tile is walked again."""
 LN2 = math.log(2.0)
 
 
@@ -131,7 +131,7 @@ class _Blend(torch.autograd.Function):
         views, (count, channels) = len(records), features.shape
         image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
         features, background = features.contiguous(), background.contiguous()
-        part = min(BLEND_PART, triton.next_power_of_2(channels))
+        part = min(MOST_CHANNELS, triton.next_power_of_2(channels))
         grid = (len(lists.starts) - 1, -(-channels // part))
         with torch.cuda.device_of(records):
             triton_blend.blend[grid](
@@ -149,12 +149,11 @@ class _Blend(torch.autograd.Function):
         lists: TileLists = ctx.lists
         views, channels, height, width = image.shape
         sums = records.new_zeros(len(lists.slots), MOMENTS + channels)
-        part = min(BACKWARD_PART, triton.next_power_of_2(channels))
         with torch.cuda.device_of(records):
             triton_blend.blend_backward[(len(lists.starts) - 1,)](
                 lists.starts, lists.entries, lists.slots, means2d, records, features, image, alpha,
                 g_image.contiguous(), g_alpha.contiguous(), sums,
-                width, height, *lists.tiles, len(features), CHANNELS=channels, PART=part, num_warps=WARPS,
+                width, height, *lists.tiles, len(features), CHANNELS=channels, num_warps=WARPS,
             )  # fmt: skip
         total = records.new_zeros(views * len(features), MOMENTS + channels)
         total[lists.visible] = torch.segment_reduce(sums, "sum", lengths=lists.counts, axis=0, unsafe=True)

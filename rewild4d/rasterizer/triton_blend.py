@@ -1,7 +1,8 @@
 """Blending and its gradient as Triton kernels: one program a tile, one lane a pixel, a group of Gaussians at a time.
 
-Shapes inside: P pixels of a tile, G Gaussians of a group, C channels of a part. Scans run along G, which one thread
-holds whole; sums along P cross the threads, once a group. Nothing is added atomically, so the bits never differ.
+Shapes inside: P pixels of a tile, G Gaussians of a group. Scans run along G, which one thread holds whole; sums along
+P cross the threads, once a group. Nothing is added atomically, so the bits never differ. The sums over channels keep
+clear of [G, C, P]: summed over C, Triton makes a product in TF32 of it, and three digits are gone.
 With TRITON_INTERPRET=1 in the environment before Triton is imported the same code runs on the CPU, slowly.
 """
 
@@ -28,7 +29,7 @@ _SIZES = ["width", "height", "across", "down", "count"]
 
 
 @triton.jit
-def _pixels(tile: tl.tensor, width: tl.tensor, height: tl.tensor, across: tl.tensor, down: tl.tensor) -> tl.tensor:
+def _pixels(tile: tl.tensor, width: tl.tensor, height: tl.tensor, across: tl.tensor, down: tl.tensor) -> tuple:
     """View of the tile; column and row of its pixels, [P]; whether they lie in the image, [P]."""
     lane = tl.arange(0, PIXELS)
     x = tile % across * SIDE + lane % SIDE
@@ -45,7 +46,7 @@ def _alphas(
     records: tl.tensor,
     x: tl.tensor,
     y: tl.tensor,
-) -> tl.tensor:
+) -> tuple:
     """The group's Gaussians and which are any, [G]; offsets, log2 of the uncapped alpha, and alpha, [G, P]."""
     place = first + tl.arange(0, GROUP)
     real = place < end
@@ -62,7 +63,7 @@ def _alphas(
 
 
 @triton.jit
-def _weights(alpha: tl.tensor, left: tl.tensor) -> tl.tensor:
+def _weights(alpha: tl.tensor, left: tl.tensor) -> tuple:
     """What is left behind each Gaussian were no pixel closed, and the Gaussian's share of the pixel, [G, P].
 
     ``left`` [P] only falls, so a pixel is closed exactly where it is not above the least transmittance.
@@ -134,7 +135,6 @@ def blend_backward(
     down: tl.tensor,
     count: tl.tensor,
     CHANNELS: tl.constexpr,
-    PART: tl.constexpr,
 ) -> None:
     """Fill the slots' rows of the zeroed sums [E, 6 + C]; program (tile).
 
@@ -157,18 +157,12 @@ def blend_backward(
         n, real, dx, dy, exponent, alpha = _alphas(entries, first, end, centres, records, x, y)
         after, weight = _weights(alpha, left)
         row = sums + tl.load(slots + first + tl.arange(0, GROUP), real, 0) * (MOMENTS + CHANNELS)
+        shade = features + (n - view * count) * CHANNELS
         drawn = tl.zeros((GROUP, PIXELS), tl.float32)
-        for part in range(0, CHANNELS, PART):
-            channel = part + tl.arange(0, PART)
-            real_channel = channel < CHANNELS
-            slope = tl.load(
-                g_image + plane[None, :] + channel[:, None] * area, real_channel[:, None] & inside[None, :], 0.0
-            )
-            both = real[:, None] & real_channel[None, :]
-            shade = tl.load(features + (n - view * count)[:, None] * CHANNELS + channel[None, :], both, 0.0)
-            drawn += tl.sum(shade[:, :, None] * slope[None, :, :], 1)
-            v_shade = tl.sum(weight[:, None, :] * slope[None, :, :], 2)
-            tl.store(row[:, None] + MOMENTS + channel[None, :], v_shade, both)
+        for channel in range(CHANNELS):
+            slope = tl.load(g_image + plane + channel * area, inside, 0.0)[None, :]
+            drawn += tl.load(shade + channel, real, 0.0)[:, None] * slope
+            tl.store(row + MOMENTS + channel, tl.sum(weight * slope, 1), real)
         drawn *= weight
         rest = behind[None, :] - tl.cumsum(drawn, 0)
         # alpha dL/dalpha, where the pixel took this Gaussian and the cap did not hold it.
