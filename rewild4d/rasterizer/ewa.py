@@ -77,7 +77,8 @@ def reach(
         near: depth from which on Gaussians are drawn.
 
     Returns:
-        Radii along the longest axis, 0 where nothing can be drawn, [..., N]; half sides of the bounding box, [..., N, 2].
+        Radii along the longest axis, 0 where nothing can be drawn [..., N], and half sides of the bounding boxes
+        [..., N, 2].
     """
     squared = 2 * (opacities / MIN_ALPHA).clamp_min(1).log()
     variance_x, variance_y = cov2d[..., 0, 0], cov2d[..., 1, 1]
