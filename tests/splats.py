@@ -1,5 +1,8 @@
 """Scenes of Gaussians, and their images and gradients, for the rasterizer's tests."""
 
+import sys
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -33,9 +36,11 @@ def scene(count: int, channels: int, views: int, width: int, height: int, seed: 
     }
 
 
-def hard_scene(kind: str, seed: int = 0) -> dict[str, Tensor]:
+def hard_scene(
+    kind: str, seed: int = 0, count: int = 300, channels: int = 3, views: int = 1, width: int = 70, height: int = 50
+) -> dict[str, Tensor]:
     """The same cloud, spoilt in one way."""
-    made = scene(300, 3, 1, 70, 50, seed)
+    made = scene(count, channels, views, width, height, seed)
     if kind == "needles":
         made["scales"][:, 0] *= 8
         made["scales"][:, 1:] *= 0.01
@@ -50,11 +55,14 @@ def hard_scene(kind: str, seed: int = 0) -> dict[str, Tensor]:
         made["opacities"] *= 0.02
     elif kind == "huge":
         made["scales"] *= 10
+    elif kind == "tied":
+        made["means"][1::2] = made["means"][::2]
     return made
 
 
-def render(inputs: dict[str, Tensor], width: int, height: int, **options: object) -> tuple[Tensor, Tensor, RasterInfo]:
-    return rasterize(*(inputs[name] for name in NAMES[:-1]), width, height, background=inputs["background"], **options)
+def render(inputs: dict[str, Tensor], width: int, height: int, **options: Any) -> tuple[Tensor, Tensor, RasterInfo]:
+    background = inputs.get("background")
+    return rasterize(*(inputs[name] for name in NAMES[:-1]), width, height, background=background, **options)
 
 
 def loss_weights(image: Tensor) -> tuple[Tensor, Tensor]:
@@ -64,12 +72,31 @@ def loss_weights(image: Tensor) -> tuple[Tensor, Tensor]:
     return weights[:, :-1], weights[:, -1:]
 
 
-def gradients(
-    inputs: dict[str, Tensor], width: int, height: int, **options: object
-) -> tuple[Tensor, dict[str, Tensor]]:
+def outcome(inputs: dict[str, Tensor], width: int, height: int, **options: Any) -> dict[str, Tensor]:
+    """Image, alpha, radii, and the gradient of a random loss by each input and by the centres ("d means", ...)."""
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
     image, alpha, info = render(leaves, width, height, **options)
     on_image, on_alpha = (weights.to(image) for weights in loss_weights(image))
     ((image * on_image).sum() + (alpha * on_alpha).sum()).backward()
-    found = {name: tensor.grad for name, tensor in leaves.items()} | {"means2d": info.means2d.grad}
-    return image.detach(), found
+    found = {f"d {name}": tensor.grad for name, tensor in (leaves | {"means2d": info.means2d}).items()}
+    return {"image": image.detach(), "alpha": alpha.detach(), "radii": info.radii} | found
+
+
+def gradients(inputs: dict[str, Tensor], width: int, height: int, **options: Any) -> tuple[Tensor, dict[str, Tensor]]:
+    made = outcome(inputs, width, height, **options)
+    return made["image"], {name[2:]: tensor for name, tensor in made.items() if name.startswith("d ")}
+
+
+def main(source: str, target: str) -> None:
+    """Write the single-precision outcomes, by the Triton backend and twice, of a file of cases."""
+    torch.set_num_threads(1)
+    cases = torch.load(source)
+    made = {}
+    for name, (inputs, width, height, options) in cases.items():
+        single = {key: tensor.float() for key, tensor in inputs.items()}
+        made[name] = [outcome(single, width, height, backend="triton", **options) for _ in range(2)]
+    torch.save(made, target)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -25,7 +25,7 @@ _WEAKEST = tl.constexpr(projection.LOG2_MIN_ALPHA)
 _STRONGEST = tl.constexpr(math.log2(conventions.MAX_ALPHA))
 _LEAST_LEFT = tl.constexpr(conventions.MIN_TRANSMITTANCE)
 
-_SIZES = ["width", "height", "across", "down", "count"]
+SIZES = ["width", "height", "across", "down", "count"]
 
 
 @triton.jit
@@ -72,7 +72,7 @@ def _weights(alpha: tl.tensor, left: tl.tensor) -> tuple:
     return after, tl.where(after > _LEAST_LEFT, after * (alpha / (1.0 - alpha)), 0.0)
 
 
-@triton.jit(do_not_specialize=_SIZES)
+@triton.jit(do_not_specialize=SIZES)
 def blend(
     starts: tl.tensor,
     entries: tl.tensor,
@@ -116,7 +116,7 @@ def blend(
     tl.store(alpha_image + pixel, 1.0 - through, inside & (tl.program_id(1) == 0))
 
 
-@triton.jit(do_not_specialize=_SIZES)
+@triton.jit(do_not_specialize=SIZES)
 def blend_backward(
     starts: tl.tensor,
     entries: tl.tensor,
