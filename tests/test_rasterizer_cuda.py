@@ -133,9 +133,7 @@ def compile_kernel(name: str, capability: int, **constants: int) -> Any:
     types = {"starts": "*i64", "entries": "*i64", "slots": "*i64"} | dict.fromkeys(triton_blend.SIZES, "i32")
     signature = {word: "constexpr" if word in constants else types.get(word, "*fp32") for word in kernel.arg_names}
     used = {word: value for word, value in constants.items() if word in kernel.arg_names}
-    return compile(
-        ASTSource(kernel, signature, used), GPUTarget("cuda", capability, 32), options={"num_warps": cuda.WARPS}
-    )
+    return compile(ASTSource(kernel, signature, used), GPUTarget("cuda", capability, 32), options=cuda.LAUNCH)
 
 
 @needs_gpu

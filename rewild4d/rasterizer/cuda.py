@@ -15,7 +15,7 @@ from rewild4d.rasterizer.projection import HALF_LOG2_E
 from rewild4d.transforms import quat_to_matrix
 
 TILE, MOMENTS = triton_blend.SIDE.value, triton_blend.MOMENTS.value
-WARPS = 8
+LAUNCH = {"num_warps": 8, "enable_fp_fusion": True}
 """A thread a pixel: the scans along a group of Gaussians then stay within one thread."""
 MOST_CHANNELS = 16
 """What one program blends; for more of them the tile is walked again."""
@@ -136,7 +136,7 @@ class _Blend(torch.autograd.Function):
         with torch.cuda.device_of(records):
             triton_blend.blend[grid](
                 lists.starts, lists.entries, means2d, records, features, background, image, alpha,
-                width, height, *lists.tiles, count, CHANNELS=channels, PART=part, num_warps=WARPS,
+                width, height, *lists.tiles, count, CHANNELS=channels, PART=part, **LAUNCH,
             )  # fmt: skip
         ctx.save_for_backward(means2d, records, features, image, alpha)
         ctx.lists = lists
@@ -153,10 +153,11 @@ class _Blend(torch.autograd.Function):
             triton_blend.blend_backward[(len(lists.starts) - 1,)](
                 lists.starts, lists.entries, lists.slots, means2d, records, features, image, alpha,
                 g_image.contiguous(), g_alpha.contiguous(), sums,
-                width, height, *lists.tiles, len(features), CHANNELS=channels, num_warps=WARPS,
+                width, height, *lists.tiles, len(features), CHANNELS=channels, **LAUNCH,
             )  # fmt: skip
         total = records.new_zeros(views * len(features), MOMENTS + channels)
-        total[lists.visible] = torch.segment_reduce(sums, "sum", lengths=lists.counts, axis=0, unsafe=True)
+        if len(lists.visible):
+            total[lists.visible] = torch.segment_reduce(sums, "sum", lengths=lists.counts, axis=0, unsafe=True)
         total = total.unflatten(0, records.shape[:2])
         m, mx, my, mxx, mxy, myy = total[..., :MOMENTS].unbind(-1)
         xx, xy, yy = records[..., :3].unbind(-1)

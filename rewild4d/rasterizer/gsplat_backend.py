@@ -1,7 +1,7 @@
 """gsplat (Apache-2.0, an optional package) behind the same function: for parity, and for very many Gaussians.
 
-What differs from CONVENTIONS.md in gsplat 1.5.3: alpha is capped at 0.999, the intrinsics get no gradient, radii are
-whole pixels and leave antialiasing out of account, sums are added atomically, so the last bits vary between runs.
+What differs in gsplat 1.5.3 stands in CONVENTIONS.md: the cap of alpha, the radii, no gradient for the intrinsics, and
+sums that are added atomically, so that the last bits vary between runs.
 """
 
 import gsplat

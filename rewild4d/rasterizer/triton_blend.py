@@ -112,8 +112,9 @@ def blend(
     total += behind[:, None] * through[None, :]
     rows = ((view.to(tl.int64) * CHANNELS + channel) * height)[:, None] + y[None, :]
     tl.store(image + rows * width + x[None, :], total, real_channel[:, None] & inside[None, :])
-    pixel = (view.to(tl.int64) * height + y) * width + x
-    tl.store(alpha_image + pixel, 1.0 - through, inside & (tl.program_id(1) == 0))
+    if tl.program_id(1) == 0:
+        pixel = (view.to(tl.int64) * height + y) * width + x
+        tl.store(alpha_image + pixel, 1.0 - through, inside)
 
 
 @triton.jit(do_not_specialize=SIZES)
