@@ -56,6 +56,7 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         items: label of each held-out image, as in ``Score.per_item``.
         diagnostics: what the method says of itself (Gaussians, joint motion, ...).
         pictures: files written beside the record, relative to it.
+        machine: see `rewild4d.machine.machine`; records from before there was a choice do not name the rasterizer.
     """
 
     schema: int

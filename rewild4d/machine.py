@@ -39,11 +39,16 @@ def code_version() -> dict[str, str]:
     return {"version": __version__, "sources": digest(*parts)[:16]}
 
 
-def machine() -> dict[str, str]:
-    """Processor, system, threads and the versions that decide the last digit."""
-    versions = {name: metadata.version(name) for name in ("torch", "numpy", "numba")}
+def machine(device: torch.device, rasterizer: str) -> dict[str, str]:
+    """Processor, system, threads, what renders, and the versions that decide the last digit."""
+    packages = ["torch", "numpy", "numba"]
+    if rasterizer in ("triton", "gsplat"):
+        packages.append(rasterizer)
+    versions = {name: metadata.version(name) for name in packages}
     return {
         "processor": _processor(),
+        **({"gpu": torch.cuda.get_device_name(device)} if device.type == "cuda" else {}),
+        "rasterizer": rasterizer,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "threads": str(torch.get_num_threads()),

@@ -9,7 +9,7 @@ import time
 import traceback
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from itertools import repeat
@@ -30,6 +30,7 @@ from rewild4d.leaderboard.records import FILE, SCHEMA, RunRecord, Timing, make_r
 from rewild4d.machine import code_version, machine, peak_memory_mib
 from rewild4d.priors.choose import PriorChoice, make_prior
 from rewild4d.protocol import Protocol, evaluate
+from rewild4d.rasterizer import pick_rasterizer, set_default
 from rewild4d.registry import load_method
 from rewild4d.types import Case, Clip, Truth
 from rewild4d.view import save_pictures
@@ -50,7 +51,7 @@ class Plan:
     """Everything that decides what is run; the same plan gives the same run ids.
 
     `jobs` cases run at a time, each in a process with `threads` threads: the tensors of one fit are small, so two
-    cases side by side finish sooner than one with two threads.
+    cases side by side finish sooner than one with two threads. `rasterizer` is one of rewild4d.rasterizer.BACKENDS.
     """
 
     dataset: str
@@ -64,6 +65,7 @@ class Plan:
     out: Path
     jobs: int = 1
     threads: int = 1
+    rasterizer: str = "auto"
 
 
 class Progress:
@@ -108,23 +110,26 @@ def execute(plan: Plan) -> list[RunRecord]:
     A run that fails leaves a record with its message and does not stop the others.
 
     Raises:
-        UserError: data that cannot be read, before anything is fitted.
+        UserError: data that cannot be read or a rasterizer that cannot be used, before anything is fitted.
     """
+    plan = replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device))
     plan.out.mkdir(parents=True, exist_ok=True)
     for name in plan.cases:
         plan.reader.load(name, plan.protocol.selection)
     jobs = min(plan.jobs, len(plan.cases))
     if jobs <= 1:
         torch.set_num_threads(plan.threads)
+        set_default(plan.rasterizer)
         return [record for name in plan.cases for record in _run_case(plan, name)]
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, _start_worker, (plan.threads, os.getpid())) as pool:
+    with ProcessPoolExecutor(jobs, context, _start_worker, (plan.threads, plan.rasterizer, os.getpid())) as pool:
         return [record for records in pool.map(_run_case, repeat(plan), plan.cases) for record in records]
 
 
-def _start_worker(threads: int, parent: int) -> None:
+def _start_worker(threads: int, rasterizer: str, parent: int) -> None:
     """Threads of its own, and an end with its parent: an orphan would write into the folder of the next start."""
     torch.set_num_threads(threads)
+    set_default(rasterizer)
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -161,6 +166,7 @@ class _Job:
         self.run_id = make_run_id(
             method=entry.method, config=entry.config, clip=clip.digest, truth=truth.digest, prior=prior_id,
             protocol=plan.protocol.digest, seed=seed, code=code_version(), device=plan.device.type,
+            rasterizer=plan.rasterizer,
         )  # fmt: skip
         self.folder = folder / f"{entry.method}-{entry.preset}-seed{seed}-{self.run_id[:8]}"
         self.title = f"{clip.name}: {entry.method}"
@@ -232,7 +238,7 @@ class _Job:
             "prior": {"name": prior.name, "provenance": prior.provenance, "digest": prior.digest,
                       "quality": prior.quality} if prior else {"name": plan.prior.name},
             "protocol": {"digest": plan.protocol.digest, **msgspec.to_builtins(plan.protocol)},
-            "code": code_version(), "machine": machine(),
+            "code": code_version(), "machine": machine(plan.device, plan.rasterizer),
         }  # fmt: skip
         return RunRecord(**{**fields, **found})
 

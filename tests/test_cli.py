@@ -67,6 +67,8 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
         ),
         (["run", "--preset", "quik"], "unknown preset of 'ours' 'quik'. Did you mean 'quick'?"),
         (["run", "--device", "tpu"], "--device: expected auto, cpu or cuda, got 'tpu'"),
+        (["run", "--rasterizer", "tritn"], "unknown rasterizer 'tritn'. Did you mean 'triton'?"),
+        (["evaluate", "/no/such/run", "--rasterizer", "nunba"], "unknown rasterizer 'nunba'. Did you mean 'numba'?"),
         (["run", "--threads", "0"], "--threads: expected a number of at least 1, got 0"),
         (["run", "--data", "/no/such/folder"], "/no/such/folder: expected"),
         (["table", "--runs", "/no/such/folder"], "/no/such/folder: expected a folder of runs"),

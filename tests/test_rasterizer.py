@@ -6,80 +6,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from splats import NAMES, gradients, hard_scene, loss_weights, render, scene
 from torch import Tensor
 
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import mirror_camera, mirror_points, mirror_quats
 from rewild4d.types import Camera
-
-NAMES = ("means", "quats", "scales", "opacities", "features", "world_to_camera", "intrinsics", "background")
-
-
-def scene(count: int, channels: int, views: int, width: int, height: int, seed: int) -> dict[str, Tensor]:
-    """A cloud around the origin seen from five units away, float64, every input `rasterize` differentiates."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator, dtype=torch.float64)
-
-    means = torch.randn(count, 3, generator=generator, dtype=torch.float64)
-    turn = 0.1 * torch.randn(views, 3, 3, generator=generator, dtype=torch.float64)
-    world_to_camera = torch.eye(4, dtype=torch.float64).repeat(views, 1, 1)
-    world_to_camera[:, :3, :3] = torch.linalg.matrix_exp(turn - turn.mT)
-    world_to_camera[:, 2, 3] = 5
-    pinhole = torch.tensor([[1.1 * width, 0, 0.45 * width], [0, 0.9 * width, 0.55 * height], [0, 0, 1]])
-    return {
-        "means": means,
-        "quats": torch.randn(count, 4, generator=generator, dtype=torch.float64),
-        "scales": 0.02 + 0.3 * uniform(count, 3),
-        "opacities": 0.05 + 0.9 * uniform(count),
-        "features": uniform(count, channels),
-        "world_to_camera": world_to_camera,
-        "intrinsics": pinhole.double().repeat(views, 1, 1),
-        "background": uniform(views, channels),
-    }
-
-
-def hard_scene(kind: str, seed: int = 0) -> dict[str, Tensor]:
-    """The same cloud, spoilt in one way."""
-    made = scene(300, 3, 1, 70, 50, seed)
-    if kind == "needles":
-        made["scales"][:, 0] *= 8
-        made["scales"][:, 1:] *= 0.01
-    elif kind == "sub-pixel":
-        made["scales"] *= 1e-3
-    elif kind == "behind":
-        made["means"][::2, 2] -= 8
-        made["means"][::3] *= 4
-    elif kind == "opaque":
-        made["opacities"][:] = 0.9999
-    elif kind == "faint":
-        made["opacities"] *= 0.02
-    elif kind == "huge":
-        made["scales"] *= 10
-    return made
-
-
-def render(inputs: dict[str, Tensor], width: int, height: int, **options: object) -> tuple[Tensor, Tensor, object]:
-    return rasterize(*(inputs[name] for name in NAMES[:-1]), width, height, background=inputs["background"], **options)
-
-
-def loss_weights(image: Tensor) -> tuple[Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(9)
-    shape = (image.shape[0], image.shape[1] + 1, *image.shape[2:])
-    weights = torch.randn(shape, generator=generator, dtype=torch.float64)
-    return weights[:, :-1], weights[:, -1:]
-
-
-def gradients(
-    inputs: dict[str, Tensor], width: int, height: int, **options: object
-) -> tuple[Tensor, dict[str, Tensor]]:
-    leaves = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
-    image, alpha, info = render(leaves, width, height, **options)
-    on_image, on_alpha = (weights.to(image) for weights in loss_weights(image))
-    ((image * on_image).sum() + (alpha * on_alpha).sum()).backward()
-    found = {name: tensor.grad for name, tensor in leaves.items()} | {"means2d": info.means2d.grad}
-    return image.detach(), found
 
 
 @pytest.mark.parametrize("antialias", [False, True])
@@ -253,7 +185,7 @@ def test_bad_input_is_named(name: str, value: Tensor, message: str) -> None:
 
 def test_an_unknown_or_unfit_backend_is_named() -> None:
     inputs = scene(4, 3, 1, 8, 8, 0)
-    with pytest.raises(ValueError, match="expected one of auto, reference, numba, got 'cuda'"):
+    with pytest.raises(ValueError, match="expected one of auto, numba, triton, gsplat, reference, got 'cuda'"):
         render(inputs, 8, 8, backend="cuda")
     with pytest.raises(ValueError, match=r"numba.*expected float32 on the CPU, got torch.float64"):
         render(inputs, 8, 8, backend="numba")

@@ -1,6 +1,9 @@
 """The runner: records, resume, failures that are records, and methods that never see what is held out."""
 
+import multiprocessing
+import os
 import shutil
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,7 @@ from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import STANDARD
 from rewild4d.priors.io import save_prior
 from rewild4d.protocol import find_protocol
+from rewild4d.rasterizer.backends import resolve
 from rewild4d.registry import load_method
 from rewild4d.types import Camera, Case, Clip, Truth
 
@@ -124,6 +128,20 @@ def test_other_settings_are_another_run(plan: runner.Plan) -> None:
     first = runner.execute(plan)[1]
     entry = runner.Entry("prior-only", "quick", PriorOnlyConfig(gaussians=2001), (0,))
     assert runner.execute(replace(plan, entries=(entry,)))[0].run_id != first.run_id
+
+
+def test_the_rasterizer_is_named_and_another_one_is_another_run(plan: runner.Plan) -> None:
+    plan = replace(plan, entries=plan.entries[:1])
+    made = [runner.execute(replace(plan, rasterizer=name))[0] for name in ("auto", "numba", "reference", "auto")]
+    assert [record.machine["rasterizer"] for record in made] == ["numba", "numba", "reference", "numba"]
+    assert made[0] == made[1] == made[3] and made[0].run_id != made[2].run_id
+    assert made[2].status == "ok"
+
+
+def test_worker_processes_render_with_the_rasterizer_of_the_plan() -> None:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, context, runner._start_worker, (1, "reference", os.getpid())) as pool:
+        assert pool.submit(resolve, "auto", torch.device("cpu"), torch.float32).result() == "reference"
 
 
 def test_methods_get_the_clip_and_nothing_that_is_held_out(plan: runner.Plan, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ from rewild4d.leaderboard.records import FILE, RunRecord, read_record, to_json, 
 from rewild4d.leaderboard.tables import markdown
 from rewild4d.machine import code_version, machine, pick_device
 from rewild4d.protocol import evaluate, find_protocol
+from rewild4d.rasterizer import pick_rasterizer, set_default
 from rewild4d.registry import load_dataset, load_method
 from rewild4d.runner import Progress
 from rewild4d.view import save_pictures
@@ -28,12 +29,14 @@ class Options:
         runs: folders of single runs, each with a record.json and a reconstruction.
         data: where the data is now, if it was moved since.
         device: auto, cpu or cuda.
+        rasterizer: what renders: auto, numba (CPU), triton or gsplat (CUDA), or reference (small scenes only).
         json: print the records as a JSON array, and nothing else, to standard output.
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     data: Path | None = None
     device: str = "auto"
+    rasterizer: str = "auto"
     json: bool = False
 
 
@@ -52,6 +55,8 @@ def score_again(folder: Path, options: Options) -> RunRecord:
     Raises:
         UserError: no record, no reconstruction, or data that has changed since the fit.
     """
+    device = pick_device(options.device)
+    rasterizer = pick_rasterizer(options.rasterizer, device)
     record = read_record(folder / FILE)
     saved = folder / "reconstruction"
     if not saved.is_dir():
@@ -62,7 +67,8 @@ def score_again(folder: Path, options: Options) -> RunRecord:
     for name, now in (("clip", clip.digest), ("truth", truth.digest)):
         if now != record.data[name]:
             raise UserError(f"{root}: the {name} of {record.case} is not the one that {folder} was fitted to.")
-    reconstruction = load_method(record.method).load(saved, pick_device(options.device))
+    reconstruction = load_method(record.method).load(saved, device)
+    set_default(rasterizer)
     progress = Progress(f"{record.case}: evaluate")
     scores, items = evaluate(reconstruction, truth, protocol, progress)
     progress.close()
@@ -70,6 +76,6 @@ def score_again(folder: Path, options: Options) -> RunRecord:
     settings = {"digest": protocol.digest, **msgspec.to_builtins(protocol)}
     renewed = msgspec.structs.replace(
         record, status="ok", error="", scores=scores, items=items, pictures=pictures, protocol=settings,
-        code=code_version(), machine=machine(),
+        code=code_version(), machine=machine(device, rasterizer),
     )  # fmt: skip
     return read_record(write_record(renewed, folder))

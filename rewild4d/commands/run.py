@@ -18,6 +18,7 @@ from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import PRESETS as PRIOR_PRESETS
 from rewild4d.priors.config import STANDARD
 from rewild4d.protocol import find_protocol
+from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_builtin, load_dataset, load_method
 from rewild4d.runner import Entry, Plan, Progress, choose_cases, execute
 
@@ -39,6 +40,7 @@ class Options:
         seeds: one run for each.
         prior: "template" (fitted to the clip), "coarse:<noise>" (from the truth plus noise: for studies) or a file.
         device: auto, cpu or cuda.
+        rasterizer: what renders: auto, numba (CPU), triton or gsplat (CUDA), or reference (small scenes only).
         jobs: cases at a time; 0 is one for each processor core (one in all on a GPU).
         threads: of each case; other numbers than 1 may change the last digits.
         out: folder for runs.
@@ -54,6 +56,7 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     prior: str = "template"
     device: str = "auto"
+    rasterizer: str = "auto"
     jobs: int = 0
     threads: int = 1
     out: Path = Path("runs")
@@ -83,6 +86,7 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
         UserError: an unknown name, a folder that is not there or cannot be written.
     """
     device = pick_device(options.device)
+    rasterizer = pick_rasterizer(options.rasterizer, device)
     load_dataset(options.dataset)  # an unknown data set is the first thing to say
     protocol = find_protocol(options.dataset, options.protocol)
     for flag, value, least in (("--jobs", options.jobs, 0), ("--threads", options.threads, 1)):
@@ -109,6 +113,7 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
         out=options.out.absolute(),
         jobs=options.jobs or cores,
         threads=options.threads,
+        rasterizer=rasterizer,
     )
 
 

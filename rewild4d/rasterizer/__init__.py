@@ -1,5 +1,6 @@
 """The one rasterizer: 3D Gaussians to images, differentiable, see CONVENTIONS.md beside this file."""
 
 from rewild4d.rasterizer.api import RasterInfo, rasterize
+from rewild4d.rasterizer.backends import BACKENDS, pick_rasterizer, set_default
 
-__all__ = ["RasterInfo", "rasterize"]
+__all__ = ["BACKENDS", "RasterInfo", "pick_rasterizer", "rasterize", "set_default"]

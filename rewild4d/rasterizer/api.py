@@ -1,15 +1,12 @@
 """The one entry point: checks the input and hands it to a backend."""
 
 import math
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from rewild4d.rasterizer import cpu, reference
+from rewild4d.rasterizer import backends
 from rewild4d.rasterizer.conventions import RasterInfo
-
-BACKENDS = ("auto", "reference", "numba")
 
 
 def rasterize(
@@ -47,8 +44,9 @@ def rasterize(
         eps2d: variance in square pixels added to every projected Gaussian.
         antialias: scale opacity down by what ``eps2d`` adds in area, so that far objects do not grow.
         near: Gaussians whose centre is not farther than this along the camera's z are not drawn.
-        backend: "numba" (CPU, float32), "reference" (dense torch, any device and float type, small scenes only) or
-            "auto": numba for float32 on the CPU, the reference otherwise.
+        backend: "numba" (float32 on the CPU), "triton" or "gsplat" (float32 on a CUDA GPU), "reference" (dense torch,
+            any device and float type, small scenes only) or "auto": the process's choice (`set_default`) where it
+            takes these tensors, else the fastest that does, else the reference.
 
     Returns:
         features [V, C, height, width], alpha [V, 1, height, width], and the info densification needs.
@@ -73,20 +71,11 @@ def rasterize(
         _check_finite(name, tensor)
     if not (eps2d >= 0 and near > 0):
         raise ValueError(f"expected eps2d >= 0 and near > 0, got eps2d={eps2d} and near={near}.")
-    chosen = _choose(backend, means)
-    return chosen(
+    render = backends.load(backends.resolve(backend, means.device, means.dtype))
+    return render(
         means, quats, scales, opacities, features, world_to_camera, intrinsics,
         int(width), int(height), background, float(eps2d), bool(antialias), float(near),
     )  # fmt: skip
-
-
-def _choose(backend: str, means: Tensor) -> Callable[..., tuple[Tensor, Tensor, RasterInfo]]:
-    if backend not in BACKENDS:
-        raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got '{backend}'.")
-    fits = means.dtype == torch.float32 and means.device.type == "cpu"
-    if backend == "numba" and not fits:
-        raise ValueError(f"backend 'numba': expected float32 on the CPU, got {means.dtype} on {means.device}.")
-    return reference.rasterize if backend == "reference" or not fits else cpu.rasterize
 
 
 def _check_gaussians(named: dict[str, Tensor]) -> None:

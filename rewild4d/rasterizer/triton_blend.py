@@ -1,0 +1,180 @@
+"""Blending and its gradient as Triton kernels: one program a tile, one lane a pixel, a group of Gaussians at a time.
+
+Shapes inside: P pixels of a tile, G Gaussians of a group. Scans run along G, which one thread holds whole; sums along
+P cross the threads, once a group. Nothing is added atomically, so the bits never differ. The sums over channels keep
+clear of [G, C, P]: summed over C, Triton makes a product in TF32 of it, and three digits are gone.
+With TRITON_INTERPRET=1 in the environment before Triton is imported the same code runs on the CPU, slowly.
+"""
+
+import math
+
+import triton
+import triton.language as tl
+
+from rewild4d.rasterizer import conventions, projection
+
+SIDE = tl.constexpr(16)
+"""A tile is 16 x 16 pixels."""
+PIXELS = tl.constexpr(256)
+GROUP = tl.constexpr(16)
+MOMENTS = tl.constexpr(6)
+"""Sums of q, q dx, q dy, q dx^2, q dx dy, q dy^2 that come before the channel sums in a slot, q = dL/dalpha alpha."""
+
+_MAX_ALPHA = tl.constexpr(conventions.MAX_ALPHA)
+_WEAKEST = tl.constexpr(projection.LOG2_MIN_ALPHA)
+_STRONGEST = tl.constexpr(math.log2(conventions.MAX_ALPHA))
+_LEAST_LEFT = tl.constexpr(conventions.MIN_TRANSMITTANCE)
+
+SIZES = ["width", "height", "across", "down", "count"]
+
+
+@triton.jit
+def _pixels(tile: tl.tensor, width: tl.tensor, height: tl.tensor, across: tl.tensor, down: tl.tensor) -> tuple:
+    """View of the tile; column and row of its pixels, [P]; whether they lie in the image, [P]."""
+    lane = tl.arange(0, PIXELS)
+    x = tile % across * SIDE + lane % SIDE
+    y = tile // across % down * SIDE + lane // SIDE
+    return tile // (across * down), x, y, (x < width) & (y < height)
+
+
+@triton.jit
+def _alphas(
+    entries: tl.tensor,
+    first: tl.tensor,
+    end: tl.tensor,
+    centres: tl.tensor,
+    records: tl.tensor,
+    x: tl.tensor,
+    y: tl.tensor,
+) -> tuple:
+    """The group's Gaussians and which are any, [G]; offsets, log2 of the uncapped alpha, and alpha, [G, P]."""
+    place = first + tl.arange(0, GROUP)
+    real = place < end
+    n = tl.load(entries + place, real, 0)
+    dx = (x + 0.5)[None, :] - tl.load(centres + n * 2, real, 0.0)[:, None]
+    dy = (y + 0.5)[None, :] - tl.load(centres + n * 2 + 1, real, 0.0)[:, None]
+    xx = tl.load(records + n * 4, real, 0.0)[:, None]
+    xy = tl.load(records + n * 4 + 1, real, 0.0)[:, None]
+    yy = tl.load(records + n * 4 + 2, real, 0.0)[:, None]
+    top = tl.load(records + n * 4 + 3, real, -1000.0)[:, None]
+    exponent = top + (xx * dx + xy * dy) * dx + yy * dy * dy
+    alpha = tl.where(exponent >= _WEAKEST, tl.minimum(tl.exp2(exponent), _MAX_ALPHA), 0.0)
+    return n, real, dx, dy, exponent, alpha
+
+
+@triton.jit
+def _weights(alpha: tl.tensor, left: tl.tensor) -> tuple:
+    """What is left behind each Gaussian were no pixel closed, and the Gaussian's share of the pixel, [G, P].
+
+    ``left`` [P] only falls, so a pixel is closed exactly where it is not above the least transmittance.
+    """
+    after = left[None, :] * tl.cumprod(1.0 - alpha, 0)
+    return after, tl.where(after > _LEAST_LEFT, after * (alpha / (1.0 - alpha)), 0.0)
+
+
+@triton.jit(do_not_specialize=SIZES)
+def blend(
+    starts: tl.tensor,
+    entries: tl.tensor,
+    centres: tl.tensor,
+    records: tl.tensor,
+    features: tl.tensor,
+    background: tl.tensor,
+    image: tl.tensor,
+    alpha_image: tl.tensor,
+    width: tl.tensor,
+    height: tl.tensor,
+    across: tl.tensor,
+    down: tl.tensor,
+    count: tl.tensor,
+    CHANNELS: tl.constexpr,
+    PART: tl.constexpr,
+) -> None:
+    """Fill image [V, C, h, w] and alpha [V, 1, h, w]; program (tile, part of the channels)."""
+    tile = tl.program_id(0)
+    view, x, y, inside = _pixels(tile, width, height, across, down)
+    first, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    channel = tl.program_id(1) * PART + tl.arange(0, PART)
+    real_channel = channel < CHANNELS
+    left = tl.where(inside, 1.0, 0.0)
+    through = left
+    total = tl.zeros((PART, PIXELS), tl.float32)
+    while (first < end) & (tl.max(left, 0) > _LEAST_LEFT):
+        n, real, _, _, _, alpha = _alphas(entries, first, end, centres, records, x, y)
+        after, weight = _weights(alpha, left)
+        place = (n - view * count)[:, None] * CHANNELS + channel[None, :]
+        shade = tl.load(features + place, real[:, None] & real_channel[None, :], 0.0)
+        total += tl.sum(weight[:, None, :] * shade[:, :, None], 0)
+        through = tl.minimum(through, tl.min(tl.where(after > _LEAST_LEFT, after, 1.0), 0))
+        left = tl.min(after, 0)
+        first += GROUP
+    behind = tl.load(background + view * CHANNELS + channel, real_channel, 0.0)
+    total += behind[:, None] * through[None, :]
+    rows = ((view.to(tl.int64) * CHANNELS + channel) * height)[:, None] + y[None, :]
+    tl.store(image + rows * width + x[None, :], total, real_channel[:, None] & inside[None, :])
+    if tl.program_id(1) == 0:
+        pixel = (view.to(tl.int64) * height + y) * width + x
+        tl.store(alpha_image + pixel, 1.0 - through, inside)
+
+
+@triton.jit(do_not_specialize=SIZES)
+def blend_backward(
+    starts: tl.tensor,
+    entries: tl.tensor,
+    slots: tl.tensor,
+    centres: tl.tensor,
+    records: tl.tensor,
+    features: tl.tensor,
+    image: tl.tensor,
+    alpha_image: tl.tensor,
+    g_image: tl.tensor,
+    g_alpha: tl.tensor,
+    sums: tl.tensor,
+    width: tl.tensor,
+    height: tl.tensor,
+    across: tl.tensor,
+    down: tl.tensor,
+    count: tl.tensor,
+    CHANNELS: tl.constexpr,
+) -> None:
+    """Fill the slots' rows of the zeroed sums [E, 6 + C]; program (tile).
+
+    Walks front to back as the blend does: what lies behind a Gaussian is the pixel's total minus the prefix.
+    """
+    tile = tl.program_id(0)
+    view, x, y, inside = _pixels(tile, width, height, across, down)
+    first, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    pixel = (view.to(tl.int64) * height + y) * width + x
+    plane = pixel + view * (CHANNELS - 1) * height.to(tl.int64) * width
+    area = height.to(tl.int64) * width
+    left = tl.where(inside, 1.0, 0.0)
+    # The loss's linear share of all that is blended: g.out minus T dL/dalpha.
+    through = 1.0 - tl.load(alpha_image + pixel, inside, 1.0)
+    behind = -through * tl.load(g_alpha + pixel, inside, 0.0)
+    for channel in range(CHANNELS):
+        slope = tl.load(g_image + plane + channel * area, inside, 0.0)
+        behind += slope * tl.load(image + plane + channel * area, inside, 0.0)
+    while (first < end) & (tl.max(left, 0) > _LEAST_LEFT):
+        n, real, dx, dy, exponent, alpha = _alphas(entries, first, end, centres, records, x, y)
+        after, weight = _weights(alpha, left)
+        row = sums + tl.load(slots + first + tl.arange(0, GROUP), real, 0) * (MOMENTS + CHANNELS)
+        shade = features + (n - view * count) * CHANNELS
+        drawn = tl.zeros((GROUP, PIXELS), tl.float32)
+        for channel in range(CHANNELS):
+            slope = tl.load(g_image + plane + channel * area, inside, 0.0)[None, :]
+            drawn += tl.load(shade + channel, real, 0.0)[:, None] * slope
+            tl.store(row + MOMENTS + channel, tl.sum(weight * slope, 1), real)
+        drawn *= weight
+        rest = behind[None, :] - tl.cumsum(drawn, 0)
+        # alpha dL/dalpha, where the pixel took this Gaussian and the cap did not hold it.
+        pull = tl.where((weight > 0.0) & (exponent <= _STRONGEST), drawn - rest * (alpha / (1.0 - alpha)), 0.0)
+        pull_x, pull_y = pull * dx, pull * dy
+        tl.store(row, tl.sum(pull, 1), real)
+        tl.store(row + 1, tl.sum(pull_x, 1), real)
+        tl.store(row + 2, tl.sum(pull_y, 1), real)
+        tl.store(row + 3, tl.sum(pull_x * dx, 1), real)
+        tl.store(row + 4, tl.sum(pull_x * dy, 1), real)
+        tl.store(row + 5, tl.sum(pull_y * dy, 1), real)
+        behind -= tl.sum(drawn, 0)
+        left = tl.min(after, 0)
+        first += GROUP

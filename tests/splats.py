@@ -1,0 +1,102 @@
+"""Scenes of Gaussians, and their images and gradients, for the rasterizer's tests."""
+
+import sys
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rewild4d.rasterizer import RasterInfo, rasterize
+
+NAMES = ("means", "quats", "scales", "opacities", "features", "world_to_camera", "intrinsics", "background")
+
+
+def scene(count: int, channels: int, views: int, width: int, height: int, seed: int) -> dict[str, Tensor]:
+    """A cloud around the origin seen from five units away, float64, every input `rasterize` differentiates."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    means = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    turn = 0.1 * torch.randn(views, 3, 3, generator=generator, dtype=torch.float64)
+    world_to_camera = torch.eye(4, dtype=torch.float64).repeat(views, 1, 1)
+    world_to_camera[:, :3, :3] = torch.linalg.matrix_exp(turn - turn.mT)
+    world_to_camera[:, 2, 3] = 5
+    pinhole = torch.tensor([[1.1 * width, 0, 0.45 * width], [0, 0.9 * width, 0.55 * height], [0, 0, 1]])
+    return {
+        "means": means,
+        "quats": torch.randn(count, 4, generator=generator, dtype=torch.float64),
+        "scales": 0.02 + 0.3 * uniform(count, 3),
+        "opacities": 0.05 + 0.9 * uniform(count),
+        "features": uniform(count, channels),
+        "world_to_camera": world_to_camera,
+        "intrinsics": pinhole.double().repeat(views, 1, 1),
+        "background": uniform(views, channels),
+    }
+
+
+def hard_scene(
+    kind: str, seed: int = 0, count: int = 300, channels: int = 3, views: int = 1, width: int = 70, height: int = 50
+) -> dict[str, Tensor]:
+    """The same cloud, spoilt in one way."""
+    made = scene(count, channels, views, width, height, seed)
+    if kind == "needles":
+        made["scales"][:, 0] *= 8
+        made["scales"][:, 1:] *= 0.01
+    elif kind == "sub-pixel":
+        made["scales"] *= 1e-3
+    elif kind == "behind":
+        made["means"][::2, 2] -= 8
+        made["means"][::3] *= 4
+    elif kind == "opaque":
+        made["opacities"][:] = 0.9999
+    elif kind == "faint":
+        made["opacities"] *= 0.02
+    elif kind == "huge":
+        made["scales"] *= 10
+    elif kind == "tied":
+        made["means"][1::2] = made["means"][::2]
+    return made
+
+
+def render(inputs: dict[str, Tensor], width: int, height: int, **options: Any) -> tuple[Tensor, Tensor, RasterInfo]:
+    background = inputs.get("background")
+    return rasterize(*(inputs[name] for name in NAMES[:-1]), width, height, background=background, **options)
+
+
+def loss_weights(image: Tensor) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(9)
+    shape = (image.shape[0], image.shape[1] + 1, *image.shape[2:])
+    weights = torch.randn(shape, generator=generator, dtype=torch.float64)
+    return weights[:, :-1], weights[:, -1:]
+
+
+def outcome(inputs: dict[str, Tensor], width: int, height: int, **options: Any) -> dict[str, Tensor]:
+    """Image, alpha, radii, and the gradient of a random loss by each input and by the centres ("d means", ...)."""
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
+    image, alpha, info = render(leaves, width, height, **options)
+    on_image, on_alpha = (weights.to(image) for weights in loss_weights(image))
+    ((image * on_image).sum() + (alpha * on_alpha).sum()).backward()
+    found = {f"d {name}": tensor.grad for name, tensor in (leaves | {"means2d": info.means2d}).items()}
+    return {"image": image.detach(), "alpha": alpha.detach(), "radii": info.radii} | found
+
+
+def gradients(inputs: dict[str, Tensor], width: int, height: int, **options: Any) -> tuple[Tensor, dict[str, Tensor]]:
+    made = outcome(inputs, width, height, **options)
+    return made["image"], {name[2:]: tensor for name, tensor in made.items() if name.startswith("d ")}
+
+
+def main(source: str, target: str) -> None:
+    """Write the single-precision outcomes, by the Triton backend and twice, of a file of cases."""
+    torch.set_num_threads(1)
+    cases = torch.load(source)
+    made = {}
+    for name, (inputs, width, height, options) in cases.items():
+        single = {key: tensor.float() for key, tensor in inputs.items()}
+        made[name] = [outcome(single, width, height, backend="triton", **options) for _ in range(2)]
+    torch.save(made, target)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
