@@ -24,13 +24,22 @@ _config: Any = numba.config
 _CACHE = Path(_config.CACHE_DIR or cache_folder() / "kernels")
 
 
+def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A part of a kernel that is copied into each of its callers: calls that pass arrays cost a hundred cycles."""
+    return _compiled(function, {"inline": "always"})
+
+
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function on its first call, without the GIL, and keep the machine code in the cache folder.
 
     It may call kernels of its own folder and of this one. Where no cache folder can be written it is compiled anew in
     every process.
     """
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    return _compiled(function, {})
+
+
+def _compiled(function: Callable[..., Any], more: dict[str, Any]) -> Callable[..., Any]:
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", **more}
     before = _config.CACHE_DIR
     _config.CACHE_DIR = str(_CACHE / _sources_digest(Path(function.__code__.co_filename).parent))
     try:

@@ -114,6 +114,19 @@ def load(typing: Any, array: Any, index: Any) -> Any:
 
 
 @intrinsic
+def broadcast(typing: Any, array: Any, index: Any) -> Any:
+    """One number of an array in all lanes; the index is not checked and not counted from the end."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        one = ir.Constant(_VECTOR, ir.Undefined)
+        one = builder.insert_element(one, builder.load(builder.gep(data, [args[1]])), ir.Constant(_INT, 0))
+        return builder.shuffle_vector(one, one, ir.Constant(_INTEGERS, [0] * LANES))
+
+    return signature(lanes_type, array, types.intp), generate
+
+
+@intrinsic
 def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
     """Write sixteen consecutive numbers of an array."""
 

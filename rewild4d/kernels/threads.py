@@ -2,7 +2,8 @@
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from queue import SimpleQueue
 from typing import Any
 
@@ -45,9 +46,30 @@ def _work(jobs: "SimpleQueue[_Job]") -> None:
         outcome.done.release()
 
 
+_own_count: int | None = None
+
+
 def thread_count() -> int:
-    """How many threads to use: torch's own number, so that one setting governs everything."""
-    return torch.get_num_threads()
+    """How many threads to use: torch's own number, so that one setting governs everything, but see `torch_on_one`."""
+    return _own_count or torch.get_num_threads()
+
+
+@contextmanager
+def torch_on_one() -> Iterator[None]:
+    """Leave the threads to the kernels: torch itself computes on one meanwhile.
+
+    After a parallel operation torch's OpenMP threads spin for some milliseconds, and a kernel that starts then has to
+    share its cores with them: on two cores it gained nothing from the second.
+    """
+    global _own_count
+    before, threads = _own_count, torch.get_num_threads()
+    _own_count = thread_count()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        _own_count = before
+        torch.set_num_threads(threads)
 
 
 def run(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> None:

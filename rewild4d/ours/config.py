@@ -80,7 +80,7 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     enabled: bool = True
     """False is the paper's "w/o Deform" ablation."""
-    width: int = 128
+    width: int = 64
     """Hidden width; the dearest network of the method, its cost grows with the square."""
     heads: int = 4
     """Attention heads over the parts."""

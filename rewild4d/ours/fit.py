@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from rewild4d.contracts import Log
+from rewild4d.kernels.threads import torch_on_one
 from rewild4d.ours.canonical import NAMES
 from rewild4d.ours.checkpoint import fit_digest, load_checkpoint, save_checkpoint
 from rewild4d.ours.coloring import initial_colors
@@ -16,6 +17,7 @@ from rewild4d.ours.config import Config, Rates
 from rewild4d.ours.deform import Posed
 from rewild4d.ours.density import DensityControl
 from rewild4d.ours.geometry_losses import compact_loss, neighbours, rigid_loss, smooth_loss, tv_loss
+from rewild4d.ours.gradients import clip_gradients
 from rewild4d.ours.losses import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.pose import blend_poses, pose_distance
@@ -192,7 +194,7 @@ class Training:
 
     def _check_gradients(self, index: int) -> None:
         """Bound the networks' gradients; a value that is not finite stops the fit with its name."""
-        norms = [nn.utils.clip_grad_norm_(self.groups[name], self.config.rates.clip) for name in ("pose", "deform")]
+        norms = [clip_gradients(self.groups[name], self.config.rates.clip) for name in ("pose", "deform")]
         sums = [parameter.grad.sum() for parameter in self.model.gaussians.parameters() if parameter.grad is not None]
         if torch.isfinite(torch.stack(norms + sums)).all():
             return
@@ -269,22 +271,33 @@ def train(
         main.restore(saved["main"])
         warmup.optimizer.load_state_dict(saved["warmup"])
         generator.set_state(saved["generator"])
-    total = warmup.total + config.iterations
-    for index in range(start, total):
-        if index == warmup.total:
-            model.gaussians.colors.data[:, 0] = initial_colors(model, supervision)
-        figures = warmup.step(index) if index < warmup.total else main.step(index - warmup.total)
-        if index % LOG_EVERY == 0 or index + 1 == total:
-            log(index + 1, total, figures)
-        if workdir is not None and (index + 1) % config.checkpoint_every == 0 and index + 1 < total:
-            state = {
-                "step": index + 1,
-                "main": main.state(),
-                "warmup": warmup.optimizer.state_dict(),
-                "generator": generator.get_state(),
-            }
-            save_checkpoint(workdir, identity, state)
+    with torch_on_one():
+        for index in range(start, warmup.total + config.iterations):
+            _iterate(index, warmup, main, log)
+            if workdir is not None and (index + 1) % config.checkpoint_every == 0:
+                _save(workdir, identity, index + 1, warmup, main)
     return model
+
+
+def _iterate(index: int, warmup: WarmUp, main: Training, log: Log) -> None:
+    total = warmup.total + main.config.iterations
+    if index == warmup.total:
+        main.model.gaussians.colors.data[:, 0] = initial_colors(main.model, main.supervision)
+    figures = warmup.step(index) if index < warmup.total else main.step(index - warmup.total)
+    if index % LOG_EVERY == 0 or index + 1 == total:
+        log(index + 1, total, figures)
+
+
+def _save(workdir: Path, identity: str, step: int, warmup: WarmUp, main: Training) -> None:
+    if step == warmup.total + main.config.iterations:
+        return
+    state = {
+        "step": step,
+        "main": main.state(),
+        "warmup": warmup.optimizer.state_dict(),
+        "generator": main.generator.get_state(),
+    }
+    save_checkpoint(workdir, identity, state)
 
 
 def _fixed_rate(rates: Rates, name: str) -> float:

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -116,9 +117,17 @@ def _check_cameras(world_to_camera: Tensor, intrinsics: Tensor, width: int, heig
             )
 
 
+def _total(tensor: Tensor) -> float:
+    if tensor.device.type != "cpu":
+        return tensor.sum().item()
+    # NumPy's sum wakes no OpenMP threads, see `cpu._zeros`.
+    with np.errstate(all="ignore"):
+        return float(tensor.numpy().sum())
+
+
 def _check_finite(name: str, tensor: Tensor) -> None:
     # A sum is one fast pass and is finite unless something in it is not (or it overflows, then the slow look decides).
-    if math.isfinite(tensor.detach().sum().item()):
+    if math.isfinite(_total(tensor.detach())):
         return
     bad = (~torch.isfinite(tensor.detach())).nonzero()
     if len(bad):

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import (
     LANES,
     bits_gt,
+    broadcast,
     columns_of_block,
     exp2,
     fma,
@@ -45,22 +46,26 @@ STRONGEST_ALPHA = np.float32(MAX_ALPHA)
 LEAST_LEFT = np.float32(MIN_TRANSMITTANCE)
 
 
-@kernel
+@inlined
 def form(records: np.ndarray, record: int) -> tuple:
     """The four coefficients of one Gaussian's exponent, each in all lanes."""
-    xx, xy, yy = records[record + XX], records[record + XY], records[record + YY]
-    return splat(xx), splat(xy), splat(yy), splat(records[record + LOG_OPACITY])
+    return (
+        broadcast(records, record + XX),
+        broadcast(records, record + XY),
+        broadcast(records, record + YY),
+        broadcast(records, record + LOG_OPACITY),
+    )
 
 
-@kernel
+@inlined
 def offsets(records: np.ndarray, record: int, tile_left: int, tile_top: int) -> tuple:
     """From the Gaussian's centre to the pixel centres of the tile's first block, two vectors."""
-    dx = splat(np.float32(tile_left + 0.5 - records[record + CENTER_X]))
-    dy = splat(np.float32(tile_top + 0.5 - records[record + CENTER_Y]))
+    left, top = splat(np.float32(tile_left + 0.5)), splat(np.float32(tile_top + 0.5))
+    dx, dy = left - broadcast(records, record + CENTER_X), top - broadcast(records, record + CENTER_Y)
     return columns_of_block() + dx, rows_of_block() + dy
 
 
-@kernel
+@inlined
 def exponent_at(form: tuple, offset_x: Any, offset_y: Any, block: int) -> tuple:
     """The offsets of one block's pixels from the centre, and log2 of alpha there before the cap."""
     xx, xy, yy, log_opacity = form
@@ -69,7 +74,7 @@ def exponent_at(form: tuple, offset_x: Any, offset_y: Any, block: int) -> tuple:
     return dx, dy, fma(fma(xx, dx, xy * dy), dx, fma(yy, dy * dy, log_opacity))
 
 
-@kernel
+@inlined
 def open_tile(tile_left: int, tile_top: int, width: int, height: int, transmittance: np.ndarray) -> int:
     """Set transmittance to 1 inside the image and 0 outside; give the bits of the blocks that hold a pixel."""
     if tile_left + TILE <= width and tile_top + TILE <= height:
@@ -134,13 +139,13 @@ def blend(
         _write_tile(view, tile_left, tile_top, final, colors, background, image, alpha)
 
 
-@kernel
+@inlined
 def tile_place(tile: int, tiles_x: int, tiles_y: int) -> tuple:
     """View, top and left pixel of a tile."""
     return tile // (tiles_x * tiles_y), tile // tiles_x % tiles_y * TILE, tile % tiles_x * TILE
 
 
-@kernel
+@inlined
 def _blend_entry(
     bits: int,
     records: np.ndarray,
@@ -175,11 +180,11 @@ def _blend_entry(
         closed |= (bits_gt(after, zero) == 0) << block
         for channel in range(channels):
             place = (block * channels + channel) * LANES
-            store(colors, place, fma(weight, splat(features[feature + channel]), load(colors, place)))
+            store(colors, place, fma(weight, broadcast(features, feature + channel), load(colors, place)))
     return touched, closed
 
 
-@kernel
+@inlined
 def _write_tile(
     view: int,
     tile_left: int,
@@ -202,7 +207,7 @@ def _write_tile(
             _write_block(pixels, (view * channels + channel) * height, x, y, width, height, color)
 
 
-@kernel
+@inlined
 def _write_block(plane: np.ndarray, first_row: int, x: int, y: int, width: int, height: int, value: Any) -> None:
     """Store the part of a block that lies in the image."""
     corner = (first_row + y) * width + x

@@ -9,16 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.compiling import inlined, kernel
+from rewild4d.kernels.rows import sum_rows
 from rewild4d.kernels.simd import (
     LANES,
+    broadcast,
     divide,
     exp2,
     fma,
-    fold1,
-    fold2,
-    fold4,
-    fold8,
     keep_where_ge,
     load,
     load_block,
@@ -58,7 +56,7 @@ def slot_width(channels: int) -> int:
 _slot_width = kernel(slot_width)
 
 
-@kernel
+@inlined
 def _read_block(plane: np.ndarray, first_row: int, x: int, y: int, width: int, height: int) -> Any:
     """Load a block, zero where it leaves the image."""
     corner = (first_row + y) * width + x
@@ -115,7 +113,7 @@ def blend_backward(
                 )  # fmt: skip
 
 
-@kernel
+@inlined
 def _read_tile(
     view: int,
     tile_left: int,
@@ -143,7 +141,7 @@ def _read_tile(
         store(behind, block * LANES, total)
 
 
-@kernel
+@inlined
 def _entry_backward(
     bits: int,
     records: np.ndarray,
@@ -180,7 +178,7 @@ def _entry_backward(
         along = zero
         for channel in range(channels):
             slope = load(gradients, (block * channels + channel) * LANES)
-            along = fma(slope, splat(features[feature + channel]), along)
+            along = fma(slope, broadcast(features, feature + channel), along)
             row = (MOMENTS + channel) * LANES
             store(rows, row, fma(weight, slope, load(rows, row)))
         rest = load(behind, block * LANES) - weight * along
@@ -199,28 +197,7 @@ def _entry_backward(
     store(rows, 3 * LANES, mxx)
     store(rows, 4 * LANES, mxy)
     store(rows, 5 * LANES, myy)
-    _sum_rows(rows, MOMENTS + channels, sums, place)
-
-
-@kernel
-def _four_rows(rows: np.ndarray, first: int, count: int) -> Any:
-    zero = splat(np.float32(0))
-    if first >= count:
-        return zero
-    a = load(rows, first * LANES)
-    b = load(rows, (first + 1) * LANES) if first + 1 < count else zero
-    c = load(rows, (first + 2) * LANES) if first + 2 < count else zero
-    d = load(rows, (first + 3) * LANES) if first + 3 < count else zero
-    return fold2(fold1(a, b), fold1(c, d))
-
-
-@kernel
-def _sum_rows(rows: np.ndarray, count: int, sums: np.ndarray, place: int) -> None:
-    """Write the sum of each vector in ``rows`` to sums[place:], sixteen at a time."""
-    for first in range(0, count, LANES):
-        near = fold4(_four_rows(rows, first, count), _four_rows(rows, first + 4, count))
-        far = fold4(_four_rows(rows, first + 8, count), _four_rows(rows, first + 12, count))
-        store(sums, place + first, fold8(near, far))
+    sum_rows(rows, MOMENTS + channels, sums, place)
 
 
 @kernel

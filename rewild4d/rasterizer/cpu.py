@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from rewild4d.kernels.memory import keep_freed_memory
 from rewild4d.kernels.threads import run, spans, thread_count
 from rewild4d.rasterizer.binning import (
     BLOCK_LEFT,
@@ -26,6 +27,8 @@ from rewild4d.rasterizer.blending import blend
 from rewild4d.rasterizer.blending_backward import blend_backward, gather_slots, slot_width
 from rewild4d.rasterizer.conventions import RasterInfo
 from rewild4d.rasterizer.projection import CHUNK, RECORD, project, project_backward
+
+keep_freed_memory()
 
 SERIAL_BELOW = 512
 """Gaussians for which waking a second thread costs more than it saves."""
@@ -61,6 +64,11 @@ def rasterize(
 
 def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
+
+
+def _zeros(*shape: int) -> Tensor:
+    # Not torch's: filled by its OpenMP threads, which then spin and take the cores from the next kernel.
+    return torch.from_numpy(np.zeros(shape, np.float32))
 
 
 class _Project(torch.autograd.Function):
@@ -99,7 +107,7 @@ class _Project(torch.autograd.Function):
         views, count = radii.shape
         arrays = tuple(_array(tensor) for tensor in inputs[:4])
         cameras = _array(world_to_camera.double()), _array(intrinsics.double())
-        gradients = [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in inputs[:4]]
+        gradients = [_zeros(*tensor.shape) for tensor in inputs[:4]]
         outputs = tuple(_array(tensor) for tensor in gradients)
         chunks = max(1, -(-count // CHUNK))
         v_cameras, v_pinholes = np.zeros((chunks, views, 3, 4)), np.zeros((chunks, views, 4))
@@ -217,9 +225,11 @@ class _Blend(torch.autograd.Function):
             _array(g_image), _array(g_alpha), sums,
         )  # fmt: skip
         run(blend_backward, [call] * _blend_threads(lists))
-        v_means2d = torch.zeros(*records.shape[:2], 2)
-        v_records = torch.zeros_like(records)
-        v_features = torch.zeros(features.shape)
+        v_means2d, v_records, v_features = (
+            _zeros(*records.shape[:2], 2),
+            _zeros(*records.shape),
+            _zeros(*features.shape),
+        )
         outputs = (v_means2d.numpy(), v_records.numpy(), v_features.numpy())
         given = (lists.order, lists.slots, lists.pair_bits, records.numpy(), sums, width)
         for view in range(records.shape[0]):

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rewild4d.harmonics import C1, C2, C3
-from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import take_ticket
 from rewild4d.kernels.threads import run, thread_count
 
@@ -20,12 +20,12 @@ CHUNK = 1024
 """Gaussians a unit of work holds."""
 
 
-@kernel
+@inlined
 def _cross(a: tuple, b: tuple) -> tuple:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@kernel
+@inlined
 def _direction(means: np.ndarray, quats: np.ndarray, rest: np.ndarray, n: int, eye: np.ndarray) -> tuple:
     """Unit direction from the eye to a Gaussian, as the Gaussian saw it at rest."""
     x, y, z = means[n, 0] - eye[0], means[n, 1] - eye[1], means[n, 2] - eye[2]
@@ -48,7 +48,7 @@ def _direction(means: np.ndarray, quats: np.ndarray, rest: np.ndarray, n: int, e
     )
 
 
-@kernel
+@inlined
 def _basis(direction: tuple, degree: int, values: np.ndarray) -> None:
     """Values of the basis functions above degree 0."""
     x, y, z = direction
@@ -92,6 +92,7 @@ def _backward(
 ) -> None:  # fmt: skip
     values = np.empty(15, np.float32)
     count = (degree + 1) ** 2 - 1
+    zero, share_of_one = np.float32(0), np.float32(1 / gain)
     while True:
         begin = take_ticket(tickets) * CHUNK
         if begin >= len(means):
@@ -99,11 +100,17 @@ def _backward(
         for n in range(begin, min(begin + CHUNK, len(means))):
             _basis(_direction(means, quats, rest, n, eye), degree, values)
             on_colors[n] = 0
-            for channel in range(3):
-                if seen[n, channel] > 0:
-                    on_colors[n, 0, channel] = slope[n, channel]
-                    for k in range(count):
-                        on_colors[n, k + 1, channel] = values[k] * slope[n, channel] / np.float32(gain)
+            red, green, blue = (
+                slope[n, 0] if seen[n, 0] > 0 else zero,
+                slope[n, 1] if seen[n, 1] > 0 else zero,
+                slope[n, 2] if seen[n, 2] > 0 else zero,
+            )
+            on_colors[n, 0, 0], on_colors[n, 0, 1], on_colors[n, 0, 2] = red, green, blue
+            for k in range(count):
+                share = values[k] * share_of_one
+                on_colors[n, k + 1, 0] = share * red
+                on_colors[n, k + 1, 1] = share * green
+                on_colors[n, k + 1, 2] = share * blue
 
 
 def seen_rgb(

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.compiling import inlined, kernel
+from rewild4d.kernels.rows import add_scaled, sum_rows
 from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
 from rewild4d.kernels.threads import run, thread_count
 
@@ -19,7 +20,7 @@ CHUNK = 1024
 """Gaussians a unit of work holds; gradients of the joints are summed over these, whatever the number of threads."""
 
 
-@kernel
+@inlined
 def _leader(weights: np.ndarray, n: int) -> int:
     """The joint of the largest weight, the first of equals."""
     best = 0
@@ -29,7 +30,7 @@ def _leader(weights: np.ndarray, n: int) -> int:
     return best
 
 
-@kernel
+@inlined
 def _unit(quats: np.ndarray, n: int) -> tuple:
     """A quaternion of length one, and one over its length before."""
     a, b, c, d = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
@@ -37,7 +38,7 @@ def _unit(quats: np.ndarray, n: int) -> tuple:
     return a * inverse, b * inverse, c * inverse, d * inverse, inverse
 
 
-@kernel
+@inlined
 def _times(p: tuple, q: tuple) -> tuple:
     return (
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
@@ -47,12 +48,12 @@ def _times(p: tuple, q: tuple) -> tuple:
     )
 
 
-@kernel
+@inlined
 def _conjugate(q: tuple) -> tuple:
     return q[0], -q[1], -q[2], -q[3]
 
 
-@kernel
+@inlined
 def _unit_slope(unit: tuple, slope: tuple) -> tuple:
     """Gradient of a quaternion from that of its unit quaternion, given with one over the length."""
     inverse = unit[4]
@@ -63,7 +64,7 @@ def _unit_slope(unit: tuple, slope: tuple) -> tuple:
     )  # fmt: skip
 
 
-@kernel
+@inlined
 def _blend(weights: np.ndarray, n: int, leader: int, rows: np.ndarray, blended: np.ndarray) -> None:
     """The weighted sum of the joints' rows, with the signs that suit the leader."""
     joints = weights.shape[1]
@@ -106,7 +107,7 @@ def _backward(
     """Set the gradients; on_rows [chunks, J x 16] gets the live branch's alone."""
     joints = weights.shape[1]
     blended, slope, live = np.empty(LANES, np.float32), np.empty(LANES, np.float32), np.empty(LANES, np.float32)
-    products = np.empty(LANES, np.float32)
+    products, sums = np.empty(joints * LANES, np.float32), np.empty(joints + LANES, np.float32)
     while True:
         chunk = take_ticket(tickets)
         if chunk * CHUNK >= len(means):
@@ -137,13 +138,12 @@ def _backward(
             by_weight, by_row = load(slope, 0), load(live, 0)
             for joint in range(joints):
                 pair = (leader * joints + joint) * LANES
-                store(products, 0, by_weight * load(rows, pair))
-                total = np.float32(0)
-                for i in range(LANES):
-                    total += products[i]
-                on_weights[n, joint] = total
+                store(products, joint * LANES, by_weight * load(rows, pair))
                 share = splat(weights[n, joint]) * load(signs, pair)
                 store(mine, joint * LANES, fma(by_row, share, load(mine, joint * LANES)))
+            sum_rows(products, joints, sums, 0)
+            for joint in range(joints):
+                on_weights[n, joint] = sums[joint]
 
 
 def _tables(transforms: Tensor, quats: Tensor) -> tuple[np.ndarray, np.ndarray]:
@@ -208,7 +208,7 @@ class _Skin(torch.autograd.Function):
         return *made, on_transforms, total[:, 12:].contiguous()
 
 
-@kernel
+@inlined
 def _corner(points: np.ndarray, n: int, axis: int, origin: np.ndarray, pitch: np.ndarray, last: int) -> tuple:
     """Voxel below a point along one axis, and the share of the one above; outside the cube the border counts."""
     place = min(max((points[n, axis] - origin[axis]) / pitch[axis], np.float32(0)), np.float32(last))
@@ -219,9 +219,9 @@ def _corner(points: np.ndarray, n: int, axis: int, origin: np.ndarray, pitch: np
 @kernel
 def _sample_forward(
     tickets: np.ndarray, table: np.ndarray, points: np.ndarray, origin: np.ndarray, pitch: np.ndarray, size: int,
-    weights: np.ndarray,
+    joints: int, weights: np.ndarray,
 ) -> None:  # fmt: skip
-    joints = weights.shape[1]
+    """Set the rows of weights; it and the table are flat."""
     while True:
         begin = take_ticket(tickets) * CHUNK
         if begin >= len(points):
@@ -230,15 +230,14 @@ def _sample_forward(
             x, ahead_x = _corner(points, n, 0, origin, pitch, size - 1)
             y, ahead_y = _corner(points, n, 1, origin, pitch, size - 1)
             z, ahead_z = _corner(points, n, 2, origin, pitch, size - 1)
-            weights[n] = 0
+            weights[n * joints : (n + 1) * joints] = 0
             for i in range(2):
                 for j in range(2):
                     for k in range(2):
                         share = (ahead_x if i else 1 - ahead_x) * (ahead_y if j else 1 - ahead_y)
                         share = np.float32(share * (ahead_z if k else 1 - ahead_z))
                         row = ((x + i) * size + y + j) * size + z + k
-                        for joint in range(joints):
-                            weights[n, joint] += share * table[row, joint]
+                        add_scaled(share, table, row * joints, weights, n * joints, joints)
 
 
 @kernel
@@ -261,15 +260,18 @@ def _sort_by_plane(
 @kernel
 def _sample_backward(
     tickets: np.ndarray, points: np.ndarray, origin: np.ndarray, pitch: np.ndarray, size: int, order: np.ndarray,
-    starts: np.ndarray, slope: np.ndarray, on_table: np.ndarray,
+    starts: np.ndarray, joints: int, slope: np.ndarray, on_table: np.ndarray,
 ) -> None:  # fmt: skip
-    """Set on_table plane by plane: first from the points below a plane, then from those above it, each in order."""
-    joints = slope.shape[1]
+    """Set on_table plane by plane: first from the points below a plane, then from those above it, each in order.
+
+    It and the slope are flat.
+    """
+    line = size * size * joints
     while True:
         plane = take_ticket(tickets)
         if plane >= size:
             return
-        on_table[plane * size * size : (plane + 1) * size * size] = 0
+        on_table[plane * line : (plane + 1) * line] = 0
         for upper in (1, 0):
             if plane < upper:
                 continue
@@ -284,8 +286,7 @@ def _sample_backward(
                         share = along * (ahead_y if j else 1 - ahead_y)
                         share = np.float32(share * (ahead_z if k else 1 - ahead_z))
                         row = (plane * size + y + j) * size + z + k
-                        for joint in range(joints):
-                            on_table[row, joint] += share * slope[n, joint]
+                        add_scaled(share, slope, n * joints, on_table, row * joints, joints)
 
 
 def sample_grid(table: Tensor, points: Tensor, origin: Tensor, pitch: Tensor, size: int) -> Tensor:
@@ -309,7 +310,8 @@ class _Sample(torch.autograd.Function):
     def forward(ctx: Any, table: Tensor, points: Tensor, origin: Tensor, pitch: Tensor, size: int) -> Tensor:
         weights = table.new_empty(len(points), table.shape[1])
         place = *map(_array, (points, origin, pitch)), size
-        run(_sample_forward, [(np.zeros(1, np.int64), _array(table), *place, weights.numpy())] * thread_count())
+        call = np.zeros(1, np.int64), _array(table).ravel(), *place, table.shape[1], weights.numpy().ravel()
+        run(_sample_forward, [call] * thread_count())
         ctx.place = place
         return weights
 
@@ -320,6 +322,7 @@ class _Sample(torch.autograd.Function):
         order, starts = np.empty(len(points), np.int32), np.empty(size + 1, np.int64)
         _sort_by_plane(*ctx.place, order, starts)
         on_table = torch.empty(size**3, slope.shape[1])
-        call = np.zeros(1, np.int64), *ctx.place, order, starts, _array(slope), on_table.numpy()
+        joints = slope.shape[1]
+        call = np.zeros(1, np.int64), *ctx.place, order, starts, joints, _array(slope).ravel(), on_table.numpy().ravel()
         run(_sample_backward, [call] * thread_count())
         return on_table, None, None, None, None

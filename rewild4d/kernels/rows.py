@@ -1,0 +1,40 @@
+"""Sums over vectors and rows of any length, for kernels on the sixteen lanes of simd.py."""
+
+from typing import Any
+
+import numpy as np
+
+from rewild4d.kernels.compiling import inlined
+from rewild4d.kernels.simd import LANES, fma, fold1, fold2, fold4, fold8, load, splat, store
+
+
+@inlined
+def _four_rows(rows: np.ndarray, first: int, count: int) -> Any:
+    zero = splat(np.float32(0))
+    if first >= count:
+        return zero
+    a = load(rows, first * LANES)
+    b = load(rows, (first + 1) * LANES) if first + 1 < count else zero
+    c = load(rows, (first + 2) * LANES) if first + 2 < count else zero
+    d = load(rows, (first + 3) * LANES) if first + 3 < count else zero
+    return fold2(fold1(a, b), fold1(c, d))
+
+
+@inlined
+def sum_rows(rows: np.ndarray, count: int, sums: np.ndarray, place: int) -> None:
+    """Write the sum of each of ``count`` vectors in ``rows`` to sums[place:], sixteen at a time."""
+    for first in range(0, count, LANES):
+        near = fold4(_four_rows(rows, first, count), _four_rows(rows, first + 4, count))
+        far = fold4(_four_rows(rows, first + 8, count), _four_rows(rows, first + 12, count))
+        store(sums, place + first, fold8(near, far))
+
+
+@inlined
+def add_scaled(share: float, source: np.ndarray, start: int, target: np.ndarray, place: int, count: int) -> None:
+    """Add ``share`` times source[start : start + count] to target[place:], both 1D."""
+    whole = count // LANES * LANES
+    factor = splat(share)
+    for i in range(0, whole, LANES):
+        store(target, place + i, fma(factor, load(source, start + i), load(target, place + i)))
+    for i in range(whole, count):
+        target[place + i] += share * source[start + i]
