@@ -9,6 +9,7 @@ import numpy as np
 
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.matrix import add_product, transpose_tile
+from rewild4d.kernels.rows import sum_rows
 from rewild4d.kernels.simd import LANES, divide, exp2, fma, load, maximum, select_gt, splat, store
 
 BLOCK = 48
@@ -100,11 +101,15 @@ def _layer_gradient(
         for lane in range(0, BLOCK, LANES):
             transpose_tile(given, feature * BLOCK + lane, BLOCK, turned, lane * columns + feature, columns)
     add_product(slope, 0, BLOCK, 1, turned, 0, columns, BLOCK, gradient, first, columns, rows, columns)
+    # Scratch again: each row's three vectors become one, then one number.
     for row in range(rows):
-        total = np.float32(0)
-        for lane in range(BLOCK):
-            total += slope[row * BLOCK + lane]
-        gradient[first + rows * columns + row] += total
+        place = row * BLOCK
+        total = load(slope, place) + load(slope, place + LANES) + load(slope, place + 2 * LANES)
+        store(turned, row * LANES, total)
+    sum_rows(turned, rows, turned, 0)
+    bias = first + rows * columns
+    for row in range(0, rows, LANES):
+        store(gradient, bias + row, load(gradient, bias + row) + load(turned, row))
 
 
 @kernel
