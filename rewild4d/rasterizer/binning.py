@@ -48,19 +48,29 @@ def _tile_rectangle(records: np.ndarray, view: int, n: int, tiles_x: int, tiles_
 
 
 @kernel
+def _sort_run(run: np.ndarray, depths: np.ndarray) -> None:
+    """Sort indices by depth, stable; a run is short unless thousands share one plane."""
+    for k in range(1, len(run)):
+        if depths[run[k]] < depths[run[k - 1]]:
+            run[:] = run[np.argsort(depths[run], kind="mergesort")]
+            return
+
+
+@kernel
 def sort_by_depth(
     view: int, radii: np.ndarray, depths: np.ndarray, order: np.ndarray, keys: np.ndarray, spare: np.ndarray
 ) -> int:
     """Write the visible Gaussians of one view, nearest first (ties by index), to order[view]; give their number.
 
-    ``keys`` and ``spare`` are int64 scratch of length N: depth bits above, index below.
+    ``keys`` and ``spare`` are int64 scratch of length N: bits of the depth in single precision above, index below. What
+    is equal so is put right afterwards.
     """
-    bits = depths.view(np.int32)
+    bits = depths[view].astype(np.float32).view(np.int32)
     histogram = np.zeros((3, RADIX), np.int64)
     count = 0
     for n in range(radii.shape[1]):
         if radii[view, n] > 0:
-            key = np.int64(bits[view, n])
+            key = np.int64(bits[n])
             keys[count] = (key << 32) | n
             histogram[0, key & (RADIX - 1)] += 1
             histogram[1, (key >> RADIX_BITS) & (RADIX - 1)] += 1
@@ -78,8 +88,14 @@ def sort_by_depth(
             spare[histogram[digit, value]] = keys[k]
             histogram[digit, value] += 1
         keys, spare = spare, keys
+    first = 0
     for k in range(count):
         order[view, k] = keys[k] & 0xFFFFFFFF
+        if keys[k] >> 32 != keys[first] >> 32:
+            if k > first + 1:
+                _sort_run(order[view, first:k], depths[view])
+            first = k
+    _sort_run(order[view, first:count], depths[view])
     return count
 
 

@@ -87,7 +87,7 @@ class _Project(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         views, count = world_to_camera.shape[0], means.shape[0]
         means2d, records = means.new_empty(views, count, 2), means.new_empty(views, count, RECORD)
-        radii, depths = means.new_empty(views, count), means.new_empty(views, count)
+        radii, depths = means.new_empty(views, count), means.new_empty(views, count, dtype=torch.float64)
         gaussians = tuple(_array(tensor) for tensor in (means, quats, scales, opacities))
         cameras = _array(world_to_camera.double()), _array(intrinsics.double())
         outputs = tuple(_array(tensor) for tensor in (means2d, records, radii, depths))
