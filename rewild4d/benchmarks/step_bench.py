@@ -13,6 +13,7 @@ from rewild4d.benchmarks.results import OURS, Row, timed_row
 from rewild4d.benchmarks.scenes import posed_clip, step_config, training
 from rewild4d.benchmarks.timing import Sample, measure, progress
 from rewild4d.harmonics import seen_colors
+from rewild4d.kernels.threads import torch_on_one
 from rewild4d.ours.config import Config, WarmUp
 from rewild4d.ours.method import Ours
 from rewild4d.rasterizer import rasterize
@@ -79,10 +80,11 @@ class Stepper:
         self.period, self.taken = loss_period(self.training.config), 0
 
     def turn(self) -> None:
-        """Take `period` steps."""
-        for _ in range(self.period):
-            self.training.step(self.first + self.taken % (SPAN * self.period))
-            self.taken += 1
+        """Take `period` steps, as `ours.fit.train` does."""
+        with torch_on_one():
+            for _ in range(self.period):
+                self.training.step(self.first + self.taken % (SPAN * self.period))
+                self.taken += 1
 
     def operators(self, turns: int) -> list[Row]:
         """Which of torch's operators and of our autograd functions take the time, as shares of all."""

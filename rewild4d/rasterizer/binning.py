@@ -7,7 +7,7 @@ place before that last sort (Gaussian by Gaussian) is its `slot`: the backward p
 
 import numpy as np
 
-from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import bits_gt, fma, load, maximum, minimum, splat
 from rewild4d.rasterizer.projection import (
     CENTER_X,
@@ -34,7 +34,7 @@ RADIX_BITS = 11
 RADIX = 1 << RADIX_BITS
 
 
-@kernel
+@inlined
 def _tile_rectangle(records: np.ndarray, view: int, n: int, tiles_x: int, tiles_y: int) -> tuple:
     """First and one past the last tile column and row that hold a pixel centre of the bounding rectangle."""
     x, y = np.float64(records[view, n, CENTER_X]), np.float64(records[view, n, CENTER_Y])
@@ -119,7 +119,7 @@ def count_slots(
     return first
 
 
-@kernel
+@inlined
 def _reached_blocks(
     records: np.ndarray, view: int, n: int, left: int, top: int, block_left: np.ndarray, block_top: np.ndarray
 ) -> int:

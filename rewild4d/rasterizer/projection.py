@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.rasterizer.conventions import FRUSTUM_MARGIN, MIN_ALPHA, MIN_COMPENSATION
 
 # Columns of a record.
@@ -21,29 +21,29 @@ HALF_LOG2_E = 0.5 / math.log(2.0)
 LOG2_MIN_ALPHA = math.log2(MIN_ALPHA)
 
 
-@kernel
+@inlined
 def _dot(a: tuple, b: tuple) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@kernel
+@inlined
 def _mix(x: float, a: tuple, y: float, b: tuple) -> tuple:
     return x * a[0] + y * b[0], x * a[1] + y * b[1], x * a[2] + y * b[2]
 
 
-@kernel
+@inlined
 def _row(matrix: np.ndarray, view: int, row: int) -> tuple:
     return matrix[view, row, 0], matrix[view, row, 1], matrix[view, row, 2]
 
 
-@kernel
+@inlined
 def _unit_quat(quats: np.ndarray, n: int) -> tuple:
     w, x, y, z = np.float64(quats[n, 0]), np.float64(quats[n, 1]), np.float64(quats[n, 2]), np.float64(quats[n, 3])
     inverse = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 
 
-@kernel
+@inlined
 def _axes(w: float, x: float, y: float, z: float) -> tuple:
     """Columns of the rotation matrix."""
     return (
@@ -53,19 +53,19 @@ def _axes(w: float, x: float, y: float, z: float) -> tuple:
     )
 
 
-@kernel
+@inlined
 def _limits(focal: float, center: float, size: int) -> tuple:
     """Between which x / z the Jacobian is taken: a little outside the frame."""
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
     return -center / focal - margin, (size - center) / focal + margin
 
 
-@kernel
+@inlined
 def _clamp(value: float, limits: tuple) -> float:
     return min(max(value, limits[0]), limits[1])
 
 
-@kernel
+@inlined
 def _image_axes(linear_x: tuple, linear_y: tuple, axes: tuple, scales: np.ndarray, n: int) -> tuple:
     """The Gaussian's half axes in the image, two rows of three: covariance = rows times their transpose."""
     a, b, c = np.float64(scales[n, 0]), np.float64(scales[n, 1]), np.float64(scales[n, 2])
@@ -145,7 +145,7 @@ def project(
             records[view, n, EXTENT_X], records[view, n, EXTENT_Y] = extent_x, extent_y
 
 
-@kernel
+@inlined
 def _covariance_gradient(
     raw_xx: float,
     xy: float,
@@ -173,7 +173,7 @@ def _covariance_gradient(
     return v_xx, v_xy, v_yy
 
 
-@kernel
+@inlined
 def _rotation_gradient(w: float, x: float, y: float, z: float, inverse: float, a: tuple, b: tuple, c: tuple) -> tuple:
     """Gradient of the raw quaternion from that of the rotation's three columns."""
     v_w = 2 * (z * (a[1] - b[0]) + y * (c[0] - a[2]) + x * (b[2] - c[1]))
@@ -189,7 +189,7 @@ def _rotation_gradient(w: float, x: float, y: float, z: float, inverse: float, a
     )
 
 
-@kernel
+@inlined
 def _pinhole_gradient(
     slope: float, near_by: float, focal: float, limits: tuple, g_center: float, g_direct: float, g_depth: float
 ) -> tuple:
