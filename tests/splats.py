@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils.data import Dataset
 
 from rewild4d.rasterizer import RasterInfo, rasterize
 
@@ -85,6 +86,28 @@ def outcome(inputs: dict[str, Tensor], width: int, height: int, **options: Any) 
 def gradients(inputs: dict[str, Tensor], width: int, height: int, **options: Any) -> tuple[Tensor, dict[str, Tensor]]:
     made = outcome(inputs, width, height, **options)
     return made["image"], {name[2:]: tensor for name, tensor in made.items() if name.startswith("d ")}
+
+
+class Renders(Dataset):
+    """Each item is an image, so that a worker process has to render."""
+
+    def __len__(self) -> int:
+        return 4
+
+    def __getitem__(self, index: int) -> Tensor:
+        return one_image(index)
+
+
+def one_image(seed: int) -> Tensor:
+    """A small image in a process of its own; one thread, as workers beside each other should have."""
+    torch.set_num_threads(1)
+    inputs = {name: value.float() for name, value in scene(700, 3, 1, 48, 32, seed).items()}
+    return render(inputs, 48, 32)[0][0]
+
+
+def image_bytes(seed: int) -> bytes:
+    """Plain bytes, which every kind of process can send."""
+    return one_image(seed).numpy().tobytes()
 
 
 def main(source: str, target: str) -> None:

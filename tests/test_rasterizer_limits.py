@@ -1,0 +1,181 @@
+"""What the CPU path promises in numbers and in other people's processes: accuracy, workers, caches, bad input."""
+
+import math
+import multiprocessing
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import joblib
+import pytest
+import torch
+from splats import Renders, gradients, image_bytes, render, scene
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from rewild4d.kernels import compiling
+
+WIDTH, HEIGHT = 70, 50
+
+
+def draw(kind: str, seed: int) -> dict[str, Tensor]:
+    """300 Gaussians of one kind; values that single precision holds, so that only the arithmetic differs."""
+    made = scene(300, 3, 1, WIDTH, HEIGHT, seed)
+    chance = torch.rand(300, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    if kind == "nearly opaque":
+        made["opacities"] = 0.999 * chance**0.3
+    elif kind == "behind and beside":
+        made["means"][::2, 2] -= 8
+        made["means"][::3] *= 4
+    elif kind == "needles":
+        made["scales"][:, 0], made["scales"][:, 1:] = 0.5, 0.0005
+    elif kind == "sub-pixel":
+        made["scales"] *= 1e-3
+    elif kind == "on one pixel":
+        made["means"] *= 0.003
+        made["scales"] *= 0.1
+        made["opacities"] *= 0.2
+    return {name: value.float().double() for name, value in made.items()}
+
+
+def compared(kind: str, seed: int) -> tuple[float, dict[str, float]]:
+    """PSNR of the image, and the relative error of every gradient, against double precision."""
+    inputs = draw(kind, seed)
+    wanted, slopes = gradients(inputs, WIDTH, HEIGHT, backend="reference")
+    single = {name: value.float() for name, value in inputs.items()}
+    image, found = gradients(single, WIDTH, HEIGHT, backend="numba")
+    error = (image - wanted).square().mean().clamp_min(1e-30).item()
+    relative = {
+        name: float((found[name] - slope).norm() / slope.norm().clamp_min(1e-30)) for name, slope in slopes.items()
+    }
+    return -10 * math.log10(error), relative
+
+
+@pytest.mark.parametrize("kind", ["plain", "nearly opaque", "behind and beside", "sub-pixel"])
+def test_gradients_to_a_hundred_thousandth_on_twenty_scenes(kind: str) -> None:
+    for seed in range(5):
+        psnr, relative = compared(kind, seed)
+        assert psnr >= 100
+        assert max(relative.values()) <= 1e-5, (seed, relative)
+
+
+@pytest.mark.parametrize(("kind", "bound"), [("needles", 5e-5), ("on one pixel", 1e-4)])
+def test_ill_conditioned_scenes(kind: str, bound: float) -> None:
+    # A needle's exponent is a difference of large numbers; on one pixel hundreds of gradients cancel in the camera's.
+    for seed in range(5):
+        psnr, relative = compared(kind, seed)
+        cameras = {"world_to_camera", "intrinsics"}
+        assert psnr >= 100
+        assert max(value for name, value in relative.items() if name not in cameras) <= bound, (seed, relative)
+        assert max(relative.values()) <= 1e-2
+
+
+def test_depths_that_single_precision_cannot_tell_apart_keep_their_order() -> None:
+    count = 64
+    depth = 5 + 1e-9 * torch.arange(count, dtype=torch.float64).flip(0)
+    inputs = scene(count, 3, 1, 20, 20, 0) | {"means": torch.zeros(count, 3, dtype=torch.float64)}
+    # The camera's own offset carries the depths, because float32 means cannot.
+    matrix = torch.eye(4, dtype=torch.float64)[None]
+    matrix[:, 2, 0] = 1e-9
+    inputs["means"][:, 0] = torch.arange(count, dtype=torch.float64).flip(0) * 1e-3
+    matrix[:, 2, 3] = 5
+    inputs |= {"world_to_camera": matrix, "scales": torch.full((count, 3), 0.3, dtype=torch.float64)}
+    assert len((inputs["means"][:, 0] * 1e-9 + 5).float().unique()) == 1 and len(depth.float().unique()) == 1
+    inputs = {name: value.float().double() for name, value in inputs.items()}
+    wanted = render(inputs, 20, 20, backend="reference")[0]
+    single = {name: value.float() for name, value in inputs.items()}
+    assert (render(single, 20, 20)[0] - wanted).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_nan_from_any_finite_input(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    inputs = {name: value.float() for name, value in scene(200, 3, 1, 40, 30, seed).items()}
+    sizes = 10.0 ** torch.randint(-30, 12, (200, 3), generator=generator)
+    inputs["scales"] = sizes
+    inputs["means"] = inputs["means"] * 10.0 ** torch.randint(-20, 8, (200, 1), generator=generator)
+    inputs["quats"][::3] = 0
+    inputs["opacities"][::4], inputs["opacities"][1::4] = 0, 1
+    image, found = gradients(inputs, 40, 30)
+    assert torch.isfinite(image).all()
+    for name, slope in found.items():
+        assert torch.isfinite(slope).all(), name
+
+
+@pytest.fixture(autouse=True)
+def same_threads() -> Iterator[None]:
+    """Workers that are threads of this process set its number of threads."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def expected() -> list[bytes]:
+    return [image_bytes(seed) for seed in range(4)]
+
+
+def test_a_data_loader_renders_in_its_workers(expected: list[bytes]) -> None:
+    loader = DataLoader(Renders(), batch_size=None, num_workers=2, multiprocessing_context="fork")
+    assert [image.numpy().tobytes() for image in loader] == expected
+
+
+@pytest.mark.parametrize("backend", ["loky", "threading"])
+def test_joblib_renders_in_its_workers(backend: str, expected: list[bytes]) -> None:
+    found = joblib.Parallel(n_jobs=2, backend=backend)(joblib.delayed(image_bytes)(seed) for seed in range(4))
+    assert found == expected
+
+
+def test_spawned_processes_render(expected: list[bytes]) -> None:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        assert list(pool.map(image_bytes, range(2))) == expected[:2]
+
+
+SCRIPT = """
+import sys, numba, torch
+from rewild4d.rasterizer import rasterize
+count = 20
+camera, pinhole = torch.eye(4)[None].clone(), torch.tensor([[[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]])
+camera[:, 2, 3] = 5
+means = torch.zeros(count, 3).requires_grad_()
+image, _, _ = rasterize(means, torch.ones(count, 4), torch.full((count, 3), 0.2), torch.full((count,), 0.5),
+                        torch.ones(count, 3), camera, pinhole, 16, 16)
+image.sum().backward()
+from rewild4d.rasterizer.blending import blend
+print(float(image.max()) > 0, sum(blend.stats.cache_hits.values()), sum(blend.stats.cache_misses.values()))
+"""
+
+
+def start(cache: Path) -> list[str]:
+    """What a fresh process says of its image and of the kernel cache."""
+    environment = os.environ | {"REWILD4D_CACHE": str(cache)}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    done = subprocess.run([sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
+def test_a_second_process_compiles_nothing(tmp_path: Path) -> None:
+    assert start(tmp_path) == ["True", "0", "1"]
+    assert start(tmp_path) == ["True", "1", "0"]
+
+
+def test_without_a_cache_folder_kernels_compile_in_the_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    blocker = tmp_path / "file"
+    blocker.write_text("")
+    monkeypatch.setattr(compiling, "_CACHE", blocker / "cache")
+    # Also where numba would fall back to, next to the source and in the user's folder.
+    monkeypatch.setattr("numba.core.caching._CacheLocator.ensure_cache_path", _refuse)
+    doubled = compiling.kernel(_double)
+    assert doubled(21) == 42 and not blocker.is_dir()
+
+
+def _refuse(self: object) -> None:
+    raise OSError("read-only")
+
+
+def _double(value: int) -> int:
+    return 2 * value
