@@ -10,7 +10,7 @@ from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.config import Config, Deform, Skinning
 from rewild4d.ours.deform import DeformNetwork, Posed
 from rewild4d.ours.fused.skinning import skin_both
-from rewild4d.ours.geometry_losses import compact_loss, tv_loss
+from rewild4d.ours.geometry_losses import compact_loss
 from rewild4d.ours.losses import colour_losses, silhouette_loss, union_window
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import joint_transforms
@@ -202,10 +202,13 @@ def test_seen_colours(degree: int) -> None:
     check_twins(make)
 
 
-def test_total_variation() -> None:
+def test_sampled_weights_with_the_total_variation(field: SkinningField) -> None:
+    points = normal(300, 3, seed=1).float()
+
     def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
-        given = leaves(dtype, table=normal(7**3, 20, seed=1).softmax(dim=-1))
-        return [tv_loss(given["table"], 7, 0.05)[None]], given
+        given = leaves(dtype, table=normal(9**3, 20, seed=1).softmax(dim=-1))
+        weights, variation = field.to(dtype).sample_and_vary(given["table"], points.to(dtype), 0.05)
+        return [weights, 100 * variation[None]], given
 
     check_twins(make)
 

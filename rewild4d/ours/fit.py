@@ -16,7 +16,7 @@ from rewild4d.ours.coloring import initial_colors
 from rewild4d.ours.config import Config, Rates
 from rewild4d.ours.deform import Posed
 from rewild4d.ours.density import DensityControl
-from rewild4d.ours.geometry_losses import compact_loss, neighbours, rigid_loss, smooth_loss, tv_loss
+from rewild4d.ours.geometry_losses import compact_loss, neighbours, rigid_loss, smooth_loss
 from rewild4d.ours.gradients import clip_gradients
 from rewild4d.ours.losses import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.model import Model, build_model
@@ -104,7 +104,8 @@ class Training:
             poses = blend_poses(poses, *prior_pose, fade(progress, config.prior.blend_until))
         pose = poses.row(own[0])
         probabilities = model.field.probabilities()
-        weights = model.field.sample(probabilities, model.gaussians.means)
+        delta = config.geometry.tv_delta if self._varies(index) else None
+        weights, variation = model.field.sample_and_vary(probabilities, model.gaussians.means, delta)
         opacities = model.gaussians.opacities()
 
         transforms = model.transforms(poses)
@@ -124,7 +125,9 @@ class Training:
                 config.prior.pull * fade(progress, config.prior.pull_until) * pose_distance(network_pose, *prior_pose)
             )
         losses["skeleton"] = skeleton_losses(model, poses, transforms, config.geometry)
-        losses |= self._geometry_losses(index, probabilities, weights, opacities, posed, deformed)
+        if delta is not None:
+            losses["tv"] = config.geometry.tv * config.geometry.tv_every * variation
+        losses |= self._geometry_losses(index, weights, opacities, posed, deformed)
         return losses, info
 
     def _times(self, keys: list[Key], progress: float) -> Tensor:
@@ -157,16 +160,19 @@ class Training:
             "silhouette": weights.silhouette * silhouette_loss(alpha, target, window),
         }
 
+    def _varies(self, index: int) -> bool:
+        """Whether the total variation of the skinning field counts in this step."""
+        config = self.config.geometry
+        lasts = index < config.until * self.config.iterations and self.config.skinning.learn
+        return lasts and config.tv > 0 and index % config.tv_every == 0
+
     def _geometry_losses(
-        self, index: int, probabilities: Tensor, weights: Tensor, opacities: Tensor, posed: Posed, deformed: Posed
+        self, index: int, weights: Tensor, opacities: Tensor, posed: Posed, deformed: Posed
     ) -> dict[str, Tensor]:
-        """The paper's three while they last, and neighbour rigidity."""
+        """Compactness and smoothness while they last, and neighbour rigidity."""
         config, own = self.config.geometry, self.model.gaussians
         losses: dict[str, Tensor] = {}
         if index < config.until * self.config.iterations:
-            if config.tv and index % config.tv_every == 0 and self.config.skinning.learn:
-                field = self.model.field
-                losses["tv"] = config.tv * config.tv_every * tv_loss(probabilities, field.resolution, config.tv_delta)
             if config.compact:
                 both = [
                     compact_loss(points, weights, opacities, config.compact_power)

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from rewild4d.ours.deform import Posed
-from rewild4d.ours.fused.regularisers import compactness, variation
+from rewild4d.ours.fused.compactness import compactness
 from rewild4d.ours.pose import Pose, aligned
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import look_at, quat_multiply, quat_to_matrix
@@ -24,8 +24,6 @@ def tv_loss(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
         resolution: R.
         delta: x^2 / 2 inside, delta (|x| - delta / 2) outside.
     """
-    if _fits(probabilities):
-        return variation(probabilities, resolution, delta)
     grid = probabilities.view(resolution, resolution, resolution, -1)
     terms = [
         huber_loss(grid.narrow(axis, 1, resolution - 1), grid.narrow(axis, 0, resolution - 1), delta=delta)

@@ -6,7 +6,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from rewild4d.ours.config import Skinning
-from rewild4d.ours.fused.skinning import sample_grid
+from rewild4d.ours.fused.field import sample_grid
+from rewild4d.ours.geometry_losses import tv_loss
 
 
 class SkinningField(nn.Module):
@@ -41,6 +42,15 @@ class SkinningField(nn.Module):
             return self.logits.softmax(dim=-1)
         return (0.5 * (self.logits + self.logits[self.flipped][:, self.mirror])).softmax(dim=-1)
 
+    def sample_and_vary(self, probabilities: Tensor, points: Tensor, delta: float | None) -> tuple[Tensor, Tensor]:
+        """Weights of points as `sample` gives them, and L_tv of the field (zero where ``delta`` is None)."""
+        if probabilities.dtype == torch.float32 and probabilities.device.type == "cpu":
+            return sample_grid(probabilities, points, self.origin, self.pitch, self.resolution, delta)
+        weights = self.sample(probabilities, points)
+        if delta is None:
+            return weights, weights.new_zeros(())
+        return weights, tv_loss(probabilities, self.resolution, delta)
+
     def sample(self, probabilities: Tensor, points: Tensor) -> Tensor:
         """Weights of points; outside the cube the nearest border counts.
 
@@ -52,7 +62,7 @@ class SkinningField(nn.Module):
             Rows on the simplex, [n, J].
         """
         if probabilities.dtype == torch.float32 and probabilities.device.type == "cpu":
-            return sample_grid(probabilities, points, self.origin, self.pitch, self.resolution)
+            return sample_grid(probabilities, points, self.origin, self.pitch, self.resolution)[0]
         last = self.resolution - 1
         place = ((points.detach() - self.origin) / self.pitch).clamp(0, last)
         base = place.floor().clamp(max=last - 1)

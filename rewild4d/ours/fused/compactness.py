@@ -1,6 +1,6 @@
-"""Total variation of the skinning field and compactness of the parts; gradients come with the value.
+"""Compactness of the parts.
 
-The twins in plain torch are in ours/geometry_losses.py.
+The twin in plain torch is in ours/geometry_losses.py.
 """
 
 from typing import Any
@@ -16,89 +16,6 @@ from rewild4d.kernels.threads import run, thread_count
 
 CHUNK = 1024
 """Gaussians a unit of work holds; sums are added over these, whatever the number of threads."""
-
-
-@kernel
-def _variation(tickets: np.ndarray, grid: np.ndarray, delta: float, slope: np.ndarray, sums: np.ndarray) -> None:
-    """Set slope [R, R, R J] and sums [R] of the Huber function of forward differences, plane by plane."""
-    size, line = grid.shape[0], grid.shape[2]
-    joints = line // size
-    width = np.float32(delta)
-    half = np.float32(0.5)
-    totals = np.empty(line, np.float32)
-    while True:
-        x = take_ticket(tickets)
-        if x >= size:
-            return
-        plane_sum = 0.0
-        for y in range(size):
-            own, out = grid[x, y], slope[x, y]
-            totals[:] = 0
-            out[:] = 0
-            for i in range(line - joints):
-                step = own[i + joints] - own[i]
-                held = min(max(step, -width), width)
-                totals[i] += held * (step - half * held)
-                out[i] -= held
-            for i in range(joints, line):
-                step = own[i] - own[i - joints]
-                out[i] += min(max(step, -width), width)
-            if y + 1 < size:
-                _forward_difference(own, grid[x, y + 1], width, out, totals)
-            if x + 1 < size:
-                _forward_difference(own, grid[x + 1, y], width, out, totals)
-            if y > 0:
-                _backward_difference(own, grid[x, y - 1], width, out)
-            if x > 0:
-                _backward_difference(own, grid[x - 1, y], width, out)
-            plane_sum += totals.sum()
-        sums[x] = plane_sum
-
-
-@kernel
-def _forward_difference(
-    own: np.ndarray, following: np.ndarray, width: float, out: np.ndarray, totals: np.ndarray
-) -> None:
-    half = np.float32(0.5)
-    for i in range(len(own)):
-        step = following[i] - own[i]
-        held = min(max(step, -width), width)
-        totals[i] += held * (step - half * held)
-        out[i] -= held
-
-
-@kernel
-def _backward_difference(own: np.ndarray, before: np.ndarray, width: float, out: np.ndarray) -> None:
-    for i in range(len(own)):
-        out[i] += min(max(own[i] - before[i], -width), width)
-
-
-def variation(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
-    """Mean over the axes of the mean Huber function of forward differences; float32, CPU.
-
-    Args:
-        probabilities: x slowest, [R^3, J].
-        resolution: R.
-        delta: where the function turns linear.
-    """
-    return _Variation.apply(probabilities, resolution, delta)
-
-
-class _Variation(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, probabilities: Tensor, resolution: int, delta: float) -> Tensor:
-        grid = probabilities.detach().contiguous().view(resolution, resolution, -1)
-        slope, sums = torch.empty_like(grid), np.empty(resolution)
-        run(_variation, [(np.zeros(1, np.int64), grid.numpy(), delta, slope.numpy(), sums)] * thread_count())
-        # Each axis has as many differences as any other.
-        ctx.share = 1 / (3 * (resolution - 1) * resolution * grid.shape[2])
-        ctx.slope, ctx.shape = slope, probabilities.shape
-        return torch.tensor(float(sums.sum()) * ctx.share, dtype=torch.float32)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
-        return (ctx.slope * (slope * ctx.share)).view(ctx.shape), None, None
 
 
 @kernel

@@ -1,0 +1,219 @@
+"""The skinning field: trilinear samples for the Gaussians, and the total variation, with one gradient for both.
+
+The twins in plain torch are `SkinningField.sample` (ours/skinning.py) and `tv_loss` (ours/geometry_losses.py).
+"""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from rewild4d.kernels.compiling import inlined, kernel
+from rewild4d.kernels.rows import add_scaled
+from rewild4d.kernels.simd import take_ticket
+from rewild4d.kernels.threads import run, thread_count
+
+CHUNK = 1024
+"""Gaussians a unit of work holds."""
+
+
+@kernel
+def _forward_difference(
+    own: np.ndarray, following: np.ndarray, width: float, out: np.ndarray, totals: np.ndarray
+) -> None:
+    half = np.float32(0.5)
+    for i in range(len(own)):
+        step = following[i] - own[i]
+        held = min(max(step, -width), width)
+        totals[i] += held * (step - half * held)
+        out[i] -= held
+
+
+@kernel
+def _backward_difference(own: np.ndarray, before: np.ndarray, width: float, out: np.ndarray) -> None:
+    for i in range(len(own)):
+        out[i] += min(max(own[i] - before[i], -width), width)
+
+
+@kernel
+def _variation(tickets: np.ndarray, grid: np.ndarray, delta: float, slope: np.ndarray, sums: np.ndarray) -> None:
+    """Set slope [R, R, R J] and sums [R] of the Huber function of forward differences, plane by plane."""
+    size, line = grid.shape[0], grid.shape[2]
+    joints = line // size
+    width = np.float32(delta)
+    half = np.float32(0.5)
+    totals = np.empty(line, np.float32)
+    while True:
+        x = take_ticket(tickets)
+        if x >= size:
+            return
+        plane_sum = 0.0
+        for y in range(size):
+            own, out = grid[x, y], slope[x, y]
+            totals[:] = 0
+            out[:] = 0
+            for i in range(line - joints):
+                step = own[i + joints] - own[i]
+                held = min(max(step, -width), width)
+                totals[i] += held * (step - half * held)
+                out[i] -= held
+            for i in range(joints, line):
+                step = own[i] - own[i - joints]
+                out[i] += min(max(step, -width), width)
+            if y + 1 < size:
+                _forward_difference(own, grid[x, y + 1], width, out, totals)
+            if x + 1 < size:
+                _forward_difference(own, grid[x + 1, y], width, out, totals)
+            if y > 0:
+                _backward_difference(own, grid[x, y - 1], width, out)
+            if x > 0:
+                _backward_difference(own, grid[x - 1, y], width, out)
+            plane_sum += totals.sum()
+        sums[x] = plane_sum
+
+
+@inlined
+def _corner(points: np.ndarray, n: int, axis: int, origin: np.ndarray, pitch: np.ndarray, last: int) -> tuple:
+    """Voxel below a point along one axis, and the share of the one above; outside the cube the border counts."""
+    place = min(max((points[n, axis] - origin[axis]) / pitch[axis], np.float32(0)), np.float32(last))
+    base = min(int(place), last - 1)
+    return base, place - np.float32(base)
+
+
+@kernel
+def _sample_forward(
+    tickets: np.ndarray, table: np.ndarray, points: np.ndarray, origin: np.ndarray, pitch: np.ndarray, size: int,
+    joints: int, weights: np.ndarray,
+) -> None:  # fmt: skip
+    """Set the rows of weights; it and the table are flat."""
+    while True:
+        begin = take_ticket(tickets) * CHUNK
+        if begin >= len(points):
+            return
+        for n in range(begin, min(begin + CHUNK, len(points))):
+            x, ahead_x = _corner(points, n, 0, origin, pitch, size - 1)
+            y, ahead_y = _corner(points, n, 1, origin, pitch, size - 1)
+            z, ahead_z = _corner(points, n, 2, origin, pitch, size - 1)
+            weights[n * joints : (n + 1) * joints] = 0
+            for i in range(2):
+                for j in range(2):
+                    for k in range(2):
+                        share = (ahead_x if i else 1 - ahead_x) * (ahead_y if j else 1 - ahead_y)
+                        share = np.float32(share * (ahead_z if k else 1 - ahead_z))
+                        row = ((x + i) * size + y + j) * size + z + k
+                        add_scaled(share, table, row * joints, weights, n * joints, joints)
+
+
+@kernel
+def _sort_by_plane(
+    points: np.ndarray, origin: np.ndarray, pitch: np.ndarray, size: int, order: np.ndarray, starts: np.ndarray
+) -> None:
+    """Points by the voxel plane below them along x; starts [size + 1]."""
+    starts[:] = 0
+    for n in range(len(points)):
+        starts[_corner(points, n, 0, origin, pitch, size - 1)[0] + 1] += 1
+    for plane in range(size):
+        starts[plane + 1] += starts[plane]
+    cursor = starts.copy()
+    for n in range(len(points)):
+        plane = _corner(points, n, 0, origin, pitch, size - 1)[0]
+        order[cursor[plane]] = n
+        cursor[plane] += 1
+
+
+@kernel
+def _sample_backward(
+    tickets: np.ndarray, points: np.ndarray, origin: np.ndarray, pitch: np.ndarray, size: int, order: np.ndarray,
+    starts: np.ndarray, joints: int, slope: np.ndarray, variation: np.ndarray, share_of_it: float, on_table: np.ndarray,
+) -> None:  # fmt: skip
+    """Set on_table plane by plane: first from the points below a plane, then from those above it, each in order.
+
+    A plane starts from its share of the slope of the total variation, where that is not empty. All arrays are flat.
+    """
+    line = size * size * joints
+    while True:
+        plane = take_ticket(tickets)
+        if plane >= size:
+            return
+        first = plane * line
+        on_table[first : first + line] = 0
+        if len(variation) > 0:
+            add_scaled(np.float32(share_of_it), variation, first, on_table, first, line)
+        for upper in (1, 0):
+            if plane < upper:
+                continue
+            for at in range(starts[plane - upper], starts[plane - upper + 1]):
+                n = order[at]
+                ahead_x = _corner(points, n, 0, origin, pitch, size - 1)[1]
+                y, ahead_y = _corner(points, n, 1, origin, pitch, size - 1)
+                z, ahead_z = _corner(points, n, 2, origin, pitch, size - 1)
+                along = ahead_x if upper else 1 - ahead_x
+                for j in range(2):
+                    for k in range(2):
+                        share = along * (ahead_y if j else 1 - ahead_y)
+                        share = np.float32(share * (ahead_z if k else 1 - ahead_z))
+                        row = (plane * size + y + j) * size + z + k
+                        add_scaled(share, slope, n * joints, on_table, row * joints, joints)
+
+
+def sample_grid(
+    table: Tensor, points: Tensor, origin: Tensor, pitch: Tensor, size: int, delta: float | None = None
+) -> tuple[Tensor, Tensor]:
+    """Trilinear samples of a cubic grid of vectors, and its total variation; float32, CPU.
+
+    Args:
+        table: x slowest, [size^3, J]; differentiable.
+        points: [n, 3].
+        origin: of the first voxel's centre, [3].
+        pitch: [3].
+        size: voxels along each axis, at least 2.
+        delta: where the Huber function of the variation turns linear; None leaves the variation out.
+
+    Returns:
+        Samples [n, J], and the mean over the axes of the mean Huber function of forward differences, scalar.
+    """
+    return _Sample.apply(table, points, origin, pitch, size, delta)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
+
+
+class _Sample(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, table: Tensor, points: Tensor, origin: Tensor, pitch: Tensor, size: int, delta: float | None
+    ) -> tuple[Tensor, Tensor]:
+        grid, joints = _array(table), table.shape[1]
+        weights = table.new_empty(len(points), joints)
+        place = *map(_array, (points, origin, pitch)), size
+        run(
+            _sample_forward,
+            [(np.zeros(1, np.int64), grid.ravel(), *place, joints, weights.numpy().ravel())] * thread_count(),
+        )
+        ctx.place, ctx.slope, total = place, np.empty(0, np.float32), 0.0
+        # Each axis has as many differences as any other.
+        ctx.share = 1 / (3 * (size - 1) * size * size * joints)
+        if delta is not None:
+            slope, sums = np.empty((size, size, size * joints), np.float32), np.empty(size)
+            lines = grid.reshape(slope.shape)
+            run(_variation, [(np.zeros(1, np.int64), lines, delta, slope, sums)] * thread_count())
+            ctx.slope, total = slope.ravel(), float(sums.sum()) * ctx.share
+        return weights, torch.tensor(total, dtype=torch.float32)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor, by_variation: Tensor) -> tuple[Tensor | None, ...]:
+        points, size = ctx.place[0], ctx.place[3]
+        order, starts = np.empty(len(points), np.int32), np.empty(size + 1, np.int64)
+        _sort_by_plane(*ctx.place, order, starts)
+        joints = slope.shape[1]
+        on_table = torch.empty(size**3, joints)
+        call = (
+            np.zeros(1, np.int64), *ctx.place, order, starts, joints, _array(slope).ravel(), ctx.slope,
+            float(by_variation) * ctx.share, on_table.numpy().ravel(),
+        )  # fmt: skip
+        run(_sample_backward, [call] * thread_count())
+        return on_table, None, None, None, None, None
