@@ -19,20 +19,26 @@ C3 = (
 
 def basis(directions: Tensor, degree: int) -> Tensor:
     """Values of the basis functions for unit directions, [..., 3] -> [..., (degree + 1)^2], degree 0 to 3."""
+    return torch.cat([_band(directions, level) for level in range(degree + 1)], dim=-1)
+
+
+def _band(directions: Tensor, level: int) -> Tensor:
+    """Values of the functions of one degree, [..., 3] -> [..., 2 level + 1]."""
     x, y, z = directions.unbind(-1)
-    values = [torch.full_like(x, C0)]
-    if degree > 0:
-        values += [-C1 * y, C1 * z, -C1 * x]
-    if degree > 1:
-        values += [
+    if level == 0:
+        values = [torch.full_like(x, C0)]
+    elif level == 1:
+        values = [-C1 * y, C1 * z, -C1 * x]
+    elif level == 2:
+        values = [
             C2[0] * x * y,
             C2[1] * y * z,
             C2[2] * (2 * z * z - x * x - y * y),
             C2[3] * x * z,
             C2[4] * (x * x - y * y),
         ]
-    if degree > 2:
-        values += [
+    else:
+        values = [
             C3[0] * y * (3 * x * x - y * y),
             C3[1] * x * y * z,
             C3[2] * y * (4 * z * z - x * x - y * y),
@@ -56,15 +62,22 @@ def rotated(coefficients: Tensor, rotations: Tensor) -> Tensor:
     Returns:
         [n, k, 3].
     """
-    count = coefficients.shape[1]
-    order = torch.arange(4 * count, device=rotations.device, dtype=rotations.dtype)
-    height, angle = 1 - (2 * order + 1) / len(order), order * (math.pi * (3 - 5**0.5))
+    made = [coefficients[:, :1]]
+    for level in range(1, round(coefficients.shape[1] ** 0.5)):
+        directions = _spiral(2 * (2 * level + 1)).to(rotations)
+        before = torch.einsum("da,nab->ndb", directions, rotations)
+        inverse = torch.linalg.pinv(_band(directions, level))
+        turns = torch.einsum("kd,ndl->nkl", inverse, _band(before, level))
+        made.append(turns @ coefficients[:, level**2 : (level + 1) ** 2])
+    return torch.cat(made, dim=1)
+
+
+def _spiral(count: int) -> Tensor:
+    """Unit directions spread over the sphere, [count, 3]."""
+    order = torch.arange(count, dtype=torch.float64)
+    height, angle = 1 - (2 * order + 1) / count, order * (math.pi * (3 - 5**0.5))
     ring = (1 - height.square()).sqrt()
-    directions = torch.stack((ring * angle.cos(), ring * angle.sin(), height), dim=-1)
-    degree = round(count**0.5) - 1
-    before = torch.einsum("da,nab->ndb", directions, rotations)
-    inverse = torch.linalg.pinv(basis(directions, degree))
-    return torch.einsum("kd,ndl,nlc->nkc", inverse, basis(before, degree), coefficients)
+    return torch.stack((ring * angle.cos(), ring * angle.sin(), height), dim=-1)
 
 
 def seen_colors(splats: Splats, eye: Tensor) -> Tensor:
