@@ -223,11 +223,12 @@ def gather_slots(
     total = np.empty(width, np.float32)
     for k in range(begin, end):
         n = order[view, k]
-        total[:] = 0
-        for slot in range(slots[view, k], slots[view, k + 1]):
-            if pair_bits[slot] != 0:
-                for i in range(MOMENTS + channels):
-                    total[i] += sums[slot * width + i]
+        for i in range(0, width, LANES):
+            added = splat(np.float32(0))
+            for slot in range(slots[view, k], slots[view, k + 1]):
+                if pair_bits[slot] != 0:
+                    added = added + load(sums, slot * width + i)
+            store(total, i, added)
         m, mx, my, mxx, mxy, myy = total[0], total[1], total[2], total[3], total[4], total[5]
         xx, xy, yy = records[view, n, XX], records[view, n, XY], records[view, n, YY]
         v_means2d[view, n, 0] = -LN2 * (2 * xx * mx + xy * my)

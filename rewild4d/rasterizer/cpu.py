@@ -111,12 +111,14 @@ class _Project(torch.autograd.Function):
         outputs = tuple(_array(tensor) for tensor in gradients)
         chunks = max(1, -(-count // CHUNK))
         v_cameras, v_pinholes = np.zeros((chunks, views, 3, 4)), np.zeros((chunks, views, 4))
+        with_cameras = any(ctx.needs_input_grad[4:6])
         shared = (radii.numpy(), _array(g_means2d), _array(g_records))
 
         def work(first: int, last: int) -> None:
             for chunk in range(first, last):
                 project_backward(
-                    chunk * CHUNK, min((chunk + 1) * CHUNK, count), *arrays, *cameras, *ctx.options[:4], *shared,
+                    chunk * CHUNK, min((chunk + 1) * CHUNK, count), *arrays, *cameras, *ctx.options[:4],
+                    with_cameras, *shared,
                     *outputs, v_cameras[chunk], v_pinholes[chunk],
                 )  # fmt: skip
 

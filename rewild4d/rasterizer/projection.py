@@ -105,10 +105,10 @@ def project(
         fx, fy, cx, cy = intrinsics[view, 0, 0], intrinsics[view, 1, 1], intrinsics[view, 0, 2], intrinsics[view, 1, 2]
         limits_x, limits_y = _limits(fx, cx, width), _limits(fy, cy, height)
         for n in range(begin, end):
-            means2d[view, n, :] = 0
-            records[view, n, :] = 0
-            radii[view, n] = 0
-            depths[view, n] = 0
+            # One by one: a slice would call memset.
+            means2d[view, n, 0], means2d[view, n, 1], radii[view, n], depths[view, n] = 0, 0, 0, 0
+            for column in range(RECORD):
+                records[view, n, column] = 0
             mean = np.float64(means[n, 0]), np.float64(means[n, 1]), np.float64(means[n, 2])
             z = _dot(row_z, mean) + move[2]
             if not z > near:
@@ -217,6 +217,7 @@ def project_backward(
     height: int,
     eps2d: float,
     antialias: bool,
+    with_cameras: bool,
     radii: np.ndarray,
     g_means2d: np.ndarray,
     g_records: np.ndarray,
@@ -229,7 +230,7 @@ def project_backward(
 ) -> None:
     """Add the gradients of Gaussians begin..end to the zeroed v_ arrays; v_cameras and v_pinholes are this chunk's own.
 
-    v_cameras is [V, 3, 4] and v_pinholes [V, 4] (fx, fy, cx, cy), double precision.
+    v_cameras is [V, 3, 4] and v_pinholes [V, 4] (fx, fy, cx, cy), double precision; left alone unless with_cameras.
     """
     for view in range(world_to_camera.shape[0]):
         row_x, row_y, row_z = (
@@ -291,6 +292,9 @@ def project_backward(
             local_z = v_z_x + v_z_y - (v_slope_x * slope_x + v_slope_y * slope_y) * near_by
             for i in range(3):
                 v_means[n, i] += local_x * row_x[i] + local_y * row_y[i] + local_z * row_z[i]
+            if not with_cameras:
+                continue
+            for i in range(3):
                 v_cameras[view, 0, i] += local_x * mean[i] + direct_x * v_linear_x[i]
                 v_cameras[view, 1, i] += local_y * mean[i] + direct_y * v_linear_y[i]
                 v_cameras[view, 2, i] += local_z * mean[i] + depth_x * v_linear_x[i] + depth_y * v_linear_y[i]
