@@ -146,6 +146,11 @@ def tile_place(tile: int, tiles_x: int, tiles_y: int) -> tuple:
 
 
 @inlined
+def _add_channel(weight: Any, features: np.ndarray, feature: int, colors: np.ndarray, place: int) -> None:
+    store(colors, place, fma(weight, broadcast(features, feature), load(colors, place)))
+
+
+@inlined
 def _blend_entry(
     bits: int,
     records: np.ndarray,
@@ -178,9 +183,14 @@ def _blend_entry(
         store(left, block * LANES, after)
         touched |= (bits_gt(weight, zero) != 0) << block
         closed |= (bits_gt(after, zero) == 0) << block
-        for channel in range(channels):
-            place = (block * channels + channel) * LANES
-            store(colors, place, fma(weight, broadcast(features, feature + channel), load(colors, place)))
+        place = block * channels * LANES
+        if channels == 3:  # the usual case without a loop
+            _add_channel(weight, features, feature, colors, place)
+            _add_channel(weight, features, feature + 1, colors, place + LANES)
+            _add_channel(weight, features, feature + 2, colors, place + 2 * LANES)
+        else:
+            for channel in range(channels):
+                _add_channel(weight, features, feature + channel, colors, place + channel * LANES)
     return touched, closed
 
 

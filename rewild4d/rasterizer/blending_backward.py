@@ -162,8 +162,14 @@ def _entry_backward(
     zero, one, least = splat(np.float32(0)), splat(np.float32(1)), splat(LEAST_LEFT)
     shape = form(records, record)
     offset_x, offset_y = offsets(records, record, tile_left, tile_top)
-    for channel in range(channels):
-        store(rows, (MOMENTS + channel) * LANES, zero)
+    red, green, blue, on_red, on_green, on_blue = zero, zero, zero, zero, zero, zero
+    if channels == 3:
+        red, green, blue = (
+            broadcast(features, feature), broadcast(features, feature + 1), broadcast(features, feature + 2)
+        )  # fmt: skip
+    else:
+        for channel in range(channels):
+            store(rows, (MOMENTS + channel) * LANES, zero)
     m, mx, my, mxx, mxy, myy = zero, zero, zero, zero, zero, zero
     while bits != 0:
         block = lowest_bit(bits)
@@ -175,12 +181,22 @@ def _entry_backward(
         after = before - weight
         weight = select_gt(after, least, weight, zero)
         store(left, block * LANES, select_gt(after, least, after, zero))
-        along = zero
-        for channel in range(channels):
-            slope = load(gradients, (block * channels + channel) * LANES)
-            along = fma(slope, broadcast(features, feature + channel), along)
-            row = (MOMENTS + channel) * LANES
-            store(rows, row, fma(weight, slope, load(rows, row)))
+        along, place_of_block = zero, block * channels * LANES
+        if channels == 3:  # the usual case keeps its sums in registers
+            first = load(gradients, place_of_block)
+            second, third = load(gradients, place_of_block + LANES), load(gradients, place_of_block + 2 * LANES)
+            along = fma(first, red, fma(second, green, third * blue))
+            on_red, on_green, on_blue = (
+                fma(weight, first, on_red),
+                fma(weight, second, on_green),
+                fma(weight, third, on_blue),
+            )
+        else:
+            for channel in range(channels):
+                slope = load(gradients, place_of_block + channel * LANES)
+                along = fma(slope, broadcast(features, feature + channel), along)
+                row = (MOMENTS + channel) * LANES
+                store(rows, row, fma(weight, slope, load(rows, row)))
         rest = load(behind, block * LANES) - weight * along
         store(behind, block * LANES, rest)
         # alpha dL/dalpha, where the pixel took this Gaussian and the cap did not hold it.
@@ -197,6 +213,10 @@ def _entry_backward(
     store(rows, 3 * LANES, mxx)
     store(rows, 4 * LANES, mxy)
     store(rows, 5 * LANES, myy)
+    if channels == 3:
+        store(rows, MOMENTS * LANES, on_red)
+        store(rows, (MOMENTS + 1) * LANES, on_green)
+        store(rows, (MOMENTS + 2) * LANES, on_blue)
     sum_rows(rows, MOMENTS + channels, sums, place)
 
 
