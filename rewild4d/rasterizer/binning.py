@@ -66,28 +66,30 @@ def sort_by_depth(
     is equal so is put right afterwards.
     """
     bits = depths[view].astype(np.float32).view(np.int32)
-    histogram = np.zeros((3, RADIX), np.int64)
-    count = 0
+    count, lowest, highest = 0, np.int64(1) << 31, np.int64(0)
     for n in range(radii.shape[1]):
         if radii[view, n] > 0:
             key = np.int64(bits[n])
             keys[count] = (key << 32) | n
-            histogram[0, key & (RADIX - 1)] += 1
-            histogram[1, (key >> RADIX_BITS) & (RADIX - 1)] += 1
-            histogram[2, key >> (2 * RADIX_BITS)] += 1
+            lowest, highest = min(lowest, key), max(highest, key)
             count += 1
-    for digit in range(3):
+    # What all depths have in common needs no sorting: an animal's differ in the lower two digits.
+    shift = 32
+    while (highest - lowest) >> (shift - 32) > 0:
+        histogram = np.zeros(RADIX, np.int64)
+        for k in range(count):
+            histogram[((keys[k] - (lowest << 32)) >> shift) & (RADIX - 1)] += 1
         total = 0
         for value in range(RADIX):
-            here = histogram[digit, value]
-            histogram[digit, value] = total
+            here = histogram[value]
+            histogram[value] = total
             total += here
-        shift = 32 + digit * RADIX_BITS
         for k in range(count):
-            value = (keys[k] >> shift) & (RADIX - 1)
-            spare[histogram[digit, value]] = keys[k]
-            histogram[digit, value] += 1
+            value = ((keys[k] - (lowest << 32)) >> shift) & (RADIX - 1)
+            spare[histogram[value]] = keys[k]
+            histogram[value] += 1
         keys, spare = spare, keys
+        shift += RADIX_BITS
     first = 0
     for k in range(count):
         order[view, k] = keys[k] & 0xFFFFFFFF
@@ -102,21 +104,23 @@ def sort_by_depth(
 @kernel
 def count_slots(
     view: int,
-    count: int,
-    first: int,
+    begin: int,
+    end: int,
     order: np.ndarray,
     records: np.ndarray,
     tiles_x: int,
     tiles_y: int,
     slots: np.ndarray,
-) -> int:
-    """Number the pairs of one view's bounding rectangles from ``first``: slots[view, k] .. slots[view, k + 1]."""
-    for k in range(count):
-        slots[view, k] = first
+    totals: np.ndarray,
+) -> None:
+    """Number the pairs of the bounding rectangles of sorted Gaussians begin..end from 0: slots[view, k] is the first of
+    Gaussian k, and totals[0] how many there are."""
+    number = 0
+    for k in range(begin, end):
+        slots[view, k] = number
         left, right, top, bottom = _tile_rectangle(records, view, order[view, k], tiles_x, tiles_y)
-        first += (right - left) * (bottom - top)
-    slots[view, count] = first
-    return first
+        number += (right - left) * (bottom - top)
+    totals[0] = number
 
 
 @inlined

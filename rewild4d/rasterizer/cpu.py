@@ -154,13 +154,11 @@ def _bin(records: np.ndarray, radii: np.ndarray, depths: np.ndarray, width: int,
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     order, slots = np.empty((views, count), np.int32), np.empty((views, count + 1), np.int64)
     keys, spare = np.empty(count, np.int64), np.empty(count, np.int64)
-    counts, pairs = [], 0
-    for view in range(views):
-        counts.append(sort_by_depth(view, radii, depths, order, keys, spare))
-        pairs = count_slots(view, counts[view], pairs, order, records, tiles_x, tiles_y, slots)
-    pair_tile, pair_bits = np.empty(pairs, np.int32), np.empty(pairs, np.uint16)
+    counts = [sort_by_depth(view, radii, depths, order, keys, spare) for view in range(views)]
     parts = thread_count() if sum(counts) > SERIAL_BELOW else 1
     pieces = [(view, *span) for view in range(views) for span in spans(counts[view], parts)]
+    pairs = _number_slots(pieces, counts, order, records, tiles_x, tiles_y, slots)
+    pair_tile, pair_bits = np.empty(pairs, np.int32), np.empty(pairs, np.uint16)
     histograms = np.zeros((max(1, len(pieces)), views * tiles_x * tiles_y), np.int32)
     grid = (tiles_x, tiles_y, BLOCK_LEFT, BLOCK_TOP)
     _run_pieces(
@@ -178,6 +176,24 @@ def _bin(records: np.ndarray, radii: np.ndarray, depths: np.ndarray, width: int,
         ],
     )
     return _Lists((tiles_x, tiles_y), order, counts, slots, pair_bits, starts, entry_gaussian, entry_slot)
+
+
+def _number_slots(
+    pieces: list[tuple[int, int, int]], counts: list[int], order: np.ndarray, records: np.ndarray, tiles_x: int,
+    tiles_y: int, slots: np.ndarray,
+) -> int:  # fmt: skip
+    """Fill slots [V, N + 1] over all pieces; gives the number of slots."""
+    totals = np.zeros((max(1, len(pieces)), 1), np.int64)
+    _run_pieces(
+        count_slots, [(*piece, order, records, tiles_x, tiles_y, slots, totals[i]) for i, piece in enumerate(pieces)]
+    )
+    before = 0
+    for (view, begin, end), total in zip(pieces, totals[:, 0].tolist(), strict=False):
+        slots[view, begin:end] += before
+        before += total
+        if end == counts[view]:
+            slots[view, end] = before
+    return before
 
 
 def _run_pieces(function: Any, calls: list[tuple[Any, ...]]) -> None:
