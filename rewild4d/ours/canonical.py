@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from rewild4d.harmonics import C0, basis, rotated
+from rewild4d.kernels.arrays import fits
 from rewild4d.ours.config import Canonical
 from rewild4d.ours.fused.harmonics import seen_rgb
 from rewild4d.priors.motion import quats_from_normals, sample_surface
@@ -79,7 +80,7 @@ class Gaussians(nn.Module):
         """
         if degree == 0:
             return self.rgb()
-        if means.dtype == torch.float32 and means.device.type == "cpu":
+        if fits(means):
             return seen_rgb(self.colors, means, quats, self.quats, eye, degree, REST_GAIN)
         directions = normalize(means.detach() - eye.to(means), dim=-1)
         canonical = torch.einsum("na,nab->nb", directions, self.turns(quats.detach()))

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from rewild4d.kernels.arrays import fits
 from rewild4d.ours.config import Deform as DeformConfig
 from rewild4d.ours.fused.deformation import Reach, deform
 from rewild4d.ours.fused.layers import layout, padded
@@ -52,7 +53,7 @@ class DeformNetwork(nn.Module):
         Returns:
             Deformed Gaussians.
         """
-        if posed.means.dtype == torch.float32 and posed.means.device.type == "cpu" and parts.shape[1] <= 16:
+        if fits(posed.means) and parts.shape[1] <= 16:
             return Posed(*self._fused(features, parts, posed, strength))
         query = torch.cat((parts, self._place(posed)), dim=-1)
         hidden = self._attend(query, features) + self.skip(query)

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
+from rewild4d.kernels.arrays import fits
 from rewild4d.ours.deform import Posed
 from rewild4d.ours.fused.compactness import compactness
 from rewild4d.ours.pose import Pose, aligned
@@ -32,11 +33,6 @@ def tv_loss(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
     return torch.stack(terms).mean()
 
 
-def _fits(tensor: Tensor) -> bool:
-    """Whether the fused kernels take it."""
-    return tensor.dtype == torch.float32 and tensor.device.type == "cpu"
-
-
 def compact_loss(points: Tensor, weights: Tensor, opacities: Tensor, power: float) -> Tensor:
     """L_compact: mean over parts of the two smaller eigenvalues of a part's covariance.
 
@@ -50,7 +46,7 @@ def compact_loss(points: Tensor, weights: Tensor, opacities: Tensor, power: floa
         opacities: [n].
         power: exponent on the weights.
     """
-    if _fits(points):
+    if fits(points):
         return compactness(points, weights, opacities, power)
     mass = weights.detach() ** power * opacities.detach()[:, None]
     total = mass.sum(0)

@@ -10,6 +10,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
+from rewild4d.kernels.arrays import fits
 from rewild4d.ours.fused.images import colour_sums, matte_loss
 from rewild4d.ours.symmetry import Target
 
@@ -40,7 +41,7 @@ def union_window(alphas: list[Tensor], margin: int) -> Window:
 
 def silhouette_loss(alpha: Tensor, target: Target, window: Window) -> Tensor:
     """BCE + Dice of a rendered matte, alpha [1, h, w] clamped at 1e-5, Dice smoothing 1; scalar."""
-    if _fits(alpha):
+    if fits(alpha):
         return matte_loss(alpha, target.mask, _corner_and_size(window), target.side**2)
     rendered, truth = alpha[:, *window], target.mask[:, *window]
     inside = rendered.clamp(1e-5, 1 - 1e-5)
@@ -66,7 +67,7 @@ def colour_losses(
     """
     area = 3 * target.side**2
     inner = _inner(window, alpha)
-    if _fits(rgb):
+    if fits(rgb):
         bounds = (inner[0].start, inner[0].stop, inner[1].start, inner[1].stop)
         sums = colour_sums(rgb, alpha, target.rgb, target.mask, background, _corner_and_size(window), bounds)
         return sums[0] / area, sums[1] / area
@@ -74,11 +75,6 @@ def colour_losses(
     x = rgb[:, *window] + (1 - alpha[:, *window]) * behind
     y = target.rgb[:, *window] + (1 - target.mask[:, *window]) * behind
     return (x - y).abs().sum() / area, (1 - ssim_map(x, y)[:, *inner]).sum() / area
-
-
-def _fits(image: Tensor) -> bool:
-    """Whether the fused kernels take it."""
-    return image.dtype == torch.float32 and image.device.type == "cpu"
 
 
 def _corner_and_size(window: Window) -> tuple[int, int, int, int]:

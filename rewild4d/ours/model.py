@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from rewild4d.kernels.arrays import fits
 from rewild4d.ours.canonical import Gaussians, initial_gaussians
 from rewild4d.ours.config import Config
 from rewild4d.ours.deform import DeformNetwork, Posed
@@ -78,7 +79,7 @@ class Model(nn.Module):
             transforms: rest -> posed, [J, 4, 4].
         """
         own, log_scales = self.gaussians, self.gaussians.scales_log()
-        if own.means.dtype == torch.float32 and own.means.device.type == "cpu":
+        if fits(own.means):
             live_means, live_quats, means, turned = skin_both(own.means, own.quats, weights, transforms, quats)
             return Posed(live_means, live_quats, log_scales), Posed(means, turned, log_scales)
         rest = nn.functional.normalize(own.quats, dim=-1)

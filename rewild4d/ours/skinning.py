@@ -5,6 +5,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
+from rewild4d.kernels.arrays import fits
 from rewild4d.ours.config import Skinning
 from rewild4d.ours.fused.field import sample_grid
 from rewild4d.ours.geometry_losses import tv_loss
@@ -44,7 +45,7 @@ class SkinningField(nn.Module):
 
     def sample_and_vary(self, probabilities: Tensor, points: Tensor, delta: float | None) -> tuple[Tensor, Tensor]:
         """Weights of points as `sample` gives them, and L_tv of the field (zero where ``delta`` is None)."""
-        if probabilities.dtype == torch.float32 and probabilities.device.type == "cpu":
+        if fits(probabilities):
             return sample_grid(probabilities, points, self.origin, self.pitch, self.resolution, delta)
         weights = self.sample(probabilities, points)
         if delta is None:
@@ -61,7 +62,7 @@ class SkinningField(nn.Module):
         Returns:
             Rows on the simplex, [n, J].
         """
-        if probabilities.dtype == torch.float32 and probabilities.device.type == "cpu":
+        if fits(probabilities):
             return sample_grid(probabilities, points, self.origin, self.pitch, self.resolution)[0]
         last = self.resolution - 1
         place = ((points.detach() - self.origin) / self.pitch).clamp(0, last)

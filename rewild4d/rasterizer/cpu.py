@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from rewild4d.kernels.arrays import array
 from rewild4d.kernels.memory import keep_freed_memory
 from rewild4d.kernels.threads import run, spans, thread_count
 from rewild4d.rasterizer.binning import (
@@ -62,10 +63,6 @@ def rasterize(
     return image, alpha, RasterInfo(radii, means2d)
 
 
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().contiguous().numpy()
-
-
 def _zeros(*shape: int) -> Tensor:
     # Not torch's: filled by its OpenMP threads, which then spin and take the cores from the next kernel.
     return torch.from_numpy(np.zeros(shape, np.float32))
@@ -88,9 +85,9 @@ class _Project(torch.autograd.Function):
         views, count = world_to_camera.shape[0], means.shape[0]
         means2d, records = means.new_empty(views, count, 2), means.new_empty(views, count, RECORD)
         radii, depths = means.new_empty(views, count), means.new_empty(views, count, dtype=torch.float64)
-        gaussians = tuple(_array(tensor) for tensor in (means, quats, scales, opacities))
-        cameras = _array(world_to_camera.double()), _array(intrinsics.double())
-        outputs = tuple(_array(tensor) for tensor in (means2d, records, radii, depths))
+        gaussians = tuple(array(tensor) for tensor in (means, quats, scales, opacities))
+        cameras = array(world_to_camera.double()), array(intrinsics.double())
+        outputs = tuple(array(tensor) for tensor in (means2d, records, radii, depths))
         parts = thread_count() if count * views > SERIAL_BELOW else 1
         run(project, [(*span, *gaussians, *cameras, *options, *outputs) for span in spans(count, parts)])
         ctx.save_for_backward(means, quats, scales, opacities, world_to_camera, intrinsics, radii)
@@ -105,14 +102,14 @@ class _Project(torch.autograd.Function):
         *inputs, radii = ctx.saved_tensors
         world_to_camera, intrinsics = inputs[4:]
         views, count = radii.shape
-        arrays = tuple(_array(tensor) for tensor in inputs[:4])
-        cameras = _array(world_to_camera.double()), _array(intrinsics.double())
+        arrays = tuple(array(tensor) for tensor in inputs[:4])
+        cameras = array(world_to_camera.double()), array(intrinsics.double())
         gradients = [_zeros(*tensor.shape) for tensor in inputs[:4]]
-        outputs = tuple(_array(tensor) for tensor in gradients)
+        outputs = tuple(array(tensor) for tensor in gradients)
         chunks = max(1, -(-count // CHUNK))
         v_cameras, v_pinholes = np.zeros((chunks, views, 3, 4)), np.zeros((chunks, views, 4))
         with_cameras = any(ctx.needs_input_grad[4:6])
-        shared = (radii.numpy(), _array(g_means2d), _array(g_records))
+        shared = (radii.numpy(), array(g_means2d), array(g_records))
 
         def work(first: int, last: int) -> None:
             for chunk in range(first, last):
@@ -222,7 +219,7 @@ class _Blend(torch.autograd.Function):
         image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
         call = (
             np.zeros(1, np.int64), *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.pair_bits,
-            records.numpy().ravel(), _array(features).ravel(), _array(background), image.numpy(), alpha.numpy(),
+            records.numpy().ravel(), array(features).ravel(), array(background), image.numpy(), alpha.numpy(),
         )  # fmt: skip
         run(blend, [call] * _blend_threads(lists))
         ctx.save_for_backward(records, features, background, image, alpha)
@@ -239,8 +236,8 @@ class _Blend(torch.autograd.Function):
         sums = np.empty(len(lists.pair_bits) * width, np.float32)
         call = (
             np.zeros(1, np.int64), *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.pair_bits,
-            records.numpy().ravel(), _array(features).ravel(), image.numpy(), alpha.numpy(),
-            _array(g_image), _array(g_alpha), sums,
+            records.numpy().ravel(), array(features).ravel(), image.numpy(), alpha.numpy(),
+            array(g_image), array(g_alpha), sums,
         )  # fmt: skip
         run(blend_backward, [call] * _blend_threads(lists))
         v_means2d, v_records, v_features = (

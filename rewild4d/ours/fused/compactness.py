@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
 from rewild4d.kernels.threads import run, thread_count
@@ -85,7 +86,7 @@ def compactness(points: Tensor, weights: Tensor, opacities: Tensor, power: float
 class _Compactness(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, points: Tensor, weights: Tensor, opacities: Tensor, power: float) -> Tensor:
-        given = tuple(tensor.detach().contiguous().numpy() for tensor in (points, weights, opacities))
+        given = tuple(map(array, (points, weights, opacities)))
         joints = weights.shape[1]
         sums = np.zeros((max(1, -(-len(points) // CHUNK)), joints * LANES), np.float32)
         run(_moments, [(np.zeros(1, np.int64), *given, power, sums)] * thread_count())

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
 from rewild4d.kernels.threads import run, thread_count
@@ -245,10 +246,6 @@ def deform(
     return _Deform.apply(flat, parts, means, quats, log_scales, sizes, reach)
 
 
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().contiguous().numpy()
-
-
 class _Deform(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -257,7 +254,7 @@ class _Deform(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         given = flat, parts, means, quats, log_scales
         made = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(log_scales)
-        call = np.zeros(1, np.int64), sizes, reach, *map(_array, given), *(tensor.numpy() for tensor in made)
+        call = np.zeros(1, np.int64), sizes, reach, *map(array, given), *(tensor.numpy() for tensor in made)
         run(_forward, [call] * thread_count())
         ctx.save_for_backward(*given)
         ctx.shape = sizes, reach
@@ -271,8 +268,8 @@ class _Deform(torch.autograd.Function):
         gradients = np.zeros((chunks, len(flat)), np.float32)
         on_parts, on_quats = torch.empty_like(parts), torch.empty_like(quats)
         call = (
-            np.zeros(1, np.int64), CHUNK, *ctx.shape, *map(_array, ctx.saved_tensors),
-            *map(_array, (g_means, g_quats, g_log_scales)), gradients, on_parts.numpy(), on_quats.numpy(),
+            np.zeros(1, np.int64), CHUNK, *ctx.shape, *map(array, ctx.saved_tensors),
+            *map(array, (g_means, g_quats, g_log_scales)), gradients, on_parts.numpy(), on_quats.numpy(),
         )  # fmt: skip
         run(_backward, [call] * thread_count())
         return torch.from_numpy(gradients.sum(axis=0)), on_parts, g_means, on_quats, g_log_scales, None, None

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.rows import add_scaled
 from rewild4d.kernels.simd import take_ticket
@@ -177,18 +178,14 @@ def sample_grid(
     return _Sample.apply(table, points, origin, pitch, size, delta)
 
 
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().contiguous().numpy()
-
-
 class _Sample(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, table: Tensor, points: Tensor, origin: Tensor, pitch: Tensor, size: int, delta: float | None
     ) -> tuple[Tensor, Tensor]:
-        grid, joints = _array(table), table.shape[1]
+        grid, joints = array(table), table.shape[1]
         weights = table.new_empty(len(points), joints)
-        place = *map(_array, (points, origin, pitch)), size
+        place = *map(array, (points, origin, pitch)), size
         run(
             _sample_forward,
             [(np.zeros(1, np.int64), grid.ravel(), *place, joints, weights.numpy().ravel())] * thread_count(),
@@ -212,7 +209,7 @@ class _Sample(torch.autograd.Function):
         joints = slope.shape[1]
         on_table = torch.empty(size**3, joints)
         call = (
-            np.zeros(1, np.int64), *ctx.place, order, starts, joints, _array(slope).ravel(), ctx.slope,
+            np.zeros(1, np.int64), *ctx.place, order, starts, joints, array(slope).ravel(), ctx.slope,
             float(by_variation) * ctx.share, on_table.numpy().ravel(),
         )  # fmt: skip
         run(_sample_backward, [call] * thread_count())

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rewild4d.harmonics import C1, C2, C3
+from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import take_ticket
 from rewild4d.kernels.threads import run, thread_count
@@ -133,18 +134,14 @@ def seen_rgb(
     return _Seen.apply(colors, means, quats, rest, eye, degree, gain)
 
 
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().float().contiguous().numpy()
-
-
 class _Seen(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, colors: Tensor, means: Tensor, quats: Tensor, rest: Tensor, eye: Tensor, degree: int, gain: float
     ) -> Tensor:
         seen = torch.empty_like(means)
-        given = *map(_array, (means, quats, rest, eye)), degree, gain
-        run(_forward, [(np.zeros(1, np.int64), _array(colors), *given, seen.numpy())] * thread_count())
+        given = *map(array, (means, quats, rest, eye.float())), degree, gain
+        run(_forward, [(np.zeros(1, np.int64), array(colors), *given, seen.numpy())] * thread_count())
         ctx.given, ctx.seen, ctx.shape = given, seen.numpy(), colors.shape
         return seen
 
@@ -152,6 +149,6 @@ class _Seen(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
         on_colors = torch.empty(ctx.shape)
-        call = np.zeros(1, np.int64), *ctx.given, ctx.seen, _array(slope), on_colors.numpy()
+        call = np.zeros(1, np.int64), *ctx.given, ctx.seen, array(slope), on_colors.numpy()
         run(_backward, [call] * thread_count())
         return on_colors, None, None, None, None, None, None

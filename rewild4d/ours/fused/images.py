@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.simd import LANES, divide, fma, keep_where_ge, load, maximum, splat, store, take_ticket
 from rewild4d.kernels.threads import run, thread_count
@@ -213,16 +214,12 @@ def colour_sums(
     return _Colour.apply(image, matte, truth, mask, background, window, inner)
 
 
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().contiguous().numpy()
-
-
 class _Colour(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, image: Tensor, matte: Tensor, truth: Tensor, mask: Tensor, background: Tensor, window: Any, inner: Any
     ) -> Tensor:
-        given = tuple(_array(tensor) for tensor in (image, matte, truth, mask, background))
+        given = tuple(array(tensor) for tensor in (image, matte, truth, mask, background))
         _, _, height, width = window
         slopes = np.zeros((9, (height + 2 * HALF) * _stride(width)), np.float32)
         sums = np.zeros((-(-height // STRIP), 2))
@@ -310,7 +307,7 @@ def matte_loss(alpha: Tensor, mask: Tensor, window: tuple[int, int, int, int], a
 class _Matte(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, alpha: Tensor, mask: Tensor, window: Any, area: float) -> Tensor:
-        given, sums = (_array(alpha), _array(mask)), np.zeros((-(-window[2] // STRIP), 4))
+        given, sums = (array(alpha), array(mask)), np.zeros((-(-window[2] // STRIP), 4))
         run(_matte_forward, [(np.zeros(1, np.int64), *given, window, sums)] * thread_count())
         entropy, common, mine, theirs = sums.sum(axis=0).tolist()
         ctx.given, ctx.window, ctx.area, ctx.sums = given, window, area, (common, mine, theirs)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.rows import sum_rows
 from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
@@ -174,10 +175,6 @@ def skin_both(
     return _Skin.apply(means, quats, weights, transforms, joint_quats)
 
 
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().contiguous().numpy()
-
-
 class _Skin(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -185,7 +182,7 @@ class _Skin(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         rows, signs = _tables(transforms, joint_quats)
         new_means, new_quats = torch.empty_like(means), torch.empty_like(quats)
-        given = tuple(map(_array, (means, quats, weights)))
+        given = tuple(map(array, (means, quats, weights)))
         call = np.zeros(1, np.int64), *given, rows, new_means.numpy(), new_quats.numpy()
         run(_forward, [call] * thread_count())
         ctx.given, ctx.tables = given, (rows, signs)
@@ -198,7 +195,7 @@ class _Skin(torch.autograd.Function):
         joints, chunks = ctx.given[2].shape[1], max(1, -(-len(ctx.given[0]) // CHUNK))
         on_rows = np.zeros((chunks, joints * LANES), np.float32)
         call = (
-            np.zeros(1, np.int64), *ctx.given, *ctx.tables, *map(_array, slopes), *(each.numpy() for each in made),
+            np.zeros(1, np.int64), *ctx.given, *ctx.tables, *map(array, slopes), *(each.numpy() for each in made),
             on_rows,
         )  # fmt: skip
         run(_backward, [call] * thread_count())
