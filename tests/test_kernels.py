@@ -1,0 +1,117 @@
+"""The parts that CPU kernels are made of, against NumPy and torch."""
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.matrix import add_product, transpose_tile
+from rewild4d.kernels.memory import keep_freed_memory
+from rewild4d.kernels.rows import add_scaled, sum_rows
+from rewild4d.kernels.threads import run, spans, thread_count, torch_on_one
+from rewild4d.ours.gradients import clip_gradients
+
+
+def numbers(*shape: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("rows", "depth", "columns"), [(8, 1, 16), (16, 7, 48), (64, 54, 80), (24, 48, 112), (8, 0, 32)]
+)
+@pytest.mark.parametrize("transposed", [False, True])
+def test_products_are_added(rows: int, depth: int, columns: int, transposed: bool) -> None:
+    a, b, before = numbers(rows, depth, seed=1), numbers(depth, columns, seed=2), numbers(rows, columns, seed=3)
+    c = before.copy()
+    # The same memory serves A and its transpose: only the distances differ.
+    stored, strides = (np.ascontiguousarray(a.T), (1, rows)) if transposed else (a, (depth, 1))
+    add_product(stored.ravel(), 0, *strides, b.ravel(), 0, columns, depth, c.ravel(), 0, columns, rows, columns)
+    np.testing.assert_allclose(c, before + a.astype(np.float64) @ b, atol=1e-4)
+
+
+@kernel
+def _transposed(source: np.ndarray, target: np.ndarray) -> None:
+    transpose_tile(source, 3, 20, target, 5, 17)
+
+
+def test_a_tile_is_transposed_in_place_of_its_strides() -> None:
+    source, target = numbers(400, seed=1), np.zeros(400, np.float32)
+    _transposed(source, target)
+    for row in range(16):
+        for column in range(16):
+            assert target[5 + 17 * column + row] == source[3 + 20 * row + column]
+
+
+@kernel
+def _summed(rows: np.ndarray, count: int, sums: np.ndarray) -> None:
+    sum_rows(rows, count, sums, 0)
+
+
+@pytest.mark.parametrize("count", [1, 9, 16, 21])
+def test_each_row_is_summed(count: int) -> None:
+    rows, sums = numbers(count, 16, seed=count), np.full(32, np.nan, np.float32)
+    _summed(rows.ravel(), count, sums)
+    np.testing.assert_allclose(sums[:count], rows.astype(np.float64).sum(1), atol=1e-5)
+
+
+@kernel
+def _added(share: float, source: np.ndarray, target: np.ndarray, count: int) -> None:
+    add_scaled(share, source, 2, target, 1, count)
+
+
+@pytest.mark.parametrize("count", [1, 16, 20, 37])
+def test_a_scaled_row_is_added_and_nothing_beyond_it(count: int) -> None:
+    source, before = numbers(50, seed=1), numbers(50, seed=2)
+    target = before.copy()
+    _added(np.float32(0.5), source, target, count)
+    wanted = before.copy()
+    wanted[1 : 1 + count] += np.float32(0.5) * source[2 : 2 + count]
+    np.testing.assert_allclose(target, wanted, rtol=1e-6)
+
+
+def test_the_kernels_keep_their_threads_while_torch_has_one() -> None:
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        with torch_on_one():
+            assert torch.get_num_threads() == 1 and thread_count() == 3
+            with torch_on_one():
+                assert thread_count() == 3
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 3 and thread_count() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_an_error_in_a_thread_reaches_the_caller() -> None:
+    def work(index: int) -> None:
+        if index == 1:
+            raise ValueError("in the second")
+
+    with pytest.raises(ValueError, match="in the second"):
+        run(work, [(0,), (1,)])
+
+
+def test_spans_cover_everything_once() -> None:
+    assert spans(10, 4) == [(0, 2), (2, 5), (5, 7), (7, 10)]
+    assert spans(2, 5) == [(0, 1), (1, 2)] and spans(0, 3) == []
+
+
+def test_the_memory_hint_never_raises() -> None:
+    assert keep_freed_memory() in (True, False)
+
+
+@pytest.mark.parametrize("limit", [0.1, 100.0])
+def test_gradients_are_clipped_as_torch_does(limit: float) -> None:
+    found = []
+    for clip in (clip_gradients, nn.utils.clip_grad_norm_):
+        layers = nn.Sequential(nn.Linear(5, 7), nn.Linear(7, 2))
+        generator = torch.Generator().manual_seed(0)
+        for parameter in layers.parameters():
+            parameter.grad = torch.randn(parameter.shape, generator=generator)
+        norm = clip(list(layers.parameters()), limit)
+        found.append([norm, *(parameter.grad for parameter in layers.parameters())])
+    for own, wanted in zip(*found, strict=True):
+        torch.testing.assert_close(own, wanted)
+    assert clip_gradients([nn.Parameter(torch.zeros(2))], limit) == 0
