@@ -81,8 +81,8 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     enabled: bool = True
     """False is the paper's "w/o Deform" ablation."""
     width: int = 64
-    """Hidden width; the dearest network of the method. 128 for 64: +0.03 dB on one horse, +0.3 on one cow (one seed, 3,000
-    steps, preset standard), and 1.3 times the time of the whole fit."""
+    """Hidden width; the dearest network of the method. 128 for 64: +0.03 dB on one horse, +0.3 on one cow (one seed,
+    3,000 steps, preset standard), and 1.3 times the time of the whole fit."""
     heads: int = 4
     """Attention heads over the parts."""
     frequencies: int = 6
