@@ -62,7 +62,7 @@ def test_gradients_to_a_hundred_thousandth_on_twenty_scenes(kind: str) -> None:
         assert max(relative.values()) <= 1e-5, (seed, relative)
 
 
-@pytest.mark.parametrize(("kind", "bound"), [("needles", 5e-5), ("on one pixel", 1e-4)])
+@pytest.mark.parametrize(("kind", "bound"), [("needles", 1e-5), ("on one pixel", 1e-4)])
 def test_ill_conditioned_scenes(kind: str, bound: float) -> None:
     # A needle's exponent is a difference of large numbers; on one pixel hundreds of gradients cancel in the camera's.
     for seed in range(5):

@@ -5,20 +5,22 @@ rectangles, which of the tile's sixteen 4 x 4 blocks the ellipse reaches; counti
 place before that last sort (Gaussian by Gaussian) is its `slot`: the backward pass leaves its sums there.
 """
 
+from typing import Any
+
 import numpy as np
 
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import bits_gt, fma, load, maximum, minimum, splat
 from rewild4d.rasterizer.projection import (
+    ALONG_X,
+    ALONG_Y,
     CENTER_X,
     CENTER_Y,
+    DOWN,
     EXTENT_X,
     EXTENT_Y,
     LOG2_MIN_ALPHA,
     LOG_OPACITY,
-    XX,
-    XY,
-    YY,
 )
 
 TILE, BLOCK, BLOCKS = 16, 4, 16
@@ -124,6 +126,13 @@ def count_slots(
 
 
 @inlined
+def _squares(a: float, b: float, c: float, x: Any, y: Any) -> Any:
+    """By how much the exponent falls from the centre to (x, y)."""
+    t, u = fma(splat(a), x, splat(b) * y), splat(c) * y
+    return fma(t, t, u * u)
+
+
+@inlined
 def _reached_blocks(
     records: np.ndarray, view: int, n: int, left: int, top: int, block_left: np.ndarray, block_top: np.ndarray
 ) -> int:
@@ -133,18 +142,16 @@ def _reached_blocks(
     optimum; all sixteen blocks are tested at once.
     """
     zero, span = splat(np.float32(0)), splat(np.float32(BLOCK - 1))
-    xx, xy, yy = records[view, n, XX], records[view, n, XY], records[view, n, YY]
+    a, b, c = records[view, n, ALONG_X], records[view, n, ALONG_Y], records[view, n, DOWN]
     low_x = load(block_left, 0) + splat(np.float32(left + 0.5 - records[view, n, CENTER_X]))
     low_y = load(block_top, 0) + splat(np.float32(top + 0.5 - records[view, n, CENTER_Y]))
     high_x, high_y = low_x + span, low_y + span
     near_x, near_y = minimum(maximum(zero, low_x), high_x), minimum(maximum(zero, low_y), high_y)
-    best_y = minimum(maximum(near_x * splat(np.float32(-0.5) * xy / yy), low_y), high_y)
-    best_x = minimum(maximum(near_y * splat(np.float32(-0.5) * xy / xx), low_x), high_x)
-    a, b, c = splat(xx), splat(xy), splat(yy)
-    on_column = fma(near_x, fma(a, near_x, b * best_y), c * (best_y * best_y))
-    on_row = fma(best_x, fma(a, best_x, b * near_y), c * (near_y * near_y))
-    needed = np.float32(LOG2_MIN_ALPHA) - records[view, n, LOG_OPACITY]
-    return bits_gt(maximum(on_column, on_row), splat(needed * np.float32(1.0001) - SLACK))
+    best_y = minimum(maximum(near_x * splat(-a * b / (b * b + c * c)), low_y), high_y)
+    best_x = minimum(maximum(near_y * splat(-b / a), low_x), high_x)
+    least = minimum(_squares(a, b, c, near_x, best_y), _squares(a, b, c, best_x, near_y))
+    reach = records[view, n, LOG_OPACITY] - np.float32(LOG2_MIN_ALPHA)
+    return bits_gt(splat(reach * np.float32(1.0001) + SLACK), least)
 
 
 @kernel

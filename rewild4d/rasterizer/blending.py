@@ -31,14 +31,14 @@ from rewild4d.kernels.simd import (
 from rewild4d.rasterizer.binning import BLOCK, BLOCKS, TILE
 from rewild4d.rasterizer.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
 from rewild4d.rasterizer.projection import (
+    ALONG_X,
+    ALONG_Y,
     CENTER_X,
     CENTER_Y,
+    DOWN,
     LOG2_MIN_ALPHA,
     LOG_OPACITY,
     RECORD,
-    XX,
-    XY,
-    YY,
 )
 
 WEAKEST = np.float32(LOG2_MIN_ALPHA)
@@ -48,11 +48,11 @@ LEAST_LEFT = np.float32(MIN_TRANSMITTANCE)
 
 @inlined
 def form(records: np.ndarray, record: int) -> tuple:
-    """The four coefficients of one Gaussian's exponent, each in all lanes."""
+    """The four numbers of one Gaussian's exponent, each in all lanes."""
     return (
-        broadcast(records, record + XX),
-        broadcast(records, record + XY),
-        broadcast(records, record + YY),
+        broadcast(records, record + ALONG_X),
+        broadcast(records, record + ALONG_Y),
+        broadcast(records, record + DOWN),
         broadcast(records, record + LOG_OPACITY),
     )
 
@@ -67,11 +67,12 @@ def offsets(records: np.ndarray, record: int, tile_left: int, tile_top: int) -> 
 
 @inlined
 def exponent_at(form: tuple, offset_x: Any, offset_y: Any, block: int) -> tuple:
-    """The offsets of one block's pixels from the centre, and log2 of alpha there before the cap."""
-    xx, xy, yy, log_opacity = form
+    """The coordinates t and u of one block's pixels, and log2 of alpha there before the cap."""
+    along_x, along_y, down, log_opacity = form
     dx = offset_x + splat(np.float32(BLOCK * (block & 3)))
     dy = offset_y + splat(np.float32(BLOCK * (block >> 2)))
-    return dx, dy, fma(fma(xx, dx, xy * dy), dx, fma(yy, dy * dy, log_opacity))
+    t, u = fma(along_x, dx, along_y * dy), down * dy
+    return t, u, log_opacity - fma(t, t, u * u)
 
 
 @inlined
@@ -172,7 +173,7 @@ def _blend_entry(
     while bits != 0:
         block = lowest_bit(bits)
         bits &= bits - 1
-        dx, dy, exponent = exponent_at(shape, offset_x, offset_y, block)
+        _, _, exponent = exponent_at(shape, offset_x, offset_y, block)
         alpha = keep_where_ge(minimum(exp2(exponent), splat(STRONGEST_ALPHA)), exponent, splat(WEAKEST))
         before = load(left, block * LANES)
         weight = alpha * before

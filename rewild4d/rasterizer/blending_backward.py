@@ -39,10 +39,10 @@ from rewild4d.rasterizer.blending import (
     tile_place,
 )
 from rewild4d.rasterizer.conventions import MAX_ALPHA
-from rewild4d.rasterizer.projection import LOG_OPACITY, RECORD, XX, XY, YY
+from rewild4d.rasterizer.projection import ALONG_X, ALONG_Y, DOWN, LOG_OPACITY, RECORD, TT, TU, UU
 
 MOMENTS = 6
-"""Sums of q, q dx, q dy, q dx^2, q dx dy, q dy^2 that come before the channel sums in a slot, q = dL/dalpha alpha."""
+"""Sums of q, q t, q u, q t^2, q t u, q u^2 that come before the channel sums in a slot, q = dL/dalpha alpha."""
 
 LN2 = math.log(2.0)
 _STRONGEST = np.float32(math.log2(MAX_ALPHA))
@@ -170,11 +170,11 @@ def _entry_backward(
     else:
         for channel in range(channels):
             store(rows, (MOMENTS + channel) * LANES, zero)
-    m, mx, my, mxx, mxy, myy = zero, zero, zero, zero, zero, zero
+    m, mt, mu, mtt, mtu, muu = zero, zero, zero, zero, zero, zero
     while bits != 0:
         block = lowest_bit(bits)
         bits &= bits - 1
-        dx, dy, exponent = exponent_at(shape, offset_x, offset_y, block)
+        t, u, exponent = exponent_at(shape, offset_x, offset_y, block)
         alpha = keep_where_ge(minimum(exp2(exponent), splat(STRONGEST_ALPHA)), exponent, splat(WEAKEST))
         before = load(left, block * LANES)
         weight = alpha * before
@@ -204,15 +204,15 @@ def _entry_backward(
         pull = select_gt(weight, zero, pull, zero)
         pull = select_gt(exponent, splat(_STRONGEST), zero, pull)
         m = m + pull
-        pull_x, pull_y = pull * dx, pull * dy
-        mx, my = mx + pull_x, my + pull_y
-        mxx, mxy, myy = fma(pull_x, dx, mxx), fma(pull_x, dy, mxy), fma(pull_y, dy, myy)
+        pull_t, pull_u = pull * t, pull * u
+        mt, mu = mt + pull_t, mu + pull_u
+        mtt, mtu, muu = fma(pull_t, t, mtt), fma(pull_t, u, mtu), fma(pull_u, u, muu)
     store(rows, 0, m)
-    store(rows, LANES, mx)
-    store(rows, 2 * LANES, my)
-    store(rows, 3 * LANES, mxx)
-    store(rows, 4 * LANES, mxy)
-    store(rows, 5 * LANES, myy)
+    store(rows, LANES, mt)
+    store(rows, 2 * LANES, mu)
+    store(rows, 3 * LANES, mtt)
+    store(rows, 4 * LANES, mtu)
+    store(rows, 5 * LANES, muu)
     if channels == 3:
         store(rows, MOMENTS * LANES, on_red)
         store(rows, (MOMENTS + 1) * LANES, on_green)
@@ -249,11 +249,11 @@ def gather_slots(
                 if pair_bits[slot] != 0:
                     added = added + load(sums, slot * width + i)
             store(total, i, added)
-        m, mx, my, mxx, mxy, myy = total[0], total[1], total[2], total[3], total[4], total[5]
-        xx, xy, yy = records[view, n, XX], records[view, n, XY], records[view, n, YY]
-        v_means2d[view, n, 0] = -LN2 * (2 * xx * mx + xy * my)
-        v_means2d[view, n, 1] = -LN2 * (2 * yy * my + xy * mx)
-        v_records[view, n, XX], v_records[view, n, XY], v_records[view, n, YY] = LN2 * mxx, LN2 * mxy, LN2 * myy
+        m, mt, mu, mtt, mtu, muu = total[0], total[1], total[2], total[3], total[4], total[5]
+        along_x, along_y, down = records[view, n, ALONG_X], records[view, n, ALONG_Y], records[view, n, DOWN]
+        v_means2d[view, n, 0] = 2 * LN2 * along_x * mt
+        v_means2d[view, n, 1] = 2 * LN2 * (along_y * mt + down * mu)
+        v_records[view, n, TT], v_records[view, n, TU], v_records[view, n, UU] = LN2 * mtt, LN2 * mtu, LN2 * muu
         v_records[view, n, LOG_OPACITY] = LN2 * m
         for channel in range(channels):
             v_features[n, channel] += total[MOMENTS + channel]

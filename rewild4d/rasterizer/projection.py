@@ -1,7 +1,9 @@
 """EWA projection and its gradient: one Gaussian at a time, in double precision, as a record that the blend reads.
 
 A record holds, per view and Gaussian, what one pixel's alpha takes: alpha = 2 ** (exponent), with d = pixel - centre,
-exponent = LOG_OPACITY + XX dx^2 + XY dx dy + YY dy^2. Invisible Gaussians have extent 0.
+exponent = LOG_OPACITY - t^2 - u^2, t = ALONG_X dx + ALONG_Y dy, u = DOWN dy. A sum of squares loses nothing to
+cancellation, as the form's expansion does for needles. The gradient of a record holds, in its columns TT, TU and UU,
+the sums of dL/dexponent times t^2, t u and u^2. Invisible Gaussians have extent 0.
 """
 
 import math
@@ -12,7 +14,9 @@ from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.rasterizer.conventions import FRUSTUM_MARGIN, MIN_ALPHA, MIN_COMPENSATION
 
 # Columns of a record.
-CENTER_X, CENTER_Y, XX, XY, YY, LOG_OPACITY, EXTENT_X, EXTENT_Y, RECORD = 0, 1, 2, 3, 4, 5, 6, 7, 8
+CENTER_X, CENTER_Y, ALONG_X, ALONG_Y, DOWN, LOG_OPACITY, EXTENT_X, EXTENT_Y, RECORD = 0, 1, 2, 3, 4, 5, 6, 7, 8
+# Columns of a record's gradient.
+TT, TU, UU = 2, 3, 4
 
 CHUNK = 1024
 """Gaussians a unit of work holds; the camera's gradient is summed over these, whatever the number of threads."""
@@ -72,6 +76,14 @@ def _image_axes(linear_x: tuple, linear_y: tuple, axes: tuple, scales: np.ndarra
     row_x = _dot(linear_x, axes[0]) * a, _dot(linear_x, axes[1]) * b, _dot(linear_x, axes[2]) * c
     row_y = _dot(linear_y, axes[0]) * a, _dot(linear_y, axes[1]) * b, _dot(linear_y, axes[2]) * c
     return row_x, row_y
+
+
+@inlined
+def _factor(xx: float, xy: float, yy: float, det: float) -> tuple:
+    """The triangular factor of the inverse covariance, times log2(e) / 2."""
+    down = math.sqrt(HALF_LOG2_E / yy)
+    along_x = math.sqrt(HALF_LOG2_E * yy / det)
+    return along_x, -along_x * xy / yy, down
 
 
 @kernel
@@ -138,9 +150,8 @@ def project(
             radii[view, n] = math.sqrt(reach * (0.5 * (xx + yy) + math.sqrt(spread * spread + xy * xy)))
             depths[view, n] = z
             records[view, n, CENTER_X], records[view, n, CENTER_Y] = u, v
-            factor = HALF_LOG2_E / det
-            records[view, n, XX], records[view, n, YY] = -factor * yy, -factor * xx
-            records[view, n, XY] = 2 * factor * xy
+            along_x, along_y, down = _factor(xx, xy, yy, det)
+            records[view, n, ALONG_X], records[view, n, ALONG_Y], records[view, n, DOWN] = along_x, along_y, down
             records[view, n, LOG_OPACITY] = log_opacity
             records[view, n, EXTENT_X], records[view, n, EXTENT_Y] = extent_x, extent_y
 
@@ -152,18 +163,19 @@ def _covariance_gradient(
     raw_yy: float,
     eps2d: float,
     antialias: bool,
-    g_xx: float,
-    g_xy: float,
-    g_yy: float,
+    g_tt: float,
+    g_tu: float,
+    g_uu: float,
     g_log: float,
 ) -> tuple:
-    """Gradient of the projected covariance (xx, xy, yy) from that of a record's four coefficients."""
+    """Gradient of the projected covariance (xx, xy, yy) from that of a record."""
     xx, yy = raw_xx + eps2d, raw_yy + eps2d
     det = xx * yy - xy * xy
-    k = HALF_LOG2_E / (det * det)
-    v_xx = k * (g_xx * yy * yy - 2 * g_xy * xy * yy + g_yy * xy * xy)
-    v_xy = 2 * k * (-g_xx * xy * yy + g_xy * (xx * yy + xy * xy) - g_yy * xx * xy)
-    v_yy = k * (g_xx * xy * xy - 2 * g_xy * xx * xy + g_yy * xx * xx)
+    a, b, c = _factor(xx, xy, yy, det)
+    k = 1 / HALF_LOG2_E
+    v_xx = k * a * a * g_tt
+    v_xy = 2 * k * a * (b * g_tt + c * g_tu)
+    v_yy = k * (b * b * g_tt + 2 * b * c * g_tu + c * c * g_uu)
     raw_det = raw_xx * raw_yy - xy * xy
     if antialias and raw_det > MIN_COMPENSATION * det:
         h = HALF_LOG2_E * g_log
@@ -257,7 +269,7 @@ def project_backward(
             g_log = np.float64(g_records[view, n, LOG_OPACITY])
             v_xx, v_xy, v_yy = _covariance_gradient(
                 _dot(half_x, half_x), _dot(half_x, half_y), _dot(half_y, half_y), eps2d, antialias,
-                g_records[view, n, XX], g_records[view, n, XY], g_records[view, n, YY], g_log,
+                g_records[view, n, TT], g_records[view, n, TU], g_records[view, n, UU], g_log,
             )  # fmt: skip
             v_opacities[n] += 2 * HALF_LOG2_E * g_log / opacities[n]
             v_half_x, v_half_y = _mix(2 * v_xx, half_x, v_xy, half_y), _mix(v_xy, half_x, 2 * v_yy, half_y)
