@@ -32,8 +32,8 @@ def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function on its first call, without the GIL, and keep the machine code in the cache folder.
 
-    It may call kernels of its own folder and of this one. Where no cache folder can be written it is compiled anew in
-    every process.
+    It may call kernels of its own folder and of this one, whose sources decide the cache; a constant from elsewhere
+    must never change. Where no cache folder can be written it is compiled anew in every process.
     """
     return _compiled(function, {})
 

@@ -115,8 +115,7 @@ class _Project(torch.autograd.Function):
             for chunk in range(first, last):
                 project_backward(
                     chunk * CHUNK, min((chunk + 1) * CHUNK, count), *arrays, *cameras, *ctx.options[:4],
-                    with_cameras, *shared,
-                    *outputs, v_cameras[chunk], v_pinholes[chunk],
+                    with_cameras, *shared, *outputs, v_cameras[chunk], v_pinholes[chunk],
                 )  # fmt: skip
 
         run(work, spans(chunks, thread_count()))
@@ -180,12 +179,12 @@ def _number_slots(
     tiles_y: int, slots: np.ndarray,
 ) -> int:  # fmt: skip
     """Fill slots [V, N + 1] over all pieces; gives the number of slots."""
-    totals = np.zeros((max(1, len(pieces)), 1), np.int64)
+    totals = np.zeros((len(pieces), 1), np.int64)
     _run_pieces(
         count_slots, [(*piece, order, records, tiles_x, tiles_y, slots, totals[i]) for i, piece in enumerate(pieces)]
     )
     before = 0
-    for (view, begin, end), total in zip(pieces, totals[:, 0].tolist(), strict=False):
+    for (view, begin, end), total in zip(pieces, totals[:, 0].tolist(), strict=True):
         slots[view, begin:end] += before
         before += total
         if end == counts[view]:
@@ -240,11 +239,8 @@ class _Blend(torch.autograd.Function):
             array(g_image), array(g_alpha), sums,
         )  # fmt: skip
         run(blend_backward, [call] * _blend_threads(lists))
-        v_means2d, v_records, v_features = (
-            _zeros(*records.shape[:2], 2),
-            _zeros(*records.shape),
-            _zeros(*features.shape),
-        )
+        v_means2d, v_records = _zeros(*records.shape[:2], 2), _zeros(*records.shape)
+        v_features = _zeros(*features.shape)
         outputs = (v_means2d.numpy(), v_records.numpy(), v_features.numpy())
         given = (lists.order, lists.slots, lists.pair_bits, records.numpy(), sums, width)
         for view in range(records.shape[0]):

@@ -92,9 +92,7 @@ def _forward(
                 new_means[n, i] = (
                     blended[4 * i] * x + blended[4 * i + 1] * y + blended[4 * i + 2] * z + blended[4 * i + 3]
                 )
-            w, i, j, k, _ = _unit(blended[12:].reshape(1, 4), 0)
-            a, b, c, d, _ = _unit(quats, n)
-            turned = _times((w, i, j, k), (a, b, c, d))
+            turned = _times(_unit(blended[12:].reshape(1, 4), 0), _unit(quats, n))
             for i in range(4):
                 new_quats[n, i] = turned[i]
 
@@ -191,7 +189,7 @@ class _Skin(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor, ...]:
-        made = tuple(torch.empty(array.shape) for array in ctx.given)
+        made = tuple(torch.empty(each.shape) for each in ctx.given)
         joints, chunks = ctx.given[2].shape[1], max(1, -(-len(ctx.given[0]) // CHUNK))
         on_rows = np.zeros((chunks, joints * LANES), np.float32)
         call = (
