@@ -191,6 +191,33 @@ def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
 
 
 @intrinsic
+def fnma(typing: Any, a: Any, b: Any, c: Any) -> Any:
+    """Compute c - a * b, rounded once."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return llvm_call(builder, "llvm.fma.v16f32", [builder.fneg(args[0]), args[1], args[2]])
+
+    return signature(lanes_type, lanes_type, lanes_type, lanes_type), generate
+
+
+@intrinsic
+def absolute(typing: Any, a: Any) -> Any:
+    """Lane by lane absolute value."""
+    return signature(lanes_type, a), lambda context, builder, sig, args: llvm_call(builder, "llvm.fabs.v16f32", args)
+
+
+@intrinsic
+def negated_absolute(typing: Any, a: Any) -> Any:
+    """Lane by lane, minus the absolute value."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        bits = builder.or_(builder.bitcast(args[0], _INTEGERS), ir.Constant(_INTEGERS, [-(2**31)] * LANES))
+        return builder.bitcast(bits, _VECTOR)
+
+    return signature(lanes_type, a), generate
+
+
+@intrinsic
 def minimum(typing: Any, a: Any, b: Any) -> Any:
     """Lane by lane minimum."""
 

@@ -2,7 +2,7 @@
 
 A vector holds the sixteen pixels of a 4 x 4 block. Gaussians are the outer loop and the blocks that they reach the
 inner one, so neighbouring steps work on different pixels and need not wait for each other; a tile's state stays in the
-first cache. A closed pixel has transmittance 0 in the running state, which makes every later Gaussian vanish there.
+first cache. A closed pixel keeps its last transmittance, with a minus sign, and takes nothing more.
 """
 
 from typing import Any
@@ -12,15 +12,18 @@ import numpy as np
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import (
     LANES,
+    absolute,
     bits_gt,
     broadcast,
     columns_of_block,
     exp2,
     fma,
+    fnma,
     keep_where_ge,
     load,
     lowest_bit,
     minimum,
+    negated_absolute,
     rows_of_block,
     select_gt,
     splat,
@@ -47,32 +50,25 @@ LEAST_LEFT = np.float32(MIN_TRANSMITTANCE)
 
 
 @inlined
-def form(records: np.ndarray, record: int) -> tuple:
-    """The four numbers of one Gaussian's exponent, each in all lanes."""
-    return (
-        broadcast(records, record + ALONG_X),
-        broadcast(records, record + ALONG_Y),
-        broadcast(records, record + DOWN),
-        broadcast(records, record + LOG_OPACITY),
-    )
-
-
-@inlined
-def offsets(records: np.ndarray, record: int, tile_left: int, tile_top: int) -> tuple:
-    """From the Gaussian's centre to the pixel centres of the tile's first block, two vectors."""
+def place_in_tile(records: np.ndarray, record: int, tile_left: int, tile_top: int, steps: np.ndarray) -> tuple:
+    """The coordinates t and u of the pixels in a tile's first block; fill ``steps`` [32] with what each block adds."""
     left, top = splat(np.float32(tile_left + 0.5)), splat(np.float32(tile_top + 0.5))
-    dx, dy = left - broadcast(records, record + CENTER_X), top - broadcast(records, record + CENTER_Y)
-    return columns_of_block() + dx, rows_of_block() + dy
+    along_x, along_y = broadcast(records, record + ALONG_X), broadcast(records, record + ALONG_Y)
+    down = broadcast(records, record + DOWN)
+    dx = columns_of_block() + (left - broadcast(records, record + CENTER_X))
+    dy = rows_of_block() + (top - broadcast(records, record + CENTER_Y))
+    block = splat(np.float32(BLOCK))
+    step_x, step_y = block * columns_of_block(), block * rows_of_block()  # lane i here stands for block i
+    store(steps, 0, fma(along_x, step_x, along_y * step_y))
+    store(steps, LANES, down * step_y)
+    return fma(along_x, dx, along_y * dy), down * dy
 
 
 @inlined
-def exponent_at(form: tuple, offset_x: Any, offset_y: Any, block: int) -> tuple:
-    """The coordinates t and u of one block's pixels, and log2 of alpha there before the cap."""
-    along_x, along_y, down, log_opacity = form
-    dx = offset_x + splat(np.float32(BLOCK * (block & 3)))
-    dy = offset_y + splat(np.float32(BLOCK * (block >> 2)))
-    t, u = fma(along_x, dx, along_y * dy), down * dy
-    return t, u, log_opacity - fma(t, t, u * u)
+def alpha_at(log_opacity: Any, t: Any, u: Any) -> tuple:
+    """Alpha before the lower cut, and log2 of alpha before the upper one."""
+    exponent = fnma(t, t, fnma(u, u, log_opacity))
+    return minimum(exp2(exponent), splat(STRONGEST_ALPHA)), exponent
 
 
 @inlined
@@ -114,7 +110,7 @@ def blend(
     """
     views, channels, height, width = image.shape
     count = len(records) // (RECORD * views)
-    left, final = np.empty(BLOCKS * LANES, np.float32), np.empty(BLOCKS * LANES, np.float32)
+    left, steps = np.empty(BLOCKS * LANES, np.float32), np.empty(2 * LANES, np.float32)
     colors = np.empty(BLOCKS * channels * LANES, np.float32)
     while True:
         tile = take_ticket(tickets)
@@ -122,7 +118,6 @@ def blend(
             return
         view, tile_top, tile_left = tile_place(tile, tiles_x, tiles_y)
         live = open_tile(tile_left, tile_top, width, height, left)
-        final[:] = left
         colors[:] = 0
         for entry in range(starts[tile], starts[tile + 1]):
             slot = entry_slot[entry]
@@ -131,13 +126,13 @@ def blend(
                 n = entry_gaussian[entry]
                 touched, closed = _blend_entry(
                     bits, records, (view * count + n) * RECORD, features, n * channels, channels, tile_left, tile_top,
-                    left, final, colors,
+                    steps, left, colors,
                 )  # fmt: skip
                 pair_bits[slot] = touched
                 live &= ~closed
             else:
                 pair_bits[slot] = 0
-        _write_tile(view, tile_left, tile_top, final, colors, background, image, alpha)
+        _write_tile(view, tile_left, tile_top, left, colors, background, image, alpha)
 
 
 @inlined
@@ -161,29 +156,28 @@ def _blend_entry(
     channels: int,
     tile_left: int,
     tile_top: int,
+    steps: np.ndarray,
     left: np.ndarray,
-    final: np.ndarray,
     colors: np.ndarray,
 ) -> tuple:
     """Blend one Gaussian into the blocks of ``bits``; give the blocks that it touched and those that are now closed."""
-    zero, least = splat(np.float32(0)), splat(LEAST_LEFT)
-    shape = form(records, record)
-    offset_x, offset_y = offsets(records, record, tile_left, tile_top)
+    zero, least, weakest = splat(np.float32(0)), splat(LEAST_LEFT), splat(WEAKEST)
+    log_opacity = broadcast(records, record + LOG_OPACITY)
+    first_t, first_u = place_in_tile(records, record, tile_left, tile_top, steps)
     touched, closed = 0, 0
     while bits != 0:
         block = lowest_bit(bits)
         bits &= bits - 1
-        _, _, exponent = exponent_at(shape, offset_x, offset_y, block)
-        alpha = keep_where_ge(minimum(exp2(exponent), splat(STRONGEST_ALPHA)), exponent, splat(WEAKEST))
+        t, u = first_t + broadcast(steps, block), first_u + broadcast(steps, LANES + block)
+        alpha, exponent = alpha_at(log_opacity, t, u)
         before = load(left, block * LANES)
-        weight = alpha * before
+        weight = keep_where_ge(alpha, exponent, weakest) * before
         after = before - weight
+        store(left, block * LANES, select_gt(after, least, after, negated_absolute(before)))
         weight = select_gt(after, least, weight, zero)
-        store(final, block * LANES, select_gt(after, least, after, load(final, block * LANES)))
-        after = select_gt(after, least, after, zero)
-        store(left, block * LANES, after)
-        touched |= (bits_gt(weight, zero) != 0) << block
-        closed |= (bits_gt(after, zero) == 0) << block
+        open_lanes = bits_gt(after, least)
+        touched |= (open_lanes & bits_gt(exponent, weakest) != 0) << block
+        closed |= (open_lanes == 0) << block
         place = block * channels * LANES
         if channels == 3:  # the usual case without a loop
             _add_channel(weight, features, feature, colors, place)
@@ -200,7 +194,7 @@ def _write_tile(
     view: int,
     tile_left: int,
     tile_top: int,
-    final: np.ndarray,
+    left: np.ndarray,
     colors: np.ndarray,
     background: np.ndarray,
     image: np.ndarray,
@@ -210,7 +204,7 @@ def _write_tile(
     pixels, mattes = image.reshape(-1), alpha.reshape(-1)
     for block in range(BLOCKS):
         x, y = tile_left + BLOCK * (block % 4), tile_top + BLOCK * (block // 4)
-        through = load(final, block * LANES)
+        through = absolute(load(left, block * LANES))
         _write_block(mattes, view * height, x, y, width, height, splat(np.float32(1)) - through)
         for channel in range(channels):
             color = load(colors, (block * channels + channel) * LANES)

@@ -15,13 +15,15 @@ from rewild4d.kernels.simd import (
     LANES,
     broadcast,
     divide,
-    exp2,
     fma,
+    fold1,
+    fold2,
+    fold4,
+    fold8,
     keep_where_ge,
     load,
     load_block,
     lowest_bit,
-    minimum,
     select_gt,
     splat,
     store,
@@ -30,27 +32,31 @@ from rewild4d.kernels.simd import (
 from rewild4d.rasterizer.binning import BLOCK, BLOCKS
 from rewild4d.rasterizer.blending import (
     LEAST_LEFT,
-    STRONGEST_ALPHA,
     WEAKEST,
-    exponent_at,
-    form,
-    offsets,
+    alpha_at,
     open_tile,
+    place_in_tile,
     tile_place,
 )
 from rewild4d.rasterizer.conventions import MAX_ALPHA
 from rewild4d.rasterizer.projection import ALONG_X, ALONG_Y, DOWN, LOG_OPACITY, RECORD, TT, TU, UU
 
 MOMENTS = 6
-"""Sums of q, q t, q u, q t^2, q t u, q u^2 that come before the channel sums in a slot, q = dL/dalpha alpha."""
+"""Sums of q, q t, q u, q t^2, q t u, q u^2 at the start of a slot, q = dL/dalpha alpha."""
 
 LN2 = math.log(2.0)
 _STRONGEST = np.float32(math.log2(MAX_ALPHA))
 
 
 def slot_width(channels: int) -> int:
-    """Numbers in a slot: the moments and channel sums, rounded up to whole vectors."""
-    return -(-(MOMENTS + channels) // LANES) * LANES
+    """Numbers in a slot: a vector of moments and of three channels' sums; other channels have vectors of their own."""
+    return LANES + (0 if channels == 3 else -(-channels // LANES) * LANES)
+
+
+@inlined
+def _first_channel(channels: int) -> int:
+    """Where in a slot the channel sums begin."""
+    return MOMENTS if channels == 3 else LANES
 
 
 _slot_width = kernel(slot_width)
@@ -90,6 +96,7 @@ def blend_backward(
     views, channels, height, width = image.shape
     count = len(records) // (RECORD * views)
     left, behind = np.empty(BLOCKS * LANES, np.float32), np.empty(BLOCKS * LANES, np.float32)
+    steps = np.empty(2 * LANES, np.float32)
     gradients = np.empty(BLOCKS * channels * LANES, np.float32)
     row_length = _slot_width(channels)
     rows = np.empty(row_length * LANES, np.float32)
@@ -109,7 +116,7 @@ def blend_backward(
                 n = entry_gaussian[entry]
                 _entry_backward(
                     bits, records, (view * count + n) * RECORD, features, n * channels, channels, tile_left, tile_top,
-                    left, behind, gradients, rows, sums, slot * row_length,
+                    steps, left, behind, gradients, rows, sums, slot * row_length,
                 )  # fmt: skip
 
 
@@ -151,6 +158,7 @@ def _entry_backward(
     channels: int,
     tile_left: int,
     tile_top: int,
+    steps: np.ndarray,
     left: np.ndarray,
     behind: np.ndarray,
     gradients: np.ndarray,
@@ -160,8 +168,8 @@ def _entry_backward(
 ) -> None:
     """Sum one Gaussian's six moments and channel gradients over the blocks of ``bits`` into sums[place:]."""
     zero, one, least = splat(np.float32(0)), splat(np.float32(1)), splat(LEAST_LEFT)
-    shape = form(records, record)
-    offset_x, offset_y = offsets(records, record, tile_left, tile_top)
+    log_opacity = broadcast(records, record + LOG_OPACITY)
+    first_t, first_u = place_in_tile(records, record, tile_left, tile_top, steps)
     red, green, blue, on_red, on_green, on_blue = zero, zero, zero, zero, zero, zero
     if channels == 3:
         red, green, blue = (
@@ -169,15 +177,15 @@ def _entry_backward(
         )  # fmt: skip
     else:
         for channel in range(channels):
-            store(rows, (MOMENTS + channel) * LANES, zero)
+            store(rows, channel * LANES, zero)
     m, mt, mu, mtt, mtu, muu = zero, zero, zero, zero, zero, zero
     while bits != 0:
         block = lowest_bit(bits)
         bits &= bits - 1
-        t, u, exponent = exponent_at(shape, offset_x, offset_y, block)
-        alpha = keep_where_ge(minimum(exp2(exponent), splat(STRONGEST_ALPHA)), exponent, splat(WEAKEST))
+        t, u = first_t + broadcast(steps, block), first_u + broadcast(steps, LANES + block)
+        alpha, exponent = alpha_at(log_opacity, t, u)
         before = load(left, block * LANES)
-        weight = alpha * before
+        weight = keep_where_ge(alpha, exponent, splat(WEAKEST)) * before
         after = before - weight
         weight = select_gt(after, least, weight, zero)
         store(left, block * LANES, select_gt(after, least, after, zero))
@@ -195,8 +203,7 @@ def _entry_backward(
             for channel in range(channels):
                 slope = load(gradients, place_of_block + channel * LANES)
                 along = fma(slope, broadcast(features, feature + channel), along)
-                row = (MOMENTS + channel) * LANES
-                store(rows, row, fma(weight, slope, load(rows, row)))
+                store(rows, channel * LANES, fma(weight, slope, load(rows, channel * LANES)))
         rest = load(behind, block * LANES) - weight * along
         store(behind, block * LANES, rest)
         # alpha dL/dalpha, where the pixel took this Gaussian and the cap did not hold it.
@@ -207,17 +214,9 @@ def _entry_backward(
         pull_t, pull_u = pull * t, pull * u
         mt, mu = mt + pull_t, mu + pull_u
         mtt, mtu, muu = fma(pull_t, t, mtt), fma(pull_t, u, mtu), fma(pull_u, u, muu)
-    store(rows, 0, m)
-    store(rows, LANES, mt)
-    store(rows, 2 * LANES, mu)
-    store(rows, 3 * LANES, mtt)
-    store(rows, 4 * LANES, mtu)
-    store(rows, 5 * LANES, muu)
-    if channels == 3:
-        store(rows, MOMENTS * LANES, on_red)
-        store(rows, (MOMENTS + 1) * LANES, on_green)
-        store(rows, (MOMENTS + 2) * LANES, on_blue)
-    sum_rows(rows, MOMENTS + channels, sums, place)
+    near = fold4(fold2(fold1(m, mt), fold1(mu, mtt)), fold2(fold1(mtu, muu), fold1(on_red, on_green)))
+    store(sums, place, fold8(near, fold4(fold2(fold1(on_blue, zero), zero), zero)))
+    sum_rows(rows, 0 if channels == 3 else channels, sums, place + LANES)
 
 
 @kernel
@@ -256,4 +255,4 @@ def gather_slots(
         v_records[view, n, TT], v_records[view, n, TU], v_records[view, n, UU] = LN2 * mtt, LN2 * mtu, LN2 * muu
         v_records[view, n, LOG_OPACITY] = LN2 * m
         for channel in range(channels):
-            v_features[n, channel] += total[MOMENTS + channel]
+            v_features[n, channel] += total[_first_channel(channels) + channel]
