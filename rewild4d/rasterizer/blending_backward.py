@@ -39,7 +39,8 @@ from rewild4d.rasterizer.blending import (
     tile_place,
 )
 from rewild4d.rasterizer.conventions import MAX_ALPHA
-from rewild4d.rasterizer.projection import ALONG_X, ALONG_Y, DOWN, LOG_OPACITY, RECORD, TT, TU, UU
+from rewild4d.rasterizer.projection import ALONG_X, ALONG_Y, DOWN, LOG_OPACITY, RECORD
+from rewild4d.rasterizer.projection_backward import TT, TU, UU
 
 MOMENTS = 6
 """Sums of q, q t, q u, q t^2, q t u, q u^2 at the start of a slot, q = dL/dalpha alpha."""

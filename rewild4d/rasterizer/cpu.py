@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
+from rewild4d.kernels.doubles import WIDTH
 from rewild4d.kernels.memory import keep_freed_memory
 from rewild4d.kernels.threads import run, spans, thread_count
 from rewild4d.rasterizer.binning import (
@@ -27,7 +28,8 @@ from rewild4d.rasterizer.binning import (
 from rewild4d.rasterizer.blending import blend
 from rewild4d.rasterizer.blending_backward import blend_backward, gather_slots, slot_width
 from rewild4d.rasterizer.conventions import RasterInfo
-from rewild4d.rasterizer.projection import CHUNK, RECORD, project, project_backward
+from rewild4d.rasterizer.projection import RECORD, project
+from rewild4d.rasterizer.projection_backward import CAMERA, CHUNK, project_backward
 
 keep_freed_memory()
 
@@ -68,6 +70,16 @@ def _zeros(*shape: int) -> Tensor:
     return torch.from_numpy(np.zeros(shape, np.float32))
 
 
+def _padded(tensor: Tensor, rows: int, dimension: int = 0) -> Tensor:
+    """The tensor with zeros below, where it has fewer rows: kernels take Gaussians by the eight."""
+    missing = rows - tensor.shape[dimension]
+    if missing == 0:
+        return tensor
+    shape = list(tensor.shape)
+    shape[dimension] = missing
+    return torch.cat([tensor, tensor.new_zeros(shape)], dimension)
+
+
 class _Project(torch.autograd.Function):
     """World to image: centres [V, N, 2], records [V, N, 8], and without gradients radii and depths [V, N]."""
 
@@ -83,13 +95,17 @@ class _Project(torch.autograd.Function):
         options: tuple[int, int, float, bool, float],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         views, count = world_to_camera.shape[0], means.shape[0]
-        means2d, records = means.new_empty(views, count, 2), means.new_empty(views, count, RECORD)
-        radii, depths = means.new_empty(views, count), means.new_empty(views, count, dtype=torch.float64)
-        gaussians = tuple(array(tensor) for tensor in (means, quats, scales, opacities))
+        room = max(count, WIDTH)
+        means2d, records = means.new_empty(views, room, 2), means.new_empty(views, room, RECORD)
+        radii, depths = means.new_empty(views, room), means.new_empty(views, room, dtype=torch.float64)
+        gaussians = tuple(array(_padded(tensor, room)).ravel() for tensor in (means, quats, scales, opacities))
         cameras = array(world_to_camera.double()), array(intrinsics.double())
-        outputs = tuple(array(tensor) for tensor in (means2d, records, radii, depths))
+        outputs = tuple(tensor.numpy().ravel() for tensor in (means2d, records, radii, depths))
         parts = thread_count() if count * views > SERIAL_BELOW else 1
-        run(project, [(*span, *gaussians, *cameras, *options, *outputs) for span in spans(count, parts)])
+        run(project, [(*span, *gaussians, *cameras, *options, *outputs) for span in spans(room, parts)])
+        if room > count:
+            means2d, records = means2d[:, :count].contiguous(), records[:, :count].contiguous()
+            radii, depths = radii[:, :count].contiguous(), depths[:, :count].contiguous()
         ctx.save_for_backward(means, quats, scales, opacities, world_to_camera, intrinsics, radii)
         ctx.options = options
         ctx.mark_non_differentiable(radii, depths)
@@ -102,28 +118,35 @@ class _Project(torch.autograd.Function):
         *inputs, radii = ctx.saved_tensors
         world_to_camera, intrinsics = inputs[4:]
         views, count = radii.shape
-        arrays = tuple(array(tensor) for tensor in inputs[:4])
+        room = max(count, WIDTH)
+        arrays = tuple(array(_padded(tensor, room)).ravel() for tensor in inputs[:4])
         cameras = array(world_to_camera.double()), array(intrinsics.double())
-        gradients = [_zeros(*tensor.shape) for tensor in inputs[:4]]
-        outputs = tuple(array(tensor) for tensor in gradients)
-        chunks = max(1, -(-count // CHUNK))
-        v_cameras, v_pinholes = np.zeros((chunks, views, 3, 4)), np.zeros((chunks, views, 4))
+        gradients = [tensor.new_empty(room, *tensor.shape[1:]) for tensor in inputs[:4]]
+        outputs = tuple(tensor.numpy().ravel() for tensor in gradients)
+        shared = tuple(array(_padded(tensor, room, 1)).ravel() for tensor in (radii, g_means2d, g_records))
+        chunks = spans(room, -(-room // CHUNK))
+        v_cameras = np.zeros((len(chunks), views, CAMERA, WIDTH))
         with_cameras = any(ctx.needs_input_grad[4:6])
-        shared = (radii.numpy(), array(g_means2d), array(g_records))
 
         def work(first: int, last: int) -> None:
             for chunk in range(first, last):
                 project_backward(
-                    chunk * CHUNK, min((chunk + 1) * CHUNK, count), *arrays, *cameras, *ctx.options[:4],
-                    with_cameras, *shared, *outputs, v_cameras[chunk], v_pinholes[chunk],
-                )  # fmt: skip
+                    *chunks[chunk],
+                    *arrays,
+                    *cameras,
+                    *ctx.options[:4],
+                    with_cameras,
+                    *shared,
+                    *outputs,
+                    v_cameras[chunk].ravel(),
+                )
 
-        run(work, spans(chunks, thread_count()))
+        run(work, spans(len(chunks), thread_count()))
+        totals = torch.from_numpy(v_cameras.sum(axis=(0, 3))).to(world_to_camera)
         v_world_to_camera, v_intrinsics = torch.zeros_like(world_to_camera), torch.zeros_like(intrinsics)
-        v_world_to_camera[:, :3] = torch.from_numpy(v_cameras.sum(axis=0)).to(world_to_camera)
-        summed = torch.from_numpy(v_pinholes.sum(axis=0)).to(intrinsics)
-        v_intrinsics[:, (0, 1, 0, 1), (0, 1, 2, 2)] = summed
-        return *gradients, v_world_to_camera, v_intrinsics, None
+        v_world_to_camera[:, :3] = totals[:, :12].view(views, 3, 4)
+        v_intrinsics[:, (0, 1, 0, 1), (0, 1, 2, 2)] = totals[:, 12:].to(intrinsics)
+        return *(gradient[:count] for gradient in gradients), v_world_to_camera, v_intrinsics, None
 
 
 @dataclass(frozen=True)
