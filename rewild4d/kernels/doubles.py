@@ -98,6 +98,14 @@ def root(typing: Any, a: Any) -> Any:
 
 
 @intrinsic
+def floor(typing: Any, a: Any) -> Any:
+    """The next whole number below, lane by lane."""
+    return signature(doubles_type, a), lambda context, builder, sig, args: llvm_call(
+        builder, "llvm.floor.v8f64", args, _VECTOR
+    )
+
+
+@intrinsic
 def where_gt(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
     """``yes`` where a > b, ``no`` elsewhere; a NaN is not greater."""
 

@@ -68,8 +68,7 @@ def rasterize(
             )
         background = background.to(means).expand(views, channels)
         named["background"] = background
-    for name, tensor in named.items():
-        _check_finite(name, tensor)
+    _check_finite(named)
     if not (eps2d >= 0 and near > 0):
         raise ValueError(f"expected eps2d >= 0 and near > 0, got eps2d={eps2d} and near={near}.")
     render = backends.load(backends.resolve(backend, means.device, means.dtype))
@@ -117,19 +116,13 @@ def _check_cameras(world_to_camera: Tensor, intrinsics: Tensor, width: int, heig
             )
 
 
-def _total(tensor: Tensor) -> float:
-    if tensor.device.type != "cpu":
-        return tensor.sum().item()
-    # NumPy's sum wakes no OpenMP threads, see `cpu._zeros`.
-    with np.errstate(all="ignore"):
-        return float(tensor.numpy().sum())
-
-
-def _check_finite(name: str, tensor: Tensor) -> None:
+def _check_finite(named: dict[str, Tensor]) -> None:
     # A sum is one fast pass and is finite unless something in it is not (or it overflows, then the slow look decides).
-    if math.isfinite(_total(tensor.detach())):
-        return
-    bad = (~torch.isfinite(tensor.detach())).nonzero()
-    if len(bad):
-        index = tuple(bad[0].tolist())
-        raise ValueError(f"{name}: expected finite values, got {tensor.detach()[index].item()} at index {list(index)}.")
+    # NumPy's wakes no OpenMP threads, see `cpu._zeros`.
+    with np.errstate(all="ignore"):
+        for name, tensor in named.items():
+            values = tensor.detach()
+            total = float(values.numpy().sum()) if values.device.type == "cpu" else values.sum().item()
+            if not math.isfinite(total) and len(bad := (~torch.isfinite(values)).nonzero()):
+                index = tuple(bad[0].tolist())
+                raise ValueError(f"{name}: expected finite values, got {values[index].item()} at index {list(index)}.")

@@ -2,7 +2,7 @@
 
 Three steps: sort the visible Gaussians of each view by depth; mark, for every (Gaussian, tile) pair of the bounding
 rectangles, which of the tile's sixteen 4 x 4 blocks the ellipse reaches; counting-sort the pairs into tiles. A pair's
-place before that last sort (Gaussian by Gaussian) is its `slot`: the backward pass leaves its sums there.
+place before all sorting (Gaussian by Gaussian) is its `slot`: the backward pass leaves its sums there.
 """
 
 from typing import Any
@@ -17,14 +17,13 @@ from rewild4d.rasterizer.projection import (
     CENTER_X,
     CENTER_Y,
     DOWN,
-    EXTENT_X,
-    EXTENT_Y,
     LOG2_MIN_ALPHA,
     LOG_OPACITY,
+    TILE,
 )
 
-TILE, BLOCK, BLOCKS = 16, 4, 16
-"""A tile is 16 x 16 pixels: sixteen blocks of 4 x 4, numbered row by row."""
+BLOCK, BLOCKS = 4, 16
+"""A tile is sixteen blocks of 4 x 4 pixels, numbered row by row."""
 
 BLOCK_LEFT = np.array([BLOCK * (block % 4) for block in range(BLOCKS)], np.float32)
 BLOCK_TOP = np.array([BLOCK * (block // 4) for block in range(BLOCKS)], np.float32)
@@ -34,19 +33,6 @@ SLACK = np.float32(1e-3)
 
 RADIX_BITS = 11
 RADIX = 1 << RADIX_BITS
-
-
-@inlined
-def _tile_rectangle(records: np.ndarray, view: int, n: int, tiles_x: int, tiles_y: int) -> tuple:
-    """First and one past the last tile column and row that hold a pixel centre of the bounding rectangle."""
-    x, y = np.float64(records[view, n, CENTER_X]), np.float64(records[view, n, CENTER_Y])
-    wide, high = np.float64(records[view, n, EXTENT_X]) * 1.0001, np.float64(records[view, n, EXTENT_Y]) * 1.0001
-    limit_x, limit_y = float(tiles_x * TILE), float(tiles_y * TILE)
-    left, right = max(np.ceil(x - wide - 0.5), 0.0), min(np.floor(x + wide - 0.5), limit_x - 1)
-    top, bottom = max(np.ceil(y - high - 0.5), 0.0), min(np.floor(y + high - 0.5), limit_y - 1)
-    if right < left or bottom < top:
-        return 0, 0, 0, 0
-    return int(left) // TILE, int(right) // TILE + 1, int(top) // TILE, int(bottom) // TILE + 1
 
 
 @kernel
@@ -103,28 +89,6 @@ def sort_by_depth(
     return count
 
 
-@kernel
-def count_slots(
-    view: int,
-    begin: int,
-    end: int,
-    order: np.ndarray,
-    records: np.ndarray,
-    tiles_x: int,
-    tiles_y: int,
-    slots: np.ndarray,
-    totals: np.ndarray,
-) -> None:
-    """Number the pairs of the bounding rectangles of sorted Gaussians begin..end from 0: slots[view, k] is the first of
-    Gaussian k, and totals[0] how many there are."""
-    number = 0
-    for k in range(begin, end):
-        slots[view, k] = number
-        left, right, top, bottom = _tile_rectangle(records, view, order[view, k], tiles_x, tiles_y)
-        number += (right - left) * (bottom - top)
-    totals[0] = number
-
-
 @inlined
 def _squares(a: float, b: float, c: float, x: Any, y: Any) -> Any:
     """By how much the exponent falls from the centre to (x, y)."""
@@ -161,6 +125,7 @@ def mark_pairs(
     end: int,
     order: np.ndarray,
     records: np.ndarray,
+    tiles: np.ndarray,
     slots: np.ndarray,
     tiles_x: int,
     tiles_y: int,
@@ -172,10 +137,10 @@ def mark_pairs(
 ) -> None:
     """Fill tile and block bits of the pairs of sorted Gaussians begin..end, and count them per tile."""
     for k in range(begin, end):
-        n, slot = order[view, k], slots[view, k]
-        left, right, top, bottom = _tile_rectangle(records, view, n, tiles_x, tiles_y)
-        for tile_y in range(top, bottom):
-            for tile_x in range(left, right):
+        n = order[view, k]
+        slot = slots[view, n]
+        for tile_y in range(np.int64(tiles[view, n, 2]), np.int64(tiles[view, n, 3])):
+            for tile_x in range(np.int64(tiles[view, n, 0]), np.int64(tiles[view, n, 1])):
                 bits = _reached_blocks(records, view, n, tile_x * TILE, tile_y * TILE, block_left, block_top)
                 tile = (view * tiles_y + tile_y) * tiles_x + tile_x
                 pair_tile[slot] = tile
@@ -214,9 +179,10 @@ def scatter_pairs(
 ) -> None:
     """Write the pairs of sorted Gaussians begin..end into their tiles' lists, in depth order."""
     for k in range(begin, end):
-        for slot in range(slots[view, k], slots[view, k + 1]):
+        n = order[view, k]
+        for slot in range(slots[view, n], slots[view, n + 1]):
             if pair_bits[slot] != 0:
                 place = cursor[pair_tile[slot]]
                 cursor[pair_tile[slot]] = place + 1
-                entry_gaussian[place] = order[view, k]
+                entry_gaussian[place] = n
                 entry_slot[place] = slot

@@ -225,7 +225,6 @@ def gather_slots(
     view: int,
     begin: int,
     end: int,
-    order: np.ndarray,
     slots: np.ndarray,
     pair_bits: np.ndarray,
     records: np.ndarray,
@@ -235,17 +234,15 @@ def gather_slots(
     v_records: np.ndarray,
     v_features: np.ndarray,
 ) -> None:
-    """Add each Gaussian's slots into the zeroed gradients of means2d, records and features, for sorted begin..end.
-
-    A Gaussian occurs once in a view's order, so chunks of one view never share a row.
-    """
+    """Add the slots of Gaussians begin..end into the zeroed gradients of means2d, records and features."""
     channels = v_features.shape[1]
     total = np.empty(width, np.float32)
-    for k in range(begin, end):
-        n = order[view, k]
+    for n in range(begin, end):
+        if slots[view, n] == slots[view, n + 1]:
+            continue
         for i in range(0, width, LANES):
             added = splat(np.float32(0))
-            for slot in range(slots[view, k], slots[view, k + 1]):
+            for slot in range(slots[view, n], slots[view, n + 1]):
                 if pair_bits[slot] != 0:
                     added = added + load(sums, slot * width + i)
             store(total, i, added)

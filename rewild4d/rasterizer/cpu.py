@@ -18,8 +18,6 @@ from rewild4d.kernels.threads import run, spans, thread_count
 from rewild4d.rasterizer.binning import (
     BLOCK_LEFT,
     BLOCK_TOP,
-    TILE,
-    count_slots,
     mark_pairs,
     scatter_pairs,
     sort_by_depth,
@@ -28,7 +26,7 @@ from rewild4d.rasterizer.binning import (
 from rewild4d.rasterizer.blending import blend
 from rewild4d.rasterizer.blending_backward import blend_backward, gather_slots, slot_width
 from rewild4d.rasterizer.conventions import RasterInfo
-from rewild4d.rasterizer.projection import RECORD, project
+from rewild4d.rasterizer.projection import RECORD, TILE, project
 from rewild4d.rasterizer.projection_backward import CAMERA, CHUNK, project_backward
 
 keep_freed_memory()
@@ -54,14 +52,14 @@ def rasterize(
 ) -> tuple[Tensor, Tensor, RasterInfo]:
     """Same as `rewild4d.rasterizer.rasterize`, on checked float32 CPU input; ``background`` is [V, C]."""
     options = (width, height, eps2d, antialias, near)
-    means2d, records, radii, depths = _Project.apply(
+    means2d, records, radii, *binning = _Project.apply(
         means, quats, scales, opacities, world_to_camera, intrinsics, options
     )
     if means2d.requires_grad:
         means2d.retain_grad()
     if background is None:
         background = features.new_zeros(world_to_camera.shape[0], features.shape[1])
-    image, alpha = _Blend.apply(means2d, records, features, background, radii, depths, width, height)
+    image, alpha = _Blend.apply(means2d, records, features, background, radii, *binning, width, height)
     return image, alpha, RasterInfo(radii, means2d)
 
 
@@ -81,7 +79,10 @@ def _padded(tensor: Tensor, rows: int, dimension: int = 0) -> Tensor:
 
 
 class _Project(torch.autograd.Function):
-    """World to image: centres [V, N, 2], records [V, N, 8], and without gradients radii and depths [V, N]."""
+    """World to image: centres [V, N, 2] and records [V, N, 8].
+
+    And without gradients radii and depths [V, N], tiles [V, N, 4] and slots [V, N + 1], see `project`.
+    """
 
     @staticmethod
     def forward(
@@ -93,24 +94,27 @@ class _Project(torch.autograd.Function):
         world_to_camera: Tensor,
         intrinsics: Tensor,
         options: tuple[int, int, float, bool, float],
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         views, count = world_to_camera.shape[0], means.shape[0]
         room = max(count, WIDTH)
         means2d, records = means.new_empty(views, room, 2), means.new_empty(views, room, RECORD)
         radii, depths = means.new_empty(views, room), means.new_empty(views, room, dtype=torch.float64)
+        tiles, slots = means.new_empty(views, room, 4), torch.empty(views, room + 1, dtype=torch.int64)
         gaussians = tuple(array(_padded(tensor, room)).ravel() for tensor in (means, quats, scales, opacities))
         cameras = array(world_to_camera.double()), array(intrinsics.double())
-        outputs = tuple(tensor.numpy().ravel() for tensor in (means2d, records, radii, depths))
-        parts = thread_count() if count * views > SERIAL_BELOW else 1
-        run(project, [(*span, *gaussians, *cameras, *options, *outputs) for span in spans(room, parts)])
+        outputs = [means2d, records, radii, depths, tiles, slots]
+        arrays = tuple(tensor.numpy().ravel() for tensor in outputs)
+        pieces = spans(room, thread_count() if count * views > SERIAL_BELOW else 1)
+        totals = np.empty((len(pieces), views), np.int64)
+        run(project, [(*piece, *gaussians, *cameras, *options, *arrays, totals[i]) for i, piece in enumerate(pieces)])
+        _join_numbers(slots.numpy(), pieces, totals)
         if room > count:
-            means2d, records = means2d[:, :count].contiguous(), records[:, :count].contiguous()
-            radii, depths = radii[:, :count].contiguous(), depths[:, :count].contiguous()
-        ctx.save_for_backward(means, quats, scales, opacities, world_to_camera, intrinsics, radii)
+            outputs = [tensor[:, : count + (tensor is slots)].contiguous() for tensor in outputs]
+        ctx.save_for_backward(means, quats, scales, opacities, world_to_camera, intrinsics, outputs[2])
         ctx.options = options
-        ctx.mark_non_differentiable(radii, depths)
+        ctx.mark_non_differentiable(*outputs[2:])
         ctx.set_materialize_grads(True)
-        return means2d, records, radii, depths
+        return tuple(outputs)
 
     @staticmethod
     @once_differentiable
@@ -154,35 +158,39 @@ class _Lists:
     """The tiles' Gaussians, front to back, of one call (see binning.py)."""
 
     tiles: tuple[int, int]
-    order: np.ndarray
-    counts: list[int]
     slots: np.ndarray
     pair_bits: np.ndarray
     starts: np.ndarray
     entry_gaussian: np.ndarray
     entry_slot: np.ndarray
 
-    def spans(self) -> list[tuple[int, int, int]]:
-        """Pieces (view, begin, end) of the sorted Gaussians, one group of `thread_count` pieces per view."""
-        parts = thread_count() if sum(self.counts) > SERIAL_BELOW else 1
-        return [(view, *span) for view, count in enumerate(self.counts) for span in spans(count, parts)]
 
-
-def _bin(records: np.ndarray, radii: np.ndarray, depths: np.ndarray, width: int, height: int) -> _Lists:
+def _bin(
+    records: np.ndarray,
+    radii: np.ndarray,
+    depths: np.ndarray,
+    tiles: np.ndarray,
+    slots: np.ndarray,
+    width: int,
+    height: int,
+) -> _Lists:
     views, count = radii.shape
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    order, slots = np.empty((views, count), np.int32), np.empty((views, count + 1), np.int64)
+    order = np.empty((views, count), np.int32)
     keys, spare = np.empty(count, np.int64), np.empty(count, np.int64)
     counts = [sort_by_depth(view, radii, depths, order, keys, spare) for view in range(views)]
     parts = thread_count() if sum(counts) > SERIAL_BELOW else 1
     pieces = [(view, *span) for view in range(views) for span in spans(counts[view], parts)]
-    pairs = _number_slots(pieces, counts, order, records, tiles_x, tiles_y, slots)
+    pairs = int(slots[-1, -1])
     pair_tile, pair_bits = np.empty(pairs, np.int32), np.empty(pairs, np.uint16)
     histograms = np.zeros((max(1, len(pieces)), views * tiles_x * tiles_y), np.int32)
     grid = (tiles_x, tiles_y, BLOCK_LEFT, BLOCK_TOP)
     _run_pieces(
         mark_pairs,
-        [(*piece, order, records, slots, *grid, pair_tile, pair_bits, histograms[i]) for i, piece in enumerate(pieces)],
+        [
+            (*piece, order, records, tiles, slots, *grid, pair_tile, pair_bits, histograms[i])
+            for i, piece in enumerate(pieces)
+        ],
     )
     starts = np.empty(histograms.shape[1] + 1, np.int64)
     start_tiles(histograms, starts)
@@ -194,25 +202,17 @@ def _bin(records: np.ndarray, radii: np.ndarray, depths: np.ndarray, width: int,
             for i, piece in enumerate(pieces)
         ],
     )
-    return _Lists((tiles_x, tiles_y), order, counts, slots, pair_bits, starts, entry_gaussian, entry_slot)
+    return _Lists((tiles_x, tiles_y), slots, pair_bits, starts, entry_gaussian, entry_slot)
 
 
-def _number_slots(
-    pieces: list[tuple[int, int, int]], counts: list[int], order: np.ndarray, records: np.ndarray, tiles_x: int,
-    tiles_y: int, slots: np.ndarray,
-) -> int:  # fmt: skip
-    """Fill slots [V, N + 1] over all pieces; gives the number of slots."""
-    totals = np.zeros((len(pieces), 1), np.int64)
-    _run_pieces(
-        count_slots, [(*piece, order, records, tiles_x, tiles_y, slots, totals[i]) for i, piece in enumerate(pieces)]
-    )
+def _join_numbers(slots: np.ndarray, pieces: list[tuple[int, int]], totals: np.ndarray) -> None:
+    """Let the slots of each view and piece, numbered from 0, go on where those before end."""
     before = 0
-    for (view, begin, end), total in zip(pieces, totals[:, 0].tolist(), strict=True):
-        slots[view, begin:end] += before
-        before += total
-        if end == counts[view]:
-            slots[view, end] = before
-    return before
+    for view in range(len(slots)):
+        for (begin, end), total in zip(pieces, totals[:, view].tolist(), strict=True):
+            slots[view, begin:end] += before
+            before += total
+        slots[view, -1] = before
 
 
 def _run_pieces(function: Any, calls: list[tuple[Any, ...]]) -> None:
@@ -233,11 +233,13 @@ class _Blend(torch.autograd.Function):
         background: Tensor,
         radii: Tensor,
         depths: Tensor,
+        tiles: Tensor,
+        slots: Tensor,
         width: int,
         height: int,
     ) -> tuple[Tensor, Tensor]:
         views, channels = radii.shape[0], features.shape[1]
-        lists = _bin(records.numpy(), radii.numpy(), depths.numpy(), width, height)
+        lists = _bin(*(tensor.numpy() for tensor in (records, radii, depths, tiles, slots)), width, height)
         image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
         call = (
             np.zeros(1, np.int64), *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.pair_bits,
@@ -265,14 +267,14 @@ class _Blend(torch.autograd.Function):
         v_means2d, v_records = _zeros(*records.shape[:2], 2), _zeros(*records.shape)
         v_features = _zeros(*features.shape)
         outputs = (v_means2d.numpy(), v_records.numpy(), v_features.numpy())
-        given = (lists.order, lists.slots, lists.pair_bits, records.numpy(), sums, width)
+        given = (lists.slots, lists.pair_bits, records.numpy(), sums, width)
+        pieces = spans(records.shape[1], _blend_threads(lists))
         for view in range(records.shape[0]):
-            pieces = [piece for piece in lists.spans() if piece[0] == view]
-            run(gather_slots, [(*piece, *given, *outputs) for piece in pieces])
+            run(gather_slots, [(view, *piece, *given, *outputs) for piece in pieces])
         v_background = None
         if ctx.needs_input_grad[3]:
             v_background = (g_image * (1 - alpha)).sum(dim=(2, 3))
-        return v_means2d, v_records, v_features, v_background, None, None, None, None
+        return v_means2d, v_records, v_features, v_background, None, None, None, None, None, None
 
 
 def _blend_threads(lists: _Lists) -> int:

@@ -12,11 +12,14 @@ from typing import Any
 import numpy as np
 
 from rewild4d.kernels.compiling import inlined, kernel
-from rewild4d.kernels.doubles import WIDTH, any_gt, load_columns, log2, root, spread, store_columns, where_gt
+from rewild4d.kernels.doubles import WIDTH, any_gt, floor, load_columns, log2, root, spread, store_columns, where_gt
 from rewild4d.rasterizer.conventions import FRUSTUM_MARGIN, MIN_ALPHA, MIN_COMPENSATION
 
 # Columns of a record.
 CENTER_X, CENTER_Y, ALONG_X, ALONG_Y, DOWN, LOG_OPACITY, EXTENT_X, EXTENT_Y, RECORD = 0, 1, 2, 3, 4, 5, 6, 7, 8
+
+TILE = 16
+"""A tile has as many pixels each way."""
 
 HALF_LOG2_E = 0.5 / math.log(2.0)
 LOG2_MIN_ALPHA = math.log2(MIN_ALPHA)
@@ -122,6 +125,32 @@ def _shown(
     return where_gt(v + extent_y, zero, where_gt(spread(float(size[1])), v - extent_y, shown, zero), zero)
 
 
+@inlined
+def _tile_span(shown: Any, center: Any, extent: Any, size: int) -> tuple:
+    """First and one past the last tile, along one axis, with a pixel centre within the extent; equal where none."""
+    zero, last = spread(0.0), spread(float(-(-size // TILE) * TILE - 1))
+    reach = extent * 1.0001
+    first = 0.0 - floor(reach - center + 0.5)
+    first = where_gt(zero, first, zero, first)
+    end = floor(center + reach - 0.5)
+    end = where_gt(end, last, last, end)
+    shown = where_gt(first, end, zero, shown)
+    first, end = floor(first * (1 / TILE)), floor(end * (1 / TILE)) + 1.0
+    return where_gt(shown, zero, first, zero), where_gt(shown, zero, end, zero)
+
+
+@inlined
+def _number_slots(view: int, begin: int, end: int, count: int, tiles: np.ndarray, slots: np.ndarray) -> int:
+    """Number the (Gaussian, tile) pairs of begin..end in one view from 0; give how many there are."""
+    number = 0
+    for n in range(begin, end):
+        slots[view * (count + 1) + n] = number
+        place = 4 * (view * count + n)
+        wide, high = tiles[place + 1] - tiles[place], tiles[place + 3] - tiles[place + 2]
+        number += np.int64(wide * high)
+    return number
+
+
 @kernel
 def project(
     begin: int,
@@ -141,10 +170,15 @@ def project(
     records: np.ndarray,
     radii: np.ndarray,
     depths: np.ndarray,
+    tiles: np.ndarray,
+    slots: np.ndarray,
+    totals: np.ndarray,
 ) -> None:
-    """Fill means2d [V, N, 2], records [V, N, 8], radii [V, N] and depths [V, N] for Gaussians begin..end.
+    """Fill means2d [V, N, 2], records [V, N, 8], radii, depths [V, N] and tiles [V, N, 4] for Gaussians begin..end.
 
-    At least eight of them. All arrays but the cameras' are flat.
+    At least eight of them. A row of tiles holds the first and one past the last column and row of a Gaussian's bounding
+    rectangle; slots [V, N + 1] numbers the tiles of these rectangles from 0 in each view, and totals [V] says how many
+    there are. All arrays but the cameras' are flat.
     """
     views, zero = world_to_camera.shape[0], spread(0.0)
     count = len(opacities)
@@ -183,6 +217,9 @@ def project(
                 spread_xy = 0.5 * (xx - yy)
                 radius = root(reach * (0.5 * (xx + yy) + root(spread_xy * spread_xy + xy * xy)))
                 along_x, along_y, down = factor(xx, xy, yy, det)
+                left, right = _tile_span(shown, u, extent_x, width)
+                top, bottom = _tile_span(shown, v, extent_y, height)
+                store_columns(tiles, 4 * row, (left, right, top, bottom))
                 store_columns(radii, row, (where_gt(shown, zero, radius, zero),))
                 store_columns(depths, row, (where_gt(shown, zero, z, zero),))
                 store_columns(records, RECORD * row, (
@@ -192,6 +229,9 @@ def project(
                     where_gt(shown, zero, extent_x, zero), where_gt(shown, zero, extent_y, zero),
                 ))  # fmt: skip
             else:
+                store_columns(tiles, 4 * row, (zero, zero, zero, zero))
                 store_columns(radii, row, (zero,))
                 store_columns(depths, row, (zero,))
                 store_columns(records, RECORD * row, (zero, zero, zero, zero, zero, zero, zero, zero))
+    for view in range(views):
+        totals[view] = _number_slots(view, begin, end, count, tiles, slots)
