@@ -6,6 +6,7 @@ import torch
 from torch import nn
 
 from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.doubles import floor, load_columns, log2, root, spread, store_columns, where_gt
 from rewild4d.kernels.matrix import add_product, transpose_tile
 from rewild4d.kernels.memory import keep_freed_memory
 from rewild4d.kernels.rows import add_scaled, sum_rows
@@ -115,3 +116,31 @@ def test_gradients_are_clipped_as_torch_does(limit: float) -> None:
     for own, wanted in zip(*found, strict=True):
         torch.testing.assert_close(own, wanted)
     assert clip_gradients([nn.Parameter(torch.zeros(2))], limit) == 0
+
+
+@kernel
+def _through_columns(given: np.ndarray, made: np.ndarray) -> None:
+    a, b, c = load_columns(given, 3, 3)
+    store_columns(made, 3, (c, a, b))
+
+
+def test_rows_become_columns_and_rows_again() -> None:
+    given, made = np.arange(30, dtype=np.float32), np.zeros(30, np.float32)
+    _through_columns(given, made)
+    assert (made[3:27].reshape(8, 3) == given[3:27].reshape(8, 3)[:, [2, 0, 1]]).all()
+    assert not made[:3].any() and not made[27:].any()
+
+
+@kernel
+def _arithmetic(x: np.ndarray, made: np.ndarray) -> None:
+    (a,) = load_columns(x, 0, 1)
+    (b,) = load_columns(x, 8, 1)
+    store_columns(made, 0, (log2(a), (1 - a * b) / (b + 2), root(a), floor(a - b), where_gt(a, b, a, spread(-1.0))))
+
+
+def test_vectors_of_doubles_compute_as_numpy_does() -> None:
+    x, made = np.random.default_rng(0).lognormal(0, 4, 16), np.zeros(40)
+    _arithmetic(x, made)
+    a, b = x[:8], x[8:]
+    expected = np.log2(a), (1 - a * b) / (b + 2), np.sqrt(a), np.floor(a - b), np.where(a > b, a, -1)
+    np.testing.assert_allclose(made.reshape(8, 5).T, expected, rtol=1e-10, atol=1e-10)

@@ -39,8 +39,11 @@ def test_reference_gradient_is_the_central_difference(name: str, antialias: bool
 
 @pytest.mark.parametrize(
     ("count", "channels", "views", "width", "height", "antialias"),
-    [(300, 3, 1, 70, 50, False), (200, 1, 3, 33, 47, True), (200, 16, 2, 16, 16, False), (1, 5, 1, 20, 9, False)],
-)
+    [
+        (300, 3, 1, 70, 50, False), (200, 1, 3, 33, 47, True), (200, 16, 2, 16, 16, False), (1, 5, 1, 20, 9, False),
+        (7, 3, 2, 30, 20, True), (9, 3, 2, 30, 20, False), (1030, 2, 1, 24, 24, True),
+    ],
+)  # fmt: skip
 def test_numba_equals_reference(
     count: int, channels: int, views: int, width: int, height: int, antialias: bool
 ) -> None:
