@@ -29,6 +29,8 @@ VIEWS = 16
 """Azimuths of KID-V, uniform over one turn: 2 pi i / 16 (`rewild4d.orbit.orbit_cameras`)."""
 FEW_IMAGES = 64
 """Below this many images a side, the noise of KID is as large as the effect of a visible blur."""
+LEAST_SEQUENCES = 5
+"""A bootstrap over fewer sequences draws too few different sets to bound anything."""
 _ROWS = 2048
 
 
@@ -67,7 +69,7 @@ def kid(
         if min(len(x), len(y)) < few:
             notes.append(f"fewer than {few} samples a side: its noise is as large as what tells methods apart")
         if interval is None:
-            notes.append("no interval: that needs several sequences")
+            notes.append(f"no interval: that needs at least {LEAST_SEQUENCES} sequences")
     return describe(
         f"{name}-u" if paired else name, value, prediction, truth, notes=notes, conditions=conditions,
         interval=interval, estimator="U-statistic, full set, paired" if paired else "unbiased MMD^2, full set",
@@ -123,8 +125,9 @@ def mmd2_unbiased(x: Tensor, y: Tensor) -> float:
         x: features, at least two rows, [n, D].
         y: features, at least two rows, [m, D].
     """
+    once = torch.ones(1, 1, dtype=torch.float64)
     sums = _kernel_sums(x, y, *(torch.zeros(len(rows), dtype=torch.int64) for rows in (x, y)), paired=False)
-    return float(_mmd2(sums, torch.ones(1, 1), torch.ones(1, 1)))
+    return float(_mmd2(sums, once, once, joint=True))
 
 
 def mmd2_u_statistic(x: Tensor, y: Tensor) -> float:
@@ -138,8 +141,9 @@ def mmd2_u_statistic(x: Tensor, y: Tensor) -> float:
     """
     if len(x) != len(y):
         raise ValueError(f"expected pairs, got {len(x)} and {len(y)} rows")
+    once = torch.ones(1, 1, dtype=torch.float64)
     sums = _kernel_sums(x, y, *(torch.zeros(len(rows), dtype=torch.int64) for rows in (x, y)), paired=True)
-    return float(_mmd2(sums, torch.ones(1, 1), torch.ones(1, 1)))
+    return float(_mmd2(sums, once, once, joint=True))
 
 
 def mmd2_interval(
@@ -156,7 +160,7 @@ def mmd2_interval(
     """Percentile bootstrap of MMD^2 over whole sequences, since the images of one sequence are alike.
 
     Where both sides hold the same sequences one draw serves both; otherwise each side is drawn on its own. A sequence
-    that is drawn twice counts twice, but an image never meets its own copy: k(x_i, x_i) would pull the estimate up.
+    that is drawn twice counts twice, but its copies never meet: they would pass for two sequences that are the same.
 
     Args:
         x: features, [n, D].
@@ -169,16 +173,17 @@ def mmd2_interval(
         seed: of the draws.
 
     Returns:
-        Lower and upper end; None with fewer than two sequences on a side.
+        Lower and upper end; None with fewer than `LEAST_SEQUENCES` on a side.
     """
     (names_x, rows_x), (names_y, rows_y) = (ids.unique(return_inverse=True) for ids in (groups_x, groups_y))
-    if min(len(names_x), len(names_y)) < 2:
+    if min(len(names_x), len(names_y)) < LEAST_SEQUENCES:
         return None
     sums = _kernel_sums(x, y, rows_x, rows_y, paired=paired)
     generator = torch.Generator().manual_seed(seed)
     weights_x = _draws(len(names_x), resamples, generator)
-    weights_y = weights_x if torch.equal(names_x, names_y) else _draws(len(names_y), resamples, generator)
-    values = _mmd2(sums, weights_x, weights_y)
+    joint = torch.equal(names_x, names_y)
+    weights_y = weights_x if joint else _draws(len(names_y), resamples, generator)
+    values = _mmd2(sums, weights_x, weights_y, joint=joint)
     tails = torch.tensor(((1 - level) / 2, (1 + level) / 2), dtype=torch.float64)
     low, high = torch.nanquantile(values, tails).tolist()  # one image drawn alone has no pair: NaN
     return low, high
@@ -234,12 +239,18 @@ def frechet_distance(x: Tensor, y: Tensor) -> float:
     return max(0.0, shift + float(a.square().sum()) + float(b.square().sum()) - 2 * cross)
 
 
-def _mmd2(sums: Sequence[tuple[Tensor, Tensor]], weights_x: Tensor, weights_y: Tensor) -> Tensor:
-    """MMD^2 from sums over pairs of groups, for each row of group weights, [R, G] and [R, H] -> [R]."""
-    pairs = ((weights_x, weights_x), (weights_y, weights_y), (weights_x, weights_y))
+def _mmd2(sums: Sequence[tuple[Tensor, Tensor]], weights_x: Tensor, weights_y: Tensor, *, joint: bool) -> Tensor:
+    """MMD^2 from sums over pairs of groups, for each row of how often the groups were drawn, [R, G] and [R, H] -> [R].
+
+    A pair of groups counts by the product of their draws; a group with itself once a draw, for copies never meet.
+    """
+    draws = ((weights_x, weights_x, True), (weights_y, weights_y, True), (weights_x, weights_y, joint))
     means = []
-    for (total, count), (left, right) in zip(sums, pairs, strict=True):
-        found, counted = (torch.einsum("rg,gh,rh->r", left.double(), m, right.double()) for m in (total, count))
+    for (total, count), (left, right, one_side) in zip(sums, draws, strict=True):
+        found, counted = (torch.einsum("rg,gh,rh->r", left, m, right) for m in (total, count))
+        if one_side:
+            copies = left * (left - 1)
+            found, counted = found - copies @ total.diagonal(), counted - copies @ count.diagonal()
         means.append(found / counted)
     return means[0] + means[1] - 2 * means[2]
 
@@ -273,7 +284,7 @@ def _pair_sums(a: Tensor, b: Tensor, groups_a: Tensor, groups_b: Tensor, *, holl
 def _draws(groups: int, resamples: int, generator: torch.Generator) -> Tensor:
     """How often each group is drawn in each of the resamples, [R, G]."""
     drawn = torch.randint(groups, (resamples, groups), generator=generator)
-    return torch.nn.functional.one_hot(drawn, groups).sum(1)
+    return torch.nn.functional.one_hot(drawn, groups).sum(1).double()
 
 
 def _aligned(rows: Tensor) -> Tensor:

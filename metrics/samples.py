@@ -84,7 +84,7 @@ class Distance:
         m: true ones.
         sequences: how many sequences they come from (of the side with fewer).
         estimator: in words.
-        interval: 2.5 and 97.5 % of a bootstrap over sequences, or None (one sequence, or no such estimate).
+        interval: 2.5 and 97.5 % of a bootstrap over sequences, or None (too few sequences, or no such estimate).
         note: why there is no value, or what to beware of.
         extractor, digest, resize: the network, the SHA-256 of its weights, how images reach its input size.
         background, crop, fps: see `Conditions`.

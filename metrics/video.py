@@ -146,7 +146,9 @@ def clip_distances(
     if reason := unfit(prediction, truth, extractor):
         x, y = (_nothing(clips, extractor) for clips in (prediction, truth))
         return [describe(name, None, x, y, estimator="", notes=[reason], conditions=conditions) for name in names]
-    x, y = (video_features(clips, extractor, progress) for clips in (prediction, truth))
+    counts = [sum(map(len, side)) for side in (prediction, truth)]
+    x = video_features(prediction, extractor, _shifted(progress, 0, sum(counts)))
+    y = video_features(truth, extractor, _shifted(progress, counts[0], sum(counts)))
     found = [
         frechet(x, y, name=names[0], conditions=conditions),
         kid(x, y, name=names[1], conditions=conditions, few=FEW_CLIPS, seed=seed),
@@ -222,6 +224,11 @@ def _nothing(sequences: Sequence[Sequence[Images]], extractor: VideoExtractor) -
     frames = lengths.pop() if len(lengths) == 1 else None
     values = torch.zeros(len(groups), 0, dtype=torch.float64)
     return Features(values, groups, extractor.name, extractor.digest, extractor.resize, frames)
+
+
+def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:
+    """The progress of a part as progress of the whole."""
+    return None if progress is None else lambda done, _: progress(before + done, total)
 
 
 def _matrix_size(matrix: ImageMatrix) -> tuple[int, int]:

@@ -137,16 +137,24 @@ def test_low_rank_form_with_fewer_samples_than_features() -> None:
 
 
 def test_interval_equals_a_resample_by_hand() -> None:
-    """Sequence 0 drawn twice, 2 once: every kernel entry counts by its sequences' weights, (i, i) never."""
+    """Sequence 0 drawn twice, 2 once: rows meet by the product of draws, in their own sequence once a draw."""
     groups = torch.tensor([0, 0, 1, 1, 1, 2, 2])
     x, y = normal(7, 5, 0), normal(7, 5, 1) + 0.3
-    weights = torch.tensor([2, 0, 1])
+    drawn = torch.tensor([2.0, 0, 1]).double()
     sums = distribution._kernel_sums(x, y, groups, groups, paired=True)
-    ours = float(distribution._mmd2(sums, weights[None], weights[None]))
-    rows = weights[groups].double()
-    pairs = rows[:, None] * rows * ~torch.eye(7, dtype=torch.bool)
-    means = [float(((a @ b.T / 5 + 1) ** 3 * pairs).sum() / pairs.sum()) for a, b in ((x, x), (y, y), (x, y))]
-    assert ours == pytest.approx(means[0] + means[1] - 2 * means[2], abs=1e-12)
+    ours = float(distribution._mmd2(sums, drawn[None], drawn[None], joint=True))
+
+    def mean(a: torch.Tensor, b: torch.Tensor) -> float:
+        total = count = 0.0
+        for i in range(7):
+            for j in range(7):
+                same = groups[i] == groups[j]
+                weight = 0.0 if i == j else float(drawn[groups[i]] * (1 if same else drawn[groups[j]]))
+                total += weight * (float(a[i] @ b[j]) / 5 + 1) ** 3
+                count += weight
+        return total / count
+
+    assert ours == pytest.approx(mean(x, x) + mean(y, y) - 2 * mean(x, y), abs=1e-12)
 
 
 def test_interval_over_sequences_is_wider_than_over_images() -> None:
@@ -160,19 +168,20 @@ def test_interval_over_sequences_is_wider_than_over_images() -> None:
     assert wide[1] - wide[0] > 1.5 * (narrow[1] - narrow[0])
     assert mmd2_interval(x, y, sequences, sequences) == wide
     assert mmd2_interval(x, y, sequences, sequences, seed=1) != wide
-    assert mmd2_interval(x, y, torch.zeros(100), torch.zeros(100)) is None
+    assert mmd2_interval(x, y, images % 4, images % 4) is None, "four sequences bound nothing"
 
 
-def test_interval_covers_the_truth() -> None:
-    """Equal distributions: the true distance, 0, lies inside about 95 of 100 intervals."""
-    sequences = torch.arange(20).repeat_interleave(2)
+@pytest.mark.parametrize("same_sequences", [True, False])
+def test_interval_covers_the_truth(same_sequences: bool) -> None:
+    """Equal distributions, the images of a sequence alike: 0 lies inside most intervals of 95 %."""
+    sequences = torch.arange(20).repeat_interleave(3)
     inside = 0
-    for seed in range(60):
-        x, y = normal(40, 4, seed), normal(40, 4, 500 + seed)
-        found = mmd2_interval(x, y, sequences, sequences, resamples=300)
+    for seed in range(100):
+        x, y = (normal(20, 4, s).repeat_interleave(3, 0) + 0.5 * normal(60, 4, s + 7000) for s in (seed, 500 + seed))
+        found = mmd2_interval(x, y, sequences, sequences + (0 if same_sequences else 100), resamples=300)
         assert found is not None
         inside += found[0] <= 0 <= found[1]
-    assert inside >= 50
+    assert inside >= 80
 
 
 def test_subsets_average_to_the_full_set() -> None:
@@ -187,11 +196,11 @@ def test_subsets_average_to_the_full_set() -> None:
 
 def test_kid_says_what_decides_it() -> None:
     x, y = normal(70, 8, 0), normal(80, 8, 1)
-    groups = [0] * 40 + [1] * 30, [0] * 40 + [1] * 40
+    groups = sorted([*range(7)] * 10), sorted([*range(8)] * 10)
     conditions = Conditions(background="white", crop="truth box")
     found = kid(features(x, groups[0]), features(y, groups[1]), conditions=conditions)
     assert found.value == mmd2_unbiased(x, y)
-    assert (found.name, found.n, found.m, found.sequences) == ("KID [linear]", 70, 80, 2)
+    assert (found.name, found.n, found.m, found.sequences) == ("KID [linear]", 70, 80, 7)
     assert (found.background, found.crop, found.frames, found.fps) == ("white", "truth box", None, None)
     assert (found.extractor, found.digest, found.resize) == ("linear", "0" * 64, "area 4x4")
     assert found.estimator == "unbiased MMD^2, full set"
@@ -211,10 +220,10 @@ def test_four_images_are_scored_with_a_warning_and_one_is_not() -> None:
 
 
 def test_paired_kid_has_its_own_name_and_needs_pairs() -> None:
-    x = features(normal(6, 8, 0), [0, 0, 0, 1, 1, 1])
+    x = features(normal(10, 8, 0), sorted([*range(5)] * 2))
     found = kid(x, x, paired=True)
     assert (found.name, found.value, found.interval) == ("KID-u [linear]", 0.0, (0.0, 0.0))
-    with pytest.raises(ValueError, match="expected pairs, row by row of the same sequence, got 6 predictions and 5"):
+    with pytest.raises(ValueError, match="expected pairs, row by row of the same sequence, got 10 predictions and 5"):
         kid(x, features(normal(5, 8, 0), [0, 0, 0, 1, 1]), paired=True)
 
 
