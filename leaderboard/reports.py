@@ -29,6 +29,7 @@ class Report(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         settings: background, fps, points, ...: all that decides the values.
         scores: by name, one value an image each; for geometry one value each.
         distances: between the two sets of images or clips.
+        networks: SHA-256 of the weights by network, of those that scores leaned on.
         items: label of each image, as in ``Score.per_item``.
         notes: how files were matched, and what to beware of.
         code: version and digest of the sources.
@@ -42,6 +43,7 @@ class Report(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     settings: dict[str, str]
     scores: dict[str, Score]
     distances: list[Distance]
+    networks: dict[str, str]
     items: list[str]
     notes: list[str]
     code: dict[str, str]

@@ -10,32 +10,35 @@ from rewild4d.errors import UserError
 from rewild4d.leaderboard.records import Score
 from rewild4d.leaderboard.reports import SCHEMA, Report
 from rewild4d.machine import code_version, machine
+from rewild4d.metrics.geometry import POINTS, compare
+from rewild4d.ply import read_surface
 
 UP = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 def score_clouds(
-    prediction: Path, truth: Path, *, up: Literal["y", "z"] | None = None, points: int = 30_000, seed: int = 0
+    prediction: Path, truth: Path, *, up: Literal["y", "z"] | None = None, points: int = POINTS, seed: int = 0
 ) -> Report:
     """Compare two .ply files.
 
     Args:
-        prediction: points, a mesh's vertices or Gaussians.
+        prediction: a mesh or Gaussians, sampled over their surface, or points, taken as they are.
         truth: the same.
         up: axis that points up in both files, for the alignment's starts.
-        points: a larger cloud is compared by so many of its points.
+        points: that are sampled; of a larger cloud so many are drawn.
         seed: of all draws.
 
     Raises:
         UserError: a file that cannot be read, or points that cannot be compared.
     """
-    from rewild4d.metrics.geometry import compare
-    from rewild4d.ply import read_points
-
     started = time.monotonic()
-    clouds = [read_points(path) for path in (prediction, truth)]
+    shape = read_surface(prediction, points, seed)
+    target, second = (read_surface(truth, points, seed + i) for i in (1, 2))
+    independent = None if torch.equal(target, second) else second  # a plain cloud has no second sampling
     try:
-        found = compare(*clouds, up=torch.tensor(UP[up]) if up else None, points=points, seed=seed)
+        found = compare(
+            shape, target, up=torch.tensor(UP[up]) if up else None, second=independent, points=points, seed=seed
+        )
     except ValueError as error:
         raise UserError(f"{prediction} against {truth}: {error}.") from error
     floors = [f"{name} {item.floor:.4g}" for name, item in found.scores.items() if item.floor is not None]
@@ -55,6 +58,7 @@ def score_clouds(
             for name, item in found.scores.items()
         },
         distances=[],
+        networks={},
         items=[str(prediction)],
         notes=[*notes, found.note, *([f"floor of each: {', '.join(floors)}"] if floors else [])],
         code=code_version(),

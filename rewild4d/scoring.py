@@ -3,8 +3,8 @@
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -22,6 +22,7 @@ from rewild4d.pairing import Inputs, Match, Shown, images_beside, match_inputs
 FAMILIES = ("psnr", "ssim", "lpips-alex", "lpips-vgg", "silhouette", "kid", "fvd")
 """What may be asked for; `score --only` chooses from these."""
 NO_MATTE = ("no true masks: name them with --masks", "no predicted masks: name them with --pred-masks")
+PAIRED = "takes the sets for independent, but they are paired: near a perfect prediction it is negative; see KID-u"
 ONE_SIDED = {
     (True, False): "the predictions have alpha, the truths have none: see that they lie on the same background",
     (False, True): "the truths have alpha, the predictions have none: see that they lie on the same background",
@@ -29,6 +30,15 @@ ONE_SIDED = {
 
 Stage = Callable[[str], Progress]
 """Begins a stage of the work by its title and gives what shows its progress."""
+
+
+class LpipsNetwork(Protocol):
+    """What `rewild4d.metrics.features.Lpips` is, as far as it is needed here."""
+
+    digest: str
+
+    def __call__(self, prediction: Tensor, target: Tensor, /) -> Tensor:
+        """Two batches [B, 3, H, W] in [0, 1] -> [B]."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +52,7 @@ class Networks:
         missing: why one is not there, by family ("lpips-alex", "kid", "fvd").
     """
 
-    lpips: Mapping[str, PairDistance] = field(default_factory=dict)
+    lpips: Mapping[str, LpipsNetwork] = field(default_factory=dict)
     images: ImageExtractor | None = None
     videos: VideoExtractor | None = None
     missing: Mapping[str, str] = field(default_factory=dict)
@@ -127,6 +137,8 @@ def score_pictures(
         settings={"background": conditions.background} | ({"fps": f"{conditions.fps:g}"} if conditions.fps else {}),
         scores=scores,
         distances=distances,
+        networks={name: network.digest for name, network in networks.lpips.items()}
+        | {distance.extractor: distance.digest for distance in distances if distance.value is not None},
         items=items,
         notes=notes,
         code=code_version(),
@@ -174,8 +186,11 @@ def image_distances(
         image_features(side, networks.images, stage(f"KID, {title}"))
         for side, title in zip(shown, ("predictions", "truths"), strict=True)
     )
-    found = [kid(x, y, conditions=conditions)]
-    return [*found, kid(x, y, paired=True, conditions=conditions)] if paired else found
+    found = kid(x, y, conditions=conditions)
+    if not paired:
+        return [found]
+    beware = "; ".join(filter(None, (found.note, PAIRED)))
+    return [replace(found, note=beware), kid(x, y, paired=True, conditions=conditions)]
 
 
 def video_distances(

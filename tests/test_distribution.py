@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import torch
+from extractors import LinearNetwork
 
 from rewild4d.metrics import distribution
 from rewild4d.metrics.distribution import (
@@ -19,18 +20,6 @@ from rewild4d.metrics.distribution import (
     mmd2_unbiased,
 )
 from rewild4d.metrics.samples import Conditions, Features, image_features
-
-
-class LinearNetwork:
-    """A seeded linear map of 4x4 thumbnails: enough of a network to test everything around it."""
-
-    name, digest, resize, dimension = "linear", "0" * 64, "area 4x4", 32
-
-    def __init__(self) -> None:
-        self.weights = torch.randn(48, self.dimension, generator=torch.Generator().manual_seed(7))
-
-    def __call__(self, images: torch.Tensor) -> torch.Tensor:
-        return torch.nn.functional.interpolate(images, (4, 4), mode="area").flatten(1) @ self.weights
 
 
 def normal(n: int, d: int, seed: int) -> torch.Tensor:

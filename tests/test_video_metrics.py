@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from extractors import LinearVideoNetwork
 
 from rewild4d.metrics.distribution import VIEWS, frechet_distance, mmd2_unbiased
 from rewild4d.metrics.samples import Conditions, Features
@@ -18,20 +19,6 @@ from rewild4d.metrics.video import (
     video_features,
 )
 from rewild4d.orbit import orbit_cameras
-
-
-class LinearVideoNetwork:
-    """A seeded linear map of each frame's 4x4 thumbnail, a weight of its own for each of the first frames, summed."""
-
-    name, digest, resize, dimension, minimum_frames = "linear-video", "0" * 64, "area 4x4", 24, 9
-
-    def __init__(self) -> None:
-        self.weights = torch.randn(32, 48, self.dimension, generator=torch.Generator().manual_seed(3))
-
-    def __call__(self, videos: torch.Tensor) -> torch.Tensor:
-        batch, frames = videos.shape[:2]
-        small = torch.nn.functional.interpolate(videos.flatten(0, 1), (4, 4), mode="area").view(batch, frames, -1)
-        return torch.einsum("btc,tcd->bd", small, self.weights[:frames]) / frames
 
 
 def numbered(views: int, frames: int) -> torch.Tensor:

@@ -34,7 +34,7 @@ class Options:
         only: what to compute: psnr ssim lpips-alex lpips-vgg silhouette kid fvd; all where it is left out.
         fps: of clips whose files do not say it, for the record.
         up: axis that points up in both .ply files, for the alignment's starts: y or z; unknown where it is left out.
-        points: a larger .ply file is compared by so many of its points.
+        points: that are sampled on a mesh or on Gaussians in a .ply file, or drawn from a larger cloud.
         device: auto, cpu or cuda.
         out: file for the scores as JSON, with every image's value, the machine and the versions.
         json: print the same JSON, and nothing else, to standard output.
