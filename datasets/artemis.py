@@ -25,10 +25,10 @@ from rewild4d.datasets.artemis_files import (
     read_intrinsics,
     read_licence,
 )
-from rewild4d.datasets.artemis_volume import Surface, read_pose, read_surface, surface_over_time
+from rewild4d.datasets.artemis_volume import SURFACE_POINTS, MovingSurface, Surface, read_pose, read_surface
 from rewild4d.datasets.artemis_writer import ArtemisWriter
 from rewild4d.datasets.images import Decoded, decode
-from rewild4d.datasets.selection import held_out, kept_frames, placed_view, selected_views
+from rewild4d.datasets.selection import held_out, kept_frames, placed_view, selected_views, up_direction
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import digest
 from rewild4d.types import Camera, Clip, Frame, Truth
@@ -137,8 +137,10 @@ class _Motion:
         clip = Clip(case, species, tuple(shown), self.fps, read_licence(self.folder), shown.digest())
         if surface is None:
             return clip, Truth(hidden, None, hidden.digest())
-        at = surface_over_time(surface, poses, self.fps)
-        return clip, Truth(hidden, at, digest(hidden.digest(), *map(at, clip.times)))
+        moving = MovingSurface(surface, poses, self.fps)
+        key = digest(hidden.digest(), *map(moving.at, clip.times))
+        up = torch.from_numpy(up_direction(self.camera_to_world))
+        return clip, Truth(hidden, moving.at, key, moving.sample, surface.diagonal, up)
 
     def _geometry(self) -> tuple[Surface | None, list[np.ndarray]]:
         """Surface points at rest and the bones of each kept frame."""
@@ -156,7 +158,7 @@ class _Motion:
             raise UserError(
                 f"{self.folder / 'volumes'}: expected the animal's voxels, which tell its {placement}, got none."
             )
-        return placed_view(placement, surface.posed(poses[0]), self.camera_to_world)
+        return placed_view(placement, surface.thinned(SURFACE_POINTS).posed(poses[0]), self.camera_to_world)
 
     def _cameras(self, decoded: Decoded) -> list[Camera]:
         """World camera of each view for the decoded images."""

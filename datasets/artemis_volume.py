@@ -1,8 +1,8 @@
 """The true geometry of an Artemis animal: rest-pose voxels with skinning weights, moved by the bones."""
 
 import pickle
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from rewild4d.datasets.artemis_files import read_matrices, read_parents
 from rewild4d.errors import UserError
 
 SURFACE_POINTS = 10_000
+"""Voxels of `Truth.surface` at most; `Truth.sample` draws as many points as it is asked for."""
 FILES = ("coords_init.pth", "volume_indices.pth", "volume_weights.pth")
 
 
@@ -24,18 +25,43 @@ class Surface:
         indices: bones that move each point, int64, [n, K].
         weights: as the files have them, nothing below zero, float64, [n, K].
         bones_rest: global bone-to-world matrices at rest, float64, [J, 4, 4].
+        pitch: size of a voxel along each axis, world units, zero along an axis with one layer, [3].
+        diagonal: of the rest pose's bounding box, world units.
     """
 
     points: np.ndarray
     indices: np.ndarray
     weights: np.ndarray
     bones_rest: np.ndarray
+    pitch: np.ndarray
+    diagonal: float
 
     def posed(self, bones: np.ndarray) -> np.ndarray:
         """Plain linear blend skinning with T_b = bones[b] @ inv(rest[b]), weights not renormalised, [n, 3]."""
         transforms = (bones @ np.linalg.inv(self.bones_rest))[:, :3]
         blended = np.einsum("nk,nkab->nab", self.weights, transforms[self.indices])
         return np.einsum("nab,nb->na", blended[..., :3], self.points) + blended[..., 3]
+
+    def thinned(self, count: int) -> "Surface":
+        """At most ``count`` of the points, always the same ones."""
+        if len(self.points) <= count:
+            return self
+        return self._rows(np.sort(np.random.default_rng(0).choice(len(self.points), count, replace=False)))
+
+    def sampled(self, count: int, seed: int) -> "Surface":
+        """Points in the cells of the surface voxels: each voxel gets as many as any other or one more.
+
+        A point lies anywhere in its voxel's cell, as the true surface does, so two seeds give independent samplings of
+        the surface and the distance between them is what a perfect reconstruction would get.
+        """
+        rng = np.random.default_rng((seed, count))
+        whole, rest = divmod(count, len(self.points))
+        drawn = rng.choice(len(self.points), rest, replace=False)
+        picked = self._rows(np.sort(np.concatenate((np.tile(np.arange(len(self.points)), whole), drawn))))
+        return replace(picked, points=picked.points + (rng.random((count, 3)) - 0.5) * self.pitch)
+
+    def _rows(self, rows: np.ndarray) -> "Surface":
+        return replace(self, points=self.points[rows], indices=self.indices[rows], weights=self.weights[rows])
 
 
 def read_skeleton(animal: Path) -> np.ndarray:
@@ -71,8 +97,6 @@ def read_pose(animal: Path, motion: str, frame: int, bones: int) -> np.ndarray:
 def read_surface(animal: Path) -> Surface | None:
     """The voxels of an animal that miss one of their six neighbours, or None where it has no folder of volumes.
 
-    At most `SURFACE_POINTS` of them, always the same ones.
-
     Raises:
         UserError: a file is missing or damaged, shapes that do not fit, a bone index out of range, no lattice.
     """
@@ -98,14 +122,15 @@ def read_surface(animal: Path) -> Surface | None:
     if error > 0.1:
         raise UserError(f"{folder / FILES[0]}: expected voxel centres on a lattice, got one {error:.2g} cells off.")
     rows = np.flatnonzero(is_surface(cells))
-    if len(rows) > SURFACE_POINTS:
-        rows = np.sort(np.random.default_rng(0).choice(rows, SURFACE_POINTS, replace=False))
     used = used[rows]
+    extent = np.ptp(points, axis=0)
     return Surface(
         points[rows],
         np.where(used, indices[rows], 0).astype(np.int64),
         np.where(used, weights[rows], 0).astype(np.float64),
         bones_rest,
+        extent / np.maximum(cells.max(axis=0), 1),
+        float(np.linalg.norm(extent)),
     )
 
 
@@ -147,22 +172,37 @@ def is_surface(cells: np.ndarray) -> np.ndarray:
     return missing
 
 
-def surface_over_time(surface: Surface, poses: list[np.ndarray], fps: float) -> Callable[[float], torch.Tensor]:
-    """The function time -> surface points in the world, float64 [n, 3]; known at the given frames only.
+@dataclass(frozen=True)
+class MovingSurface:
+    """A surface over time, known at the kept frames only.
 
-    Args:
-        surface: the points at rest.
+    Attributes:
+        surface: all surface voxels at rest.
         poses: bones of each kept frame, [J, 4, 4].
         fps: kept frames per second.
     """
 
-    def at(time: float) -> torch.Tensor:
-        frame = round(time * fps)
-        if not 0 <= frame < len(poses) or abs(time * fps - frame) > 1e-3:
-            raise ValueError(f"the surface is known at {len(poses)} frames of 1/{fps:g} s, not at {time} s")
-        return torch.from_numpy(surface.posed(poses[frame]))
+    surface: Surface
+    poses: list[np.ndarray]
+    fps: float
 
-    return at
+    @cached_property
+    def _thinned(self) -> Surface:
+        return self.surface.thinned(SURFACE_POINTS)
+
+    def at(self, time: float) -> torch.Tensor:
+        """See `types.Truth.surface`: at most `SURFACE_POINTS` voxel centres."""
+        return torch.from_numpy(self._thinned.posed(self._pose(time)))
+
+    def sample(self, time: float, count: int, seed: int) -> torch.Tensor:
+        """See `types.Truth.sample`."""
+        return torch.from_numpy(self.surface.sampled(count, seed).posed(self._pose(time)))
+
+    def _pose(self, time: float) -> np.ndarray:
+        frame = round(time * self.fps)
+        if not 0 <= frame < len(self.poses) or abs(time * self.fps - frame) > 1e-3:
+            raise ValueError(f"the surface is known at {len(self.poses)} frames of 1/{self.fps:g} s, not at {time} s")
+        return self.poses[frame]
 
 
 def _tensor(path: Path) -> np.ndarray:

@@ -78,6 +78,22 @@ def read_alpha(path: Path) -> np.ndarray:
     return _decode(path, cv2.IMREAD_GRAYSCALE)
 
 
+def read_picture(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Colour and, where the file has one, straight alpha: PNG or JPEG, grey, palette or colour, 8 or 16 bits a channel.
+
+    Returns:
+        Colour in [0, 1], float32 [h, w, 3], and alpha in [0, 1], float32 [h, w], or None.
+
+    Raises:
+        UserError: as `read_rgb`.
+    """
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    scaled = image.astype(np.float32) / np.iinfo(image.dtype).max
+    if scaled.ndim == 2:
+        return np.repeat(scaled[..., None], 3, axis=2), None
+    return scaled[..., 2::-1], scaled[..., 3] if scaled.shape[2] == 4 else None
+
+
 def read_pair(pair: ImagePair, source: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Colour and matte of one view.
 

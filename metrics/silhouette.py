@@ -1,7 +1,16 @@
-"""Agreement of silhouettes."""
+"""Agreement of silhouettes: regions (IoU, Dice) and contours (boundary F).
+
+Every function cuts two mattes [B, 1, H, W] at a threshold and gives one value per image, NaN where both are empty.
+"""
+
+import math
 
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
+
+BOUNDARY_TOLERANCE = 0.008
+"""How far two contours may lie apart and still match, as a share of the image's diagonal (DAVIS)."""
 
 
 def mask_iou(prediction: Tensor, target: Tensor, threshold: float = 0.5) -> Tensor:
@@ -15,9 +24,67 @@ def mask_iou(prediction: Tensor, target: Tensor, threshold: float = 0.5) -> Tens
     Returns:
         Per image in [0, 1], float64, [B]; NaN where both are empty (the caller reports it as not computed).
     """
+    a, b = (mask.flatten(1) for mask in _cut(prediction, target, threshold))
+    return (a & b).sum(1).to(torch.float64) / (a | b).sum(1).to(torch.float64)
+
+
+def mask_dice(prediction: Tensor, target: Tensor, threshold: float = 0.5) -> Tensor:
+    """Dice coefficient 2 |A & B| / (|A| + |B|) (Dice 1945); arguments, range and NaN as `mask_iou`, [B]."""
+    a, b = (mask.flatten(1) for mask in _cut(prediction, target, threshold))
+    return 2 * (a & b).sum(1).to(torch.float64) / (a.sum(1) + b.sum(1)).to(torch.float64)
+
+
+def boundary_f(
+    prediction: Tensor, target: Tensor, threshold: float = 0.5, tolerance: float = BOUNDARY_TOLERANCE
+) -> Tensor:
+    """Contour accuracy F of the DAVIS benchmark (Perazzi et al. 2016).
+
+    A contour pixel differs from its right, lower or lower right neighbour. Precision is the share of predicted contour
+    pixels with a true one within r pixels (centre to centre), recall the reverse, F = 2 P R / (P + R). The radius is
+    r = ceil(tolerance * sqrt(H^2 + W^2)), 3 pixels at 256x256. DAVIS scores two empty masks as 1; here they are NaN.
+
+    Args:
+        prediction: matte in [0, 1], [B, 1, H, W].
+        target: matte in [0, 1], [B, 1, H, W].
+        threshold: a pixel is inside where the matte is at least this.
+        tolerance: share of the image's diagonal.
+
+    Returns:
+        Per image in [0, 1], float64, [B]; 0 where one contour is empty, NaN where neither image has one (both masks
+        empty, or both full: the image's border is no contour).
+    """
+    radius = math.ceil(tolerance * math.hypot(*target.shape[-2:]))
+    pairs = zip(*(_contour(mask) for mask in _cut(prediction, target, threshold)), strict=True)
+    values = [_contour_f(a, b, radius) for a, b in pairs]
+    return torch.tensor(values, dtype=torch.float64, device=target.device)
+
+
+def _contour_f(prediction: Tensor, target: Tensor, radius: int) -> float:
+    """F of two contours, [H, W] each."""
+    if not prediction.any() and not target.any():
+        return math.nan
+    if not prediction.any() or not target.any():
+        return 0.0
+    precision = float((_distance_to(target)[prediction] <= radius).double().mean())
+    recall = float((_distance_to(prediction)[target] <= radius).double().mean())
+    return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+
+
+def _distance_to(contour: Tensor) -> Tensor:
+    """Distance of every pixel to the nearest contour pixel, [H, W]."""
+    return torch.from_numpy(distance_transform_edt(~contour.numpy()))
+
+
+def _contour(mask: Tensor) -> Tensor:
+    """Pixels unlike a neighbour to the right, below or both, on the CPU, [B, 1, H, W] -> [B, H, W]."""
+    mask = mask[:, 0].cpu()
+    padded = torch.nn.functional.pad(mask.float()[:, None], (0, 1, 0, 1), mode="replicate")[:, 0] > 0
+    return (mask ^ padded[:, :-1, 1:]) | (mask ^ padded[:, 1:, :-1]) | (mask ^ padded[:, 1:, 1:])
+
+
+def _cut(prediction: Tensor, target: Tensor, threshold: float) -> tuple[Tensor, Tensor]:
     if prediction.shape != target.shape or prediction.ndim != 4 or prediction.shape[1] != 1:
         raise ValueError(
             f"expected two mattes of one shape [B, 1, H, W], got {tuple(prediction.shape)} and {tuple(target.shape)}"
         )
-    a, b = (prediction >= threshold).flatten(1), (target >= threshold).flatten(1)
-    return (a & b).sum(1).to(torch.float64) / (a | b).sum(1).to(torch.float64)
+    return prediction >= threshold, target >= threshold

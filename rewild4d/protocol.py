@@ -1,6 +1,5 @@
 """Evaluation protocols: a TOML file says what is held out and measured; this renders, composites and scores."""
 
-import math
 from collections.abc import Iterable, Iterator
 from importlib import resources
 from typing import Literal
@@ -13,16 +12,12 @@ from rewild4d.contracts import Log, Reconstruction, Selection
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import digest
 from rewild4d.harmonics import seen_colors
+from rewild4d.image_scores import Beside, measure, summarize
 from rewild4d.leaderboard.records import Score
-from rewild4d.metrics.image import PSNR_CAP, psnr, ssim
-from rewild4d.metrics.silhouette import mask_iou
 from rewild4d.rasterizer import rasterize
 from rewild4d.types import Camera, Frame, Splats, Truth
 
 ScoreName = Literal["psnr", "ssim", "psnr_fg", "iou"]
-UNITS = {"psnr": "dB", "ssim": "1", "psnr_fg": "dB", "iou": "1"}
-FOREGROUND = 0.5
-"""A pixel belongs to the animal where the true matte is at least this."""
 
 
 class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -127,21 +122,6 @@ def evaluate(
     return {name: summarize(name, items) for name, items in values.items()}, labels
 
 
-def summarize(name: str, items: list[float | None]) -> Score:
-    """The mean over the items that have a value; a score without any says so instead of a number."""
-    present = [item for item in items if item is not None]
-    better = "higher"
-    if not present:
-        reason = "no held-out image" if not items else "no held-out image in which it is defined"
-        return Score(None, UNITS[name], better, 0, items, f"not computed: {reason}")
-    notes = []
-    if len(present) < len(items):
-        notes.append(f"{len(items) - len(present)} images left out: not defined there")
-    if name.startswith("psnr") and PSNR_CAP in present:
-        notes.append(f"{present.count(PSNR_CAP)} identical images counted as {PSNR_CAP:g} dB")
-    return Score(math.fsum(present) / len(present), UNITS[name], better, len(present), items, "; ".join(notes))
-
-
 def _render_frames(reconstruction: Reconstruction, frames: Iterable[Frame]) -> Iterator[tuple[Tensor, Tensor]]:
     """Render each frame's camera at its time; the Gaussians of one time are asked for once."""
     time, splats = None, None
@@ -167,18 +147,8 @@ def _score_batch(
     mask = torch.stack([frame.mask for frame in frames])
     alpha = torch.stack([alpha for _, alpha in rendered])
     image = (torch.stack([color for color, _ in rendered]) + (1 - alpha) * protocol.background).clamp(0, 1)
-    functions = {
-        "psnr": lambda: psnr(image, target),
-        "ssim": lambda: ssim(image, target),
-        "psnr_fg": lambda: psnr(image, target, mask >= FOREGROUND),
-        "iou": lambda: mask_iou(alpha, mask, FOREGROUND),
-    }
-    return {name: [_item(value) for value in functions[name]()] for name in protocol.scores}
-
-
-def _item(value: Tensor) -> float | None:
-    number = float(value)
-    return None if math.isnan(number) else number
+    shown = Beside(image, target, alpha, mask, protocol.background)
+    return {name: measure(name, shown, {}) for name in protocol.scores}
 
 
 def _batches(frames: Iterable[Frame], size: int) -> Iterator[list[Frame]]:

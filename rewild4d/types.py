@@ -118,11 +118,18 @@ class Truth:
         surface: time in seconds -> the true surface points at that time in the world, the same point in the same row
             at every time, float64, [n, 3]; None where the data set has no geometry.
         digest: SHA-256 over the held-out data.
+        sample: (time, n, seed) -> n points of the same surface in the world, rows as in ``surface``; another seed draws
+            an independent sampling, float64, [n, 3]; None where the data set has no geometry.
+        diagonal: of the animal's bounding box in its rest pose, world units; None where unknown.
+        up: direction that points up in the world, unit, float64, [3]; None where unknown.
     """
 
     held_out: Sequence[Frame]
     surface: Callable[[float], Tensor] | None
     digest: str
+    sample: Callable[[float, int, int], Tensor] | None = None
+    diagonal: float | None = None
+    up: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ import msgspec
 import pytest
 
 from rewild4d.errors import UserError
+from rewild4d.image_scores import summarize
 from rewild4d.leaderboard.records import RunRecord, Score, Timing, make_run_id, read_record, to_json, write_record
 from rewild4d.leaderboard.tables import markdown
-from rewild4d.protocol import summarize
 
 
 def record(**changes: Any) -> RunRecord:
@@ -74,8 +74,8 @@ def test_a_failure_is_a_row() -> None:
 
 
 def test_a_score_without_a_value_says_why() -> None:
-    assert summarize("psnr_fg", [None, None]).note == "not computed: no held-out image in which it is defined"
-    assert summarize("psnr", []).note == "not computed: no held-out image"
+    assert summarize("psnr_fg", [None, None]).note == "not computed: no image in which it is defined"
+    assert summarize("psnr", []).note == "not computed: no image"
     some = summarize("psnr", [10.0, None, 100.0])
     assert (some.value, some.count) == ((10.0 + 100.0) / 2, 2)
     assert some.note == "1 images left out: not defined there; 1 identical images counted as 100 dB"

@@ -1,0 +1,243 @@
+"""Distances between two sets of clips by the features of a video network: FVD, FVD-F, FVD-Diag, KVD, I3D-dist.
+
+An image matrix M[v][f] holds view v at frame f of one sequence. The names are SV4D's (Xie et al. 2025, sec. 4), who
+released no code for them; what the paper leaves open is fixed here:
+  FVD-F     one clip a view: M[v, :]
+  FVD-Diag  one clip a start view: M[(v0 + i) mod V, i], the camera advancing one view a frame around a closed orbit
+All clips of all sequences are pooled into one distance, which publishes n, m and T. FVD (Unterthiner et al. 2018) is
+dominated by bias below a few hundred clips; the kernel distance on the same features (KVD) is unbiased in n.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from rewild4d.metrics.distribution import frechet, kid
+from rewild4d.metrics.samples import (
+    Conditions,
+    Distance,
+    Features,
+    Images,
+    Progress,
+    describe,
+    not_computed,
+    require_image,
+)
+
+I3D_DIST = "I3D-dist (paired, N=1)"
+FEW_CLIPS = 64
+"""Below this many clips a side the result warns of KVD's noise."""
+
+
+class ImageMatrix(Protocol):
+    """M[v][f], an image [3, H, W] in [0, 1]: a tensor [V, F, 3, H, W], a list of clips, or a lazy reader of either."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> Images: ...
+
+
+class VideoExtractor(Protocol):
+    """What `rewild4d.metrics.features.VideoExtractor` is, as far as it is needed here: bring your own."""
+
+    name: str
+    digest: str
+    resize: str
+    minimum_frames: int
+
+    def __call__(self, videos: Tensor, /) -> Tensor:
+        """[B, T, 3, H, W] in [0, 1] -> [B, D]."""
+
+
+@dataclass(frozen=True)
+class MatrixClip:
+    """A clip through an image matrix, read image by image: frame i is matrix[views[i]][i]."""
+
+    matrix: ImageMatrix
+    views: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, index: int, /) -> Tensor:
+        return self.matrix[self.views[index]][index]
+
+
+def frame_clips(matrix: ImageMatrix) -> list[MatrixClip]:
+    """The clips of FVD-F: every view over all frames, M[v, :]."""
+    views, frames = _matrix_size(matrix)
+    return [MatrixClip(matrix, (view,) * frames) for view in range(views)]
+
+
+def diagonal_clips(matrix: ImageMatrix) -> list[MatrixClip]:
+    """The clips of FVD-Diag: from every view, one view further a frame, M[(v0 + i) mod V, i]; the orbit must close."""
+    views, frames = _matrix_size(matrix)
+    return [MatrixClip(matrix, tuple((start + i) % views for i in range(frames))) for start in range(views)]
+
+
+def video_features(
+    sequences: Sequence[Sequence[Images]], extractor: VideoExtractor, progress: Progress | None = None
+) -> Features:
+    """The features of every clip; one clip is in memory at a time.
+
+    Args:
+        sequences: the clips of each sequence; every clip has T images [3, H, W] in [0, 1].
+        extractor: [B, T, 3, H, W] in [0, 1] -> [B, D].
+        progress: called after every clip.
+
+    Raises:
+        ValueError: clips of differing or too small T, or what `require_image` refuses.
+    """
+    if reason := unfit(sequences, sequences, extractor):
+        raise ValueError(reason)
+    rows, groups = [], []
+    total = sum(map(len, sequences))
+    for group, clips in enumerate(sequences):
+        for clip in clips:
+            video = torch.stack([require_image(clip[i]) for i in range(len(clip))])
+            rows.append(extractor(video[None]).double().cpu())
+            groups.append(group)
+            if progress is not None:
+                progress(len(rows), total)
+    values = torch.cat(rows) if rows else torch.zeros(0, 0, dtype=torch.float64)
+    frames = next((len(clip) for clips in sequences for clip in clips), None)
+    ids = torch.tensor(groups, dtype=torch.int64)
+    return Features(values, ids, extractor.name, extractor.digest, extractor.resize, frames)
+
+
+def unfit(prediction: Sequence[Sequence[Images]], truth: Sequence[Sequence[Images]], extractor: VideoExtractor) -> str:
+    """Why a network cannot compare two sets of clips, or "": FVD changes wildly with T, so only equal T compare."""
+    lengths = sorted({len(clip) for side in (prediction, truth) for clips in side for clip in clips})
+    if len(lengths) > 1:
+        found = ", ".join(map(str, lengths))
+        return f"not computed: clips of {found} frames, and only equal lengths compare"
+    if lengths and lengths[0] < extractor.minimum_frames:
+        return f"not computed: clips of {lengths[0]} frames, and {extractor.name} needs {extractor.minimum_frames}"
+    return ""
+
+
+def clip_distances(
+    prediction: Sequence[Sequence[Images]],
+    truth: Sequence[Sequence[Images]],
+    extractor: VideoExtractor,
+    *,
+    paired: bool,
+    suffix: str = "",
+    conditions: Conditions = Conditions(),
+    progress: Progress | None = None,
+    seed: int = 0,
+) -> list[Distance]:
+    """FVD and KVD of two sets of clips, and where they are paired KVD-u and I3D-dist; the network runs once a clip.
+
+    Args:
+        prediction: the clips of each sequence, all of one length T.
+        truth: the same; with ``paired``, clip by clip the truth of the prediction.
+        extractor: [B, T, 3, H, W] in [0, 1] -> [B, D].
+        paired: whether the clips belong together (same cameras, same moments).
+        suffix: "-F", "-Diag": behind FVD and KVD.
+        conditions: background, crop and fps that both sets share.
+        progress: called after every clip.
+        seed: of the bootstrap over sequences.
+    """
+    names = [f"FVD{suffix}", f"KVD{suffix}", *([f"KVD{suffix}-u", I3D_DIST] if paired else [])]
+    if reason := unfit(prediction, truth, extractor):
+        x, y = (_nothing(clips, extractor) for clips in (prediction, truth))
+        return [describe(name, None, x, y, estimator="", notes=[reason], conditions=conditions) for name in names]
+    counts = [sum(map(len, side)) for side in (prediction, truth)]
+    x = video_features(prediction, extractor, _shifted(progress, 0, sum(counts)))
+    y = video_features(truth, extractor, _shifted(progress, counts[0], sum(counts)))
+    found = [
+        frechet(x, y, name=names[0], conditions=conditions),
+        kid(x, y, name=names[1], conditions=conditions, few=FEW_CLIPS, seed=seed),
+    ]
+    if paired:
+        found.append(kid(x, y, paired=True, name=names[1], conditions=conditions, few=FEW_CLIPS, seed=seed))
+        found.append(i3d_dist(x, y, conditions=conditions))
+    return found
+
+
+def fvd_f(
+    prediction: Sequence[ImageMatrix],
+    truth: Sequence[ImageMatrix],
+    extractor: VideoExtractor,
+    *,
+    paired: bool,
+    conditions: Conditions = Conditions(),
+    progress: Progress | None = None,
+    seed: int = 0,
+) -> list[Distance]:
+    """FVD-F and its companions (`clip_distances`) over every view of every image matrix, one matrix a sequence."""
+    predicted, true = ([frame_clips(matrix) for matrix in side] for side in (prediction, truth))
+    return clip_distances(
+        predicted, true, extractor, paired=paired, suffix="-F", conditions=conditions, progress=progress, seed=seed
+    )
+
+
+def fvd_diag(
+    prediction: Sequence[ImageMatrix],
+    truth: Sequence[ImageMatrix],
+    extractor: VideoExtractor,
+    *,
+    paired: bool,
+    conditions: Conditions = Conditions(),
+    progress: Progress | None = None,
+    seed: int = 0,
+) -> list[Distance]:
+    """FVD-Diag and its companions (`clip_distances`) over every diagonal; the views must be a closed, uniform orbit."""
+    predicted, true = ([diagonal_clips(matrix) for matrix in side] for side in (prediction, truth))
+    return clip_distances(
+        predicted, true, extractor, paired=paired, suffix="-Diag", conditions=conditions, progress=progress, seed=seed
+    )
+
+
+def i3d_dist(prediction: Features, truth: Features, *, conditions: Conditions = Conditions()) -> Distance:
+    """What Consistent4D's script (Jiang et al. 2024) prints as "FVD": one clip a set, clip by clip, then the mean.
+
+    |f - g|^2 + (s_f - s_g)^2 for the features f, g of one pair of clips, s the standard deviation over the features
+    themselves (N-1). It is no Fréchet distance of distributions and is not comparable with FVD.
+
+    Args:
+        prediction: features of the clips, [n, D].
+        truth: row i belongs to row i of the prediction, [n, D].
+        conditions: background, crop and fps that both sets share.
+    """
+    x, y, value = prediction.values, truth.values, None
+    if len(x) != len(y):
+        raise ValueError(f"expected pairs of clips, got {len(x)} and {len(y)}")
+    reason = not_computed(prediction, truth, least=1)
+    if not reason:
+        spread = x.std(1) - y.std(1)
+        value = float(((x - y).square().sum(1) + spread.square()).mean())
+    return describe(
+        I3D_DIST, value, prediction, truth, conditions=conditions, notes=[reason] if reason else [],
+        estimator="squared distance of each pair, averaged",
+    )  # fmt: skip
+
+
+def _nothing(sequences: Sequence[Sequence[Images]], extractor: VideoExtractor) -> Features:
+    """As many rows as there are clips, and no feature in them: for a result without a value."""
+    groups = torch.tensor([group for group, clips in enumerate(sequences) for _ in clips], dtype=torch.int64)
+    lengths = {len(clip) for clips in sequences for clip in clips}
+    frames = lengths.pop() if len(lengths) == 1 else None
+    values = torch.zeros(len(groups), 0, dtype=torch.float64)
+    return Features(values, groups, extractor.name, extractor.digest, extractor.resize, frames)
+
+
+def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:
+    """The progress of a part as progress of the whole."""
+    return None if progress is None else lambda done, _: progress(before + done, total)
+
+
+def _matrix_size(matrix: ImageMatrix) -> tuple[int, int]:
+    """Views and frames.
+
+    Raises:
+        ValueError: no view, or views of differing numbers of frames.
+    """
+    frames = {len(matrix[view]) for view in range(len(matrix))}
+    if len(frames) != 1:
+        raise ValueError(f"expected an image matrix with as many frames in every view, got {sorted(frames)}")
+    return len(matrix), frames.pop()

@@ -1,0 +1,123 @@
+"""`score`: the metrics on anybody's results, without our methods."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from rewild4d.cloud_scoring import score_clouds
+from rewild4d.commands.run import require_writable
+from rewild4d.config import parse_flags
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.files import write_text
+from rewild4d.leaderboard.reports import Report, markdown, to_json
+from rewild4d.machine import pick_device
+from rewild4d.metrics.samples import Progress as ShowProgress
+from rewild4d.pairing import Inputs
+from rewild4d.runner import Progress
+from rewild4d.scoring import FAMILIES, load_networks, score_pictures
+
+DESCRIPTION = """Score a folder of images or clips, or a .ply file, against the truth. Images are matched by file name,
+clips (subfolders of frames, or videos) by their own; nothing is resized or cropped."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Flags of `score`.
+
+    Attributes:
+        pred: folder of images, folder of clips, a video, or a .ply file.
+        truth: the same of the truth.
+        masks: true masks (white inside), laid out like --truth; the alpha of the truths where it is left out.
+        pred_masks: predicted masks, laid out like --truth; the alpha of the predictions where it is left out.
+        background: grey level from 0 (black) to 1 (white) behind images that have alpha; alpha is taken as straight.
+        unpaired: the predictions are of other views than the truths: only KID, FVD and KVD.
+        only: what to compute: psnr ssim lpips-alex lpips-vgg silhouette kid fvd; all where it is left out.
+        fps: of clips whose files do not say it, for the record.
+        up: axis that points up in both .ply files, for the alignment's starts: y or z; unknown where it is left out.
+        points: that are sampled on a mesh or on Gaussians in a .ply file, or drawn from a larger cloud.
+        device: auto, cpu or cuda.
+        out: file for the scores as JSON, with every image's value, the machine and the versions.
+        json: print the same JSON, and nothing else, to standard output.
+    """
+
+    pred: Path
+    truth: Path
+    masks: Path | None = None
+    pred_masks: Path | None = None
+    background: float = 1.0
+    unpaired: bool = False
+    only: tuple[str, ...] = ()
+    fps: float | None = None
+    up: Literal["y", "z"] | None = None
+    points: int = 30_000
+    device: str = "auto"
+    out: Path | None = None
+    json: bool = False
+
+
+def main(arguments: list[str]) -> int:
+    options = parse_flags(Options, arguments, prog="rewild4d-bench score", description=DESCRIPTION)
+    if options.out is not None:
+        require_writable(options.out.parent)
+    report = score(options)
+    if options.out is not None:
+        write_text(options.out, to_json(report) + "\n")
+    print(to_json(report) if options.json else markdown(report))
+    return 0
+
+
+def score(options: Options) -> Report:
+    """Check the flags and compare what they name.
+
+    Raises:
+        UserError: a value out of range, a name that is unknown, or a path that cannot be used.
+    """
+    device = pick_device(options.device)
+    clouds = [path.suffix.lower() == ".ply" for path in (options.pred, options.truth)]
+    if any(clouds):
+        if not all(clouds):
+            raise UserError(f"score: expected two .ply files or none, got {options.pred} and {options.truth}.")
+        if options.points < 1:
+            raise UserError(f"--points: expected a number of at least 1, got {options.points}.")
+        return score_clouds(options.pred, options.truth, up=options.up, points=options.points)
+    for name in options.only:
+        if name not in FAMILIES:
+            raise unknown_name("score", name, FAMILIES)
+    if not 0 <= options.background <= 1:
+        raise UserError(f"--background: expected a grey level from 0 to 1, got {options.background:g}.")
+    if options.fps is not None and not options.fps > 0:
+        raise UserError(f"--fps: expected a number above 0, got {options.fps:g}.")
+    if options.unpaired and (options.masks or options.pred_masks):
+        raise UserError("--unpaired: expected no masks, because only whole images are compared.")
+    families = options.only or FAMILIES
+    bar = _Bar()
+    try:
+        return score_pictures(
+            Inputs(options.pred, options.truth, options.masks, options.pred_masks),
+            networks=load_networks(families, device),
+            families=families,
+            background=options.background,
+            fps=options.fps,
+            paired=not options.unpaired,
+            device=device,
+            stage=bar.begin,
+        )
+    finally:
+        bar.close()
+
+
+class _Bar:
+    """One progress bar at a time on standard error."""
+
+    def __init__(self) -> None:
+        self.shown: Progress | None = None
+
+    def begin(self, title: str) -> ShowProgress:
+        self.close()
+        self.shown = Progress(title)
+        return self.shown
+
+    def close(self) -> None:
+        if self.shown is not None:
+            self.shown.close()
+            self.shown = None
