@@ -50,11 +50,12 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         status: "ok" or "failed"; ``error`` then holds the message.
         config: every setting of the method, defaults included.
         data: digests of the clip and of the truth, and the folder they came from.
-        prior: name, provenance, digest and the quality of its fit.
+        prior: name, provenance, digest and the quality of its fit; what the run asked for ("choice", "config").
         protocol: name, digest and settings.
         coverage: what the numbers lean on (see rewild4d.coverage).
         items: label of each held-out image, as in ``Score.per_item``.
         diagnostics: what the method says of itself (Gaussians, joint motion, ...).
+        marks: what a table has to say beside the numbers, such as "upper bound: ..."; such rows compete with nobody.
         pictures: files written beside the record, relative to it.
         machine: see `rewild4d.machine.machine`; records from before there was a choice do not name the rasterizer.
     """
@@ -80,6 +81,7 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     code: dict[str, str]
     machine: dict[str, str]
     timing: Timing
+    marks: list[str] = []
 
 
 def make_run_id(**parts: Any) -> str:

@@ -1,8 +1,9 @@
-"""`list`: methods, data sets, protocols and presets."""
+"""`list`: methods, data sets, protocols, presets and tables."""
 
 from dataclasses import dataclass
 
 from rewild4d.config import parse_flags, preset_names
+from rewild4d.leaderboard.specs import load_specs
 from rewild4d.protocol import load_protocols
 from rewild4d.registry import BUILTIN, load_dataset, load_method, names
 
@@ -28,4 +29,7 @@ def main(arguments: list[str]) -> int:
     print("protocols")
     for name, protocol in load_protocols().items():
         print(f"  {name:<24} {protocol.title}" + (" (default)" if protocol.default else ""))
+    print("tables")
+    for name, spec in load_specs().items():
+        print(f"  {name:<24} {spec.title}")
     return 0

@@ -117,22 +117,32 @@ class Gaussians(nn.Module):
 def initial_gaussians(prior: Prior, count: int, config: Canonical, generator: torch.Generator) -> dict[str, Tensor]:
     """Flat Gaussians on the rest surface (METHOD section 3): radius sqrt(area / pi n), normal along the third axis.
 
+    Without a shape prior: round ones anywhere in its bounding box, of half the side of the share of the box that each
+    one has.
+
     Args:
-        prior: its rest surface is sampled.
+        prior: its rest surface is sampled, or its size taken.
         count: number of Gaussians.
-        config: thickness and opacity at the start.
+        config: start, thickness and opacity.
         generator: the only source of chance.
 
     Returns:
         The five attributes by name; colours are mid-grey.
     """
-    surface = sample_surface(prior, count, generator)
     colors = torch.zeros(count, (config.sh_degree + 1) ** 2, 3)
     colors[:, 0] = 0.5
-    scales = surface.radius * torch.tensor((1.0, 1.0, config.thickness))
+    if config.start == "surface":
+        surface = sample_surface(prior, count, generator)
+        means, quats = surface.points, quats_from_normals(surface.normals)
+        scales = surface.radius * torch.tensor((1.0, 1.0, config.thickness))
+    else:
+        low, high = prior.vertices.float().aminmax(dim=0)
+        means = low + (high - low) * torch.rand(count, 3, generator=generator)
+        quats = torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=-1)
+        scales = 0.5 * ((high - low).prod() / count) ** (1 / 3) * torch.ones(3)
     return {
-        "means": surface.points,
-        "quats": quats_from_normals(surface.normals),
+        "means": means,
+        "quats": quats,
         "log_scales": scales.log().expand(count, 3),
         "logit_opacities": torch.full((count,), math.log(config.opacity / (1 - config.opacity))),
         "colors": colors,

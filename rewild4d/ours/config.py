@@ -4,6 +4,8 @@ Section numbers are the design's method notes. "fraction" means a share of `Conf
 length follow one schedule. Lengths without a unit are in the object frame, whose rest diagonal is 5.
 """
 
+from typing import Literal
+
 import msgspec
 
 
@@ -11,7 +13,10 @@ class Canonical(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """The canonical Gaussians (section 3)."""
 
     samples: int = 15_000
-    """Gaussians at the start: area-uniform samples of the prior's rest surface."""
+    """Gaussians at the start."""
+    start: Literal["surface", "box"] = "surface"
+    """Area-uniform on the prior's rest surface, or uniform in its bounding box, of which only the size is the prior's
+    (the paper's "w/o Shape Prior"; skinning and poses still start from the prior)."""
     thickness: float = 0.5
     """Scale along the normal over the scale in the surface: flat enough for a normal, thick enough edge-on."""
     opacity: float = 0.9
@@ -57,6 +62,9 @@ class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """At 0.1 all joints turn alike for ever; 1 tells them apart."""
     frequencies: int = 4
     """Octaves of the time code; 4 fitted better than 6 in the measured prototype."""
+    encoding: Literal["group", "view"] = "group"
+    """Sign that turns time in the code: the group's m, or the image's v (the paper's "w/o Symm. Enc.", emb(t v) + v:
+    a frame and its double in the other group share one code). Nothing where `tied`: poses are then mirrored, not coded."""
     explicit_group: bool = False
     """Append the group sign m to the code."""
     width: int = 128
@@ -80,6 +88,8 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     enabled: bool = True
     """False is the paper's "w/o Deform" ablation."""
+    anchors: bool = True
+    """The query holds skinning weights times part anchors; False: the weights themselves ("w/o Part Anchors")."""
     width: int = 64
     """Hidden width; the dearest network of the method. 128 for 64: +0.03 dB on one horse, +0.3 on one cow (one seed,
     3,000 steps, preset standard), and 1.3 times the time of the whole fit."""
