@@ -77,7 +77,7 @@ def html(table: Table) -> str:
 
 
 def tidy_csv(table: Table) -> str:
-    """One line a figure, for programs: stub columns, kind, condition, score, better, value, spread, low, high, rank, note."""
+    """One line a figure, for programs; low and high are the ends of a difference's interval."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     stubs = [stub or "row" for stub in table.stubs]

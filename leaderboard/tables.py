@@ -160,9 +160,15 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
             pair = entrant.records[index], reference.records[index]
             cells += [_difference(*pair, name) for name in frame.scores]
         rows.append(Row((entrant.label,), tuple(cells), _kind(entrant), (*entrant.notes,)))
-    caption = f"Difference to {reference.label}, case by case; in brackets the 95 % interval of a bootstrap over cases and seeds"
-    return Table(f"{frame.name}-difference", f"{frame.title}: difference to {reference.label}", caption, ("method",), columns,
-                 tuple(rows), frame.remarks)  # fmt: skip
+    return Table(
+        f"{frame.name}-difference",
+        f"{frame.title}: difference to {reference.label}",
+        "mean of the cases' differences; in brackets the 95 % interval of a bootstrap over cases and seeds",
+        ("method",),
+        columns,
+        tuple(rows),
+        frame.remarks,
+    )
 
 
 def _frame(records: Sequence[RunRecord], remarks: Sequence[str]) -> Frame:

@@ -116,7 +116,9 @@ def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[
         except UserError as error:
             rows.append(Entrant(row.label, ((),) * len(under), str(error), notes))
             continue
-        own = tuple(tuple(r for r in found if r.method == entry.method and _same(r, entry)) for found in under)
+        own = tuple(
+            tuple(r for r in found if r.method == entry.method and _equals(r.config, entry.config)) for found in under
+        )
         rows.append(Entrant(row.label, own, "", notes))
     shown = {row.method for row in spec.rows}
     # A floor has no rows of its own: it stands beside the cases that the rows were run on.
@@ -151,18 +153,17 @@ def protocol_of(spec: Spec, name: str) -> Protocol:
 
 def _is_under(record: RunRecord, condition: Condition, spec: Spec) -> bool:
     choice = record.prior.get("choice", record.prior.get("name"))
-    wanted = msgspec.to_builtins(PRIOR_PRESETS.get(spec.preset, STANDARD))
+    wanted = spec.dataset, condition.protocol, condition.prior
     fits = not condition.cases or any(fnmatchcase(record.case, pattern) for pattern in condition.cases)
-    # Records from before the prior's settings were written name none.
-    effort = record.prior.get("config", wanted) == wanted
-    same = (record.dataset, record.protocol["name"], choice) == (spec.dataset, condition.protocol, condition.prior)
-    return same and fits and effort
+    effort = record.prior.get("config")  # records from before it was written have none
+    same_effort = effort is None or _equals(effort, PRIOR_PRESETS.get(spec.preset, STANDARD))
+    return (record.dataset, record.protocol["name"], choice) == wanted and fits and same_effort
 
 
-def _same(record: RunRecord, entry: Entry) -> bool:
-    """Whether a record has an entry's settings; those that came later than the record have their defaults in it."""
+def _equals(settings: Any, wanted: msgspec.Struct) -> bool:
+    """Whether a record's settings are these; those that came later than the record have their defaults in it."""
     try:
-        return msgspec.convert(record.config, type=type(entry.config), strict=False) == entry.config
+        return msgspec.convert(settings, type=type(wanted)) == wanted
     except msgspec.ValidationError:
         return False
 

@@ -8,7 +8,7 @@ from records_for_tests import psnr, record
 
 from rewild4d.errors import UserError
 from rewild4d.image_scores import summarize
-from rewild4d.leaderboard.records import Score, make_run_id, read_record, to_json, write_record
+from rewild4d.leaderboard.records import make_run_id, read_record, to_json, write_record
 from rewild4d.leaderboard.tables import markdown
 
 

@@ -125,7 +125,8 @@ def test_what_has_no_number_says_why() -> None:
     other = record(scores={}, protocol=PROTOCOL)
     made = named_table(FRAME, [
         Entrant("failed", ((failed,),)), Entrant("without", ((later,),)), Entrant("unmeasured", ((other,),)),
-        Entrant("nobody", ((),)), Entrant("unknown", ((),), absent="unknown method 'x'."), Entrant("fine", ((record(),),)),
+        Entrant("nobody", ((),)), Entrant("unknown", ((),), absent="unknown method 'x'."),
+        Entrant("fine", ((record(),),)),
     ])  # fmt: skip
     assert [row.cells[0].text for row in made.rows] == ["failed", "n/a", "n/a", "n/a", "n/a", "20.00"]
     assert made.notes == (

@@ -64,7 +64,7 @@ class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """Octaves of the time code; 4 fitted better than 6 in the measured prototype."""
     encoding: Literal["group", "view"] = "group"
     """Sign that turns time in the code: the group's m, or the image's v (the paper's "w/o Symm. Enc.", emb(t v) + v:
-    a frame and its double in the other group share one code). Nothing where `tied`: poses are then mirrored, not coded."""
+    both groups share one code). Without effect where `tied`: poses are then mirrored, not coded."""
     explicit_group: bool = False
     """Append the group sign m to the code."""
     width: int = 128
