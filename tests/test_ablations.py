@@ -5,7 +5,7 @@ import torch
 
 from rewild4d.conformance import tiny_case
 from rewild4d.ours.canonical import initial_gaussians
-from rewild4d.ours.config import Canonical, Config, Deform, Geometry, Pose, Skinning
+from rewild4d.ours.config import Canonical, Config, Deform, Geometry, Pose, PriorUse, Skinning
 from rewild4d.ours.fit import Training
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.symmetry import Key, Supervision
@@ -38,8 +38,7 @@ def training(case: Case, **changes: object) -> Training:
 
 
 def test_without_a_shape_prior_gaussians_fill_the_box(case: Case) -> None:
-    config = Canonical(start="box", opacity=0.1)
-    start = initial_gaussians(case.prior, 4000, config, generator())
+    start = initial_gaussians(case.prior, 4000, Canonical(opacity=0.1), generator(), shape=False)
     low, high = case.prior.vertices.aminmax(dim=0)
     assert ((start["means"] >= low) & (start["means"] <= high)).all()
     # Uniform: the mean is the middle and the deviation the side over the root of twelve.
@@ -49,9 +48,16 @@ def test_without_a_shape_prior_gaussians_fill_the_box(case: Case) -> None:
     side = ((high - low).prod() / 4000) ** (1 / 3)
     torch.testing.assert_close(start["log_scales"].exp(), (0.5 * side).expand(4000, 3))
     on = initial_gaussians(case.prior, 4000, Canonical(), generator())
+    assert torch.equal(model(case, prior=PriorUse(shape=False)).gaussians.means, drawn_in_box(case))
     inside = ((start["means"][:, None, :] - on["means"][None, :400]).norm(dim=-1).amin(1) > 0.3).float().mean()
     assert inside > 0.2, "a good part lies far from the surface"
     assert {name: tensor.shape for name, tensor in start.items()} == {name: on[name].shape for name in start}
+
+
+def drawn_in_box(case: Case) -> torch.Tensor:
+    """The first draw of a model's generator."""
+    low, high = case.prior.vertices.aminmax(dim=0)
+    return low + (high - low) * torch.rand(200, 3, generator=generator())
 
 
 def test_without_part_anchors_the_query_holds_the_weights(case: Case) -> None:

@@ -24,7 +24,7 @@ from rewild4d.priors.io import save_prior
 from rewild4d.registry import names
 from rewild4d.types import Case, Clip, Truth
 
-COMING = {"d3dgs", "d3dgs*", "gart", "gart*"}
+COMING = {"d3dgs", "d3dgs-star", "gart", "gart-star"}
 """Methods that tables name before they are there."""
 
 

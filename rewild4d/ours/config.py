@@ -13,10 +13,7 @@ class Canonical(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """The canonical Gaussians (section 3)."""
 
     samples: int = 15_000
-    """Gaussians at the start."""
-    start: Literal["surface", "box"] = "surface"
-    """Area-uniform on the prior's rest surface, or uniform in its bounding box, of which only the size is the prior's
-    (the paper's "w/o Shape Prior"; skinning and poses still start from the prior)."""
+    """Gaussians at the start: area-uniform samples of the prior's rest surface."""
     thickness: float = 0.5
     """Scale along the normal over the scale in the surface: flat enough for a normal, thick enough edge-on."""
     opacity: float = 0.9
@@ -110,8 +107,11 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the prior's poses do after the start (section 4)."""
+    """What the prior's shape gives to the start, and its poses to what follows (sections 3 and 4)."""
 
+    shape: bool = True
+    """Start on the prior's rest surface; False: anywhere in its bounding box (the paper's "w/o Shape Prior"; skinning
+    and poses still start from the prior)."""
     blend: bool = False
     """Blend the prior's poses into the network's (paper; off on Artemis: after a warm-up it only undoes that)."""
     blend_until: float = 0.35

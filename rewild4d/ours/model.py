@@ -114,7 +114,7 @@ class Model(nn.Module):
 
 def build_model(config: Config, prior: Prior, generator: torch.Generator) -> Model:
     """The model at its start: Gaussians on the prior's rest surface, the field filled from its weights."""
-    values = initial_gaussians(prior, config.canonical.samples, config.canonical, generator)
+    values = initial_gaussians(prior, config.canonical.samples, config.canonical, generator, config.prior.shape)
     field = build_field(prior.vertices.float(), prior.weights.float(), prior.mirror.long(), config.skinning)
     skeleton = (prior.bones[:, 0].float(), prior.parents.long(), prior.mirror.long())
     return Model(config, Gaussians(values, config.canonical.max_scale), field, *skeleton, generator)
