@@ -323,7 +323,7 @@ def _floors(
 ) -> tuple[list[Distances], str]:
     """Distances of a second sampling from the truth at each moment, and one sentence on how it was made."""
     if seconds is not None:
-        drawn = [subsample(cloud, max(1, len(other)), seed + 2) for cloud, other in zip(seconds, given, strict=True)]
+        drawn = [subsample(cloud, len(other) or points, seed + 2) for cloud, other in zip(seconds, given, strict=True)]
         note = f"floor: an independent sampling of the truth with {_span(drawn)} points against the same truth"
         return [distances(*pair) for pair in zip(drawn, targets, strict=True)], note
     halves = []

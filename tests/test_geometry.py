@@ -207,6 +207,13 @@ def test_a_million_points_are_drawn_from_and_said_so() -> None:
     assert again.scores == found.scores
 
 
+def test_a_million_equal_points_are_compared_at_once() -> None:
+    begin = time.perf_counter()
+    found = chamfer(torch.ones(1_000_000, 3), torch.zeros(1000, 3))
+    assert found.to_truth == found.to_prediction == pytest.approx(3**0.5)
+    assert time.perf_counter() - begin < 5
+
+
 def square() -> tuple[Tensor, Tensor]:
     """A unit square of two triangles and a triangle of twice its area far away."""
     vertices = torch.tensor(((0.0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (10, 0, 0), (12, 0, 0), (10, 2, 0)))
