@@ -78,8 +78,8 @@ class Measured:
         unit: "1" for a ratio, "world" for the clouds' own unit of length.
         better: "higher" or "lower".
         per_frame: the value at each moment, None where there is none.
-        floor: the same quantity for a second sampling of the truth in the prediction's place: no method should be
-            expected to do better. None where there is no second sampling.
+        floor: the same quantity for a second sampling of the truth in the prediction's place, which is what a perfect
+            shape gets; ``Comparison.note`` says of how many points. None where there is no second sampling.
         note: why there is no value, or what was left out.
     """
 
@@ -207,8 +207,9 @@ def compare_sequence(
             global motion, drift and flicker of scale; "none" compares them as they stand.
         diagonal: of the truth's bounding box in its rest pose; of the first truth where None.
         up: direction that the two frames share, for the alignment's starts (see `align_sequence`), [3].
-        seconds: an independent sampling of each truth for the floor; where None, two halves of each truth are
-            compared, [k, 3].
+        seconds: an independent sampling of each truth for the floor, at least as large as the prediction. Where it is
+            None, two disjoint draws from each truth stand in; from a truth of fewer than twice ``points`` these are
+            halves, and their floor is worse than one of all points, [k, 3].
         points: a larger cloud is compared by so many of its points.
         seed: of all draws.
 
@@ -302,9 +303,9 @@ def _measured(
     below = [item for item in map(finite, floors) if item is not None]
     floor = math.fsum(below) / len(below) if below else None
     if not present:
-        if not reason:
-            empty = all(found is not None and not len(found.to_truth) for found in frames)
-            reason = "the prediction has no points" if empty else "the truth's diagonal is zero"
+        if all(found is not None and not len(found.to_truth) for found in frames):
+            reason = "the prediction has no points"
+        reason = reason or "the truth's diagonal is zero"
         return Measured(None, unit, better, items, floor, f"not computed: {reason}")
     note = f"{len(items) - len(present)} of {len(items)} moments left out: not defined there"
     return Measured(

@@ -88,7 +88,8 @@ def write_splats(path: Path, splats: Splats) -> None:
 
     Raises:
         UserError: the folder cannot be written.
-        ValueError: values that are not finite, scales not above zero, opacities outside [0, 1], a number of coefficients other than 1, 4, 9, 16.
+        ValueError: values that are not finite, scales not above zero, opacities outside [0, 1], coefficients other
+            than 1, 4, 9 or 16 a Gaussian.
     """
     count, bands = len(splats), splats.colors.shape[1]
     if bands not in (1, 4, 9, 16):

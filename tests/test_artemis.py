@@ -215,6 +215,30 @@ def test_surface_is_the_shell_and_follows_the_bones(animal: Path) -> None:
         truth.surface(0.5 / 30)
 
 
+def test_the_surface_can_be_sampled_again(animal: Path) -> None:
+    """The bars of the lattice: 3 x 3 x 7 cells with a hollow of 5, each point anywhere in the cell of a shell voxel."""
+    _, truth = Artemis(animal).load("cat/walk", SWEEP)
+    voxels = truth.surface(0.0)
+    pitch = torch.tensor([0.2 / 2, 0.4 / 2, 1.8 / 6]).double()
+    points = truth.sample(0.0, 20 * len(voxels) + 7, 0)
+    offset = (points[:, None] - voxels).abs() / pitch
+    owner = offset.amax(2).argmin(1)
+    assert float(offset.amax(2).amin(1).max()) <= 0.5 + 1e-9
+    assert set(owner.bincount(minlength=len(voxels)).tolist()) == {20, 21}
+    torch.testing.assert_close(
+        truth.sample(1 / 30, len(points), 0) - points, torch.tensor((0.0, 0.025, 0.0)).double().expand_as(points)
+    )
+    assert torch.equal(points, truth.sample(0.0, len(points), 0))
+    assert not torch.equal(points, truth.sample(0.0, len(points), 1))
+    assert len(truth.sample(0.0, 5, 0)) == 5
+
+
+def test_the_rest_pose_and_the_world_are_told(animal: Path) -> None:
+    _, truth = Artemis(animal).load("cat/walk", SWEEP)
+    assert truth.diagonal == pytest.approx((0.2**2 + 0.4**2 + 1.8**2) ** 0.5)
+    torch.testing.assert_close(truth.up, torch.tensor((0.0, 1.0, 0.0)).double())
+
+
 def test_lattice_of_stored_float32_with_a_hole() -> None:
     points = block((40, 50, 60), (0.0117, 0.0071, 0.0093)).astype(np.float32).astype(np.float64) + 1.3
     cells, error = lattice(points)
