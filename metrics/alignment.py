@@ -241,7 +241,7 @@ class _Search:
     def best(self, starts: Mapping[str, Tensor], iterations: int, tolerance: float) -> Alignment:
         tracks = [_Track(name, self._begin(turn), 0, False, np.inf, np.inf) for name, turn in starts.items()]
         last = _Stage(QUERIES, iterations, tolerance, 1)
-        for stage in (_Stage(300, 20, 1e-3, 4), _Stage(2000, 60, 1e-4, 1), last):
+        for stage in (_Stage(300, 20, 1e-3, 4), _Stage(1000, 60, 1e-4, 1), last):
             matcher = _Matcher(self._clouds, stage.queries, None if stage is last else COARSE_FRAMES, self._seed)
             done = [self._run(track, matcher, stage) for track in tracks]
             tracks = sorted(done, key=lambda track: track.chamfer_kept)[: stage.keep]

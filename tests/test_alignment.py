@@ -21,7 +21,7 @@ from rewild4d.metrics.alignment import (
     yaw_starts,
 )
 
-EXACT = dict(atol=1e-9, rtol=0)
+EXACT = {"atol": 1e-9, "rtol": 0}
 
 
 def cloud(count: int, seed: int = 0) -> Tensor:
