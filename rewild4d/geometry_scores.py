@@ -22,7 +22,7 @@ def score_geometry(
     """Compare shapes.
 
     Args:
-        reconstruction: what is scored; its surface is drawn by `sampling.sample_gaussians`.
+        reconstruction: what is scored; `sampling.sample_gaussians` says which points stand for it.
         truth: with a surface.
         times: moments, seconds.
         names: out of `NAMES`.

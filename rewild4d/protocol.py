@@ -70,7 +70,7 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for name, value in later.items():
             if value is None:
                 del given[name]
-        return digest(msgspec.json.encode(given, order="deterministic"))
+        return digest(msgspec.json.encode(given))
 
 
 class Evaluation(NamedTuple):

@@ -153,13 +153,12 @@ def test_polygons_are_cut_into_fans(order: str, tmp_path: Path) -> None:
     assert read_mesh(file(tmp_path, header, body))[1].tolist() == [[0, 1, 2], [4, 3, 2], [4, 2, 1]]
 
 
-def test_gaussians_are_sampled_as_a_surface(tmp_path: Path) -> None:
+def test_gaussians_stand_with_their_centres(tmp_path: Path) -> None:
     one = splats(0)
-    one.opacities[:] = torch.tensor((0.05,) * 6 + (1.0,))
+    one.opacities[:] = torch.tensor((0.05,) * 4 + (1.0,) * 3)
     write_splats(tmp_path / "a.ply", one)
-    points = read_surface(tmp_path / "a.ply", 500, 0)
-    reach = float(one.scales[6].max()) + 1e-5
-    assert len(points) == 500 and float((points - one.means[6]).norm(dim=1).max()) <= reach
+    torch.testing.assert_close(read_surface(tmp_path / "a.ply", 500, 0), one.means[4:].double())
+    assert len(read_surface(tmp_path / "a.ply", 2, 0)) == 2
     assert len(read_points(tmp_path / "a.ply")) == 7
 
 
