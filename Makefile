@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: bench test setup lint types clean
+.PHONY: bench test setup weights lint types clean
 
 bench: setup
 	$(BIN)/rewild4d-bench run --method ours --dataset artemis
@@ -17,6 +17,10 @@ $(VENV)/.ready: constraints.txt pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
+
+# The networks behind LPIPS, KID and FVD. What is there already is not fetched again.
+weights: setup
+	$(BIN)/rewild4d-bench weights fetch
 
 lint: setup
 	$(BIN)/ruff check .

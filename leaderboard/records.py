@@ -7,6 +7,7 @@ import msgspec
 
 from rewild4d.errors import UserError
 from rewild4d.files import digest, write_text
+from rewild4d.metrics.samples import Distance
 
 SCHEMA = 1
 FILE = "record.json"
@@ -53,7 +54,10 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         prior: name, provenance, digest and the quality of its fit; what the run asked for ("choice", "config").
         protocol: name, digest and settings.
         coverage: what the numbers lean on (see rewild4d.coverage).
-        items: label of each held-out image, as in ``Score.per_item``.
+        items: label of each held-out image, as in ``Score.per_item`` of image scores.
+        distances: between sets of novel views and the input video, with all that decides their values.
+        alignments: by which shapes were laid on the truth.
+        networks: SHA-256 of the weights of the metric networks that scores leaned on.
         diagnostics: what the method says of itself (Gaussians, joint motion, ...).
         marks: what a table has to say beside the numbers, such as "upper bound: ..."; such rows compete with nobody.
         pictures: files written beside the record, relative to it.
@@ -82,6 +86,9 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     machine: dict[str, str]
     timing: Timing
     marks: list[str] = []
+    distances: list[Distance] = []
+    alignments: list[dict[str, Any]] = []
+    networks: dict[str, str] = {}
 
 
 def make_run_id(**parts: Any) -> str:

@@ -166,7 +166,7 @@ def align_sequence(
 
     Raises:
         Undetermined: no moment has points of both, or those of a side lie on one line at every moment.
-        ValueError: unequal lengths, a NaN, a start that is no rotation.
+        ValueError: unequal lengths, a NaN, no start or one that is no rotation, a setting out of its range.
     """
     paired(sources, targets)
     if not 0 <= trim < 1 or not 0 < scale_clamp[0] <= 1 <= scale_clamp[1]:
@@ -180,6 +180,8 @@ def align_sequence(
         if all(is_straight(pair[side]) for pair in both):
             raise Undetermined(f"the {name}'s points lie on one line, so no rotation is unique")
     chosen = starts if starts is not None else cube_starts() if up is None else yaw_starts(up)
+    if not chosen:
+        raise ValueError("expected at least one start, got none")
     return _Search(both, trim, scale_clamp, seed).best(chosen, iterations, tolerance)
 
 
@@ -241,7 +243,7 @@ class _Search:
     def best(self, starts: Mapping[str, Tensor], iterations: int, tolerance: float) -> Alignment:
         tracks = [_Track(name, self._begin(turn), 0, False, np.inf, np.inf) for name, turn in starts.items()]
         last = _Stage(QUERIES, iterations, tolerance, 1)
-        for stage in (_Stage(300, 20, 1e-3, 4), _Stage(2000, 60, 1e-4, 1), last):
+        for stage in (_Stage(300, 20, 1e-3, 4), _Stage(1000, 60, 1e-4, 1), last):
             matcher = _Matcher(self._clouds, stage.queries, None if stage is last else COARSE_FRAMES, self._seed)
             done = [self._run(track, matcher, stage) for track in tracks]
             tracks = sorted(done, key=lambda track: track.chamfer_kept)[: stage.keep]
@@ -293,11 +295,11 @@ class _Matcher:
         forward: list[tuple[Points, Points, Points]] = []
         backward: list[tuple[Points, Points, Points]] = []
         for (source, target), (x, y) in zip(self._pairs, self._drawn, strict=True):
-            distances, rows = target.nearest(found(x))
-            forward.append((x, target.points[rows], distances))
+            distances, places = target.nearest(found(x))
+            forward.append((x, places, distances))
             # A similarity keeps the order of distances, so the source's own tree serves every iteration.
-            distances, rows = source.nearest(found.inverse(y))
-            backward.append((source.points[rows], y, found.scale * distances))
+            distances, places = source.nearest(found.inverse(y))
+            backward.append((places, y, found.scale * distances))
         kept, means = [], []
         for direction in (forward, backward):
             x, y, distances = (np.concatenate(part) for part in zip(*direction, strict=True))

@@ -79,9 +79,18 @@ class Cloud:
 
     def __init__(self, points: Points) -> None:
         self.points = points
-        self._tree = cKDTree(points)
+        self._places = _places(points)
+        self._tree = cKDTree(self._places)
 
-    def nearest(self, queries: Points) -> tuple[Points, NDArray[np.intp]]:
-        """Euclidean distance to the nearest point and its row, [q, 3] -> [q] and [q]."""
+    def nearest(self, queries: Points) -> tuple[Points, Points]:
+        """Euclidean distance to the nearest point, and where that is, [q, 3] -> [q] and [q, 3]."""
         distances, rows = self._tree.query(queries, workers=2 if len(queries) >= THREADED else 1)
-        return distances, rows
+        return distances, self._places[rows]
+
+
+def _places(points: Points) -> Points:
+    """The points, each place once: a tree cannot split equal points, and a collapsed cloud would take minutes."""
+    # Equal points have equal sums, and counting those is cheap; unequal ones rarely do.
+    if len(np.unique(points @ np.array((1.0, np.e, np.pi)))) > len(points) // 2:
+        return points
+    return np.unique(points, axis=0)

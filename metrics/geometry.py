@@ -14,7 +14,20 @@ import torch
 from torch import Tensor
 
 from rewild4d.metrics.alignment import Alignment, Undetermined, align_sequence
-from rewild4d.metrics.clouds import Cloud, Points, as_points, box_diagonal, paired, subsample
+from rewild4d.metrics.clouds import as_points, box_diagonal, paired, subsample
+from rewild4d.metrics.distances import Chamfer, Distances, chamfer, distances, fscore
+
+__all__ = [
+    "Chamfer",
+    "Comparison",
+    "Distances",
+    "Measured",
+    "chamfer",
+    "compare",
+    "compare_sequence",
+    "distances",
+    "fscore",
+]
 
 THRESHOLDS = (1, 2, 5)
 """Distances of the F-scores in percent of the truth's diagonal."""
@@ -24,49 +37,6 @@ POINTS = 30_000
 Fit = Literal["sequence", "frame", "none"]
 SUFFIX: dict[Fit, str] = {"sequence": "", "frame": "_framewise", "none": "_unaligned"}
 """End of a score's name: one similarity for all moments is the headline, the others are scores of their own."""
-
-
-@dataclass(frozen=True)
-class Distances:
-    """Nearest-neighbour distances between two clouds, computed once.
-
-    Attributes:
-        to_truth: from each point of the prediction, float64, [n].
-        to_prediction: from each point of the truth; infinite where the prediction has no points, float64, [m].
-    """
-
-    to_truth: Points
-    to_prediction: Points
-
-    @property
-    def chamfer(self) -> "Chamfer":
-        """Means of the two directions; `to_truth` is NaN where the prediction has no points."""
-        forward = float(self.to_truth.mean()) if len(self.to_truth) else math.nan
-        return Chamfer(forward, float(self.to_prediction.mean()))
-
-    def fscore(self, threshold: float) -> float:
-        """See `fscore`."""
-        precision = float((self.to_truth < threshold).mean()) if len(self.to_truth) else 0.0
-        recall = float((self.to_prediction < threshold).mean())
-        return 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0
-
-
-@dataclass(frozen=True)
-class Chamfer:
-    """Mean nearest-neighbour distances in the clouds' unit, not squared.
-
-    Attributes:
-        to_truth: from the prediction to the truth (accuracy).
-        to_prediction: from the truth to the prediction (completeness).
-    """
-
-    to_truth: float
-    to_prediction: float
-
-    @property
-    def symmetric(self) -> float:
-        """Mean (not sum) of the two directions."""
-        return (self.to_truth + self.to_prediction) / 2
 
 
 @dataclass(frozen=True)
@@ -107,56 +77,6 @@ class Comparison:
     alignments: tuple[Alignment | None, ...]
     diagonal: float
     note: str
-
-
-def distances(prediction: Tensor, truth: Tensor) -> Distances:
-    """Nearest-neighbour distances in both directions, exact.
-
-    Args:
-        prediction: finite, may be empty, [n, 3].
-        truth: finite, at least one point, [m, 3].
-
-    Raises:
-        ValueError: another shape, a NaN or an infinite value, an empty truth.
-    """
-    return _distances(as_points(prediction, "prediction", empty=True), as_points(truth, "truth"))
-
-
-def chamfer(prediction: Tensor, truth: Tensor) -> Chamfer:
-    """Chamfer distance: mean_p min_g |p - g| and mean_g min_p |p - g|, not squared.
-
-    Conventions differ between papers by the square and by a factor of two; here both directions are kept, and
-    `Chamfer.symmetric` is their mean.
-
-    Args:
-        prediction: finite, at least one point, [n, 3].
-        truth: finite, at least one point, [m, 3].
-
-    Raises:
-        ValueError: another shape, a NaN or an infinite value, an empty cloud.
-    """
-    as_points(prediction, "prediction")
-    return distances(prediction, truth).chamfer
-
-
-def fscore(prediction: Tensor, truth: Tensor, threshold: float) -> float:
-    """F-score (Knapitsch et al. 2017): harmonic mean of precision and recall at a distance.
-
-    Precision is the share of the prediction's points nearer to the truth than the threshold, recall the share of the
-    truth's points nearer to the prediction. Zero where both are zero, and for a prediction without points.
-
-    Args:
-        prediction: finite, [n, 3].
-        truth: finite, at least one point, [m, 3].
-        threshold: in the clouds' unit.
-
-    Returns:
-        In [0, 1].
-
-    Raises:
-        ValueError: another shape, a NaN or an infinite value, an empty truth.
-    """
-    return distances(prediction, truth).fscore(threshold)
 
 
 def compare(
@@ -233,12 +153,6 @@ def compare_sequence(
         for name, (quantity, unit, better) in _quantities(length).items()
     }
     return Comparison(scores, alignments, length, f"{_counts(predictions, truths, points, seed)}; {floor_note}")
-
-
-def _distances(prediction: Points, truth: Points) -> Distances:
-    if not len(prediction):
-        return Distances(np.empty(0), np.full(len(truth), np.inf))
-    return Distances(Cloud(truth).nearest(prediction)[0], Cloud(prediction).nearest(truth)[0])
 
 
 def _aligned(
@@ -323,7 +237,7 @@ def _floors(
 ) -> tuple[list[Distances], str]:
     """Distances of a second sampling from the truth at each moment, and one sentence on how it was made."""
     if seconds is not None:
-        drawn = [subsample(cloud, max(1, len(other)), seed + 2) for cloud, other in zip(seconds, given, strict=True)]
+        drawn = [subsample(cloud, len(other) or points, seed + 2) for cloud, other in zip(seconds, given, strict=True)]
         note = f"floor: an independent sampling of the truth with {_span(drawn)} points against the same truth"
         return [distances(*pair) for pair in zip(drawn, targets, strict=True)], note
     halves = []

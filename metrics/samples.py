@@ -10,6 +10,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from rewild4d.metrics.networks.layers import check_range
+
 ORIGINAL = ("inception-fid", "i3d-k400")
 """Networks under which a metric has its plain name; under any other the network's name stands behind it."""
 _BATCH = 16
@@ -149,8 +151,7 @@ def require_image(image: Tensor) -> Tensor:
     """
     if image.ndim != 3 or image.shape[0] != 3 or not image.is_floating_point():
         raise ValueError(f"expected a float image of shape [3, H, W], got {image.dtype} {tuple(image.shape)}")
-    if not bool(((image >= 0) & (image <= 1)).all()):  # a NaN fails both
-        raise ValueError(f"expected an image in [0, 1], got values from {float(image.min())} to {float(image.max())}")
+    check_range(image)
     return image
 
 

@@ -226,7 +226,7 @@ def _bytes_of(copy: Copy, file: str) -> bytes:
     if copy.member is None:
         return read_pinned(copy.path, known, file)
     try:
-        if copy.path.suffix == ".whl":
+        if zipfile.is_zipfile(copy.path):
             with zipfile.ZipFile(copy.path) as wheel:
                 data = wheel.read(copy.member)
         else:

@@ -22,7 +22,7 @@ def score_clouds(
     """Compare two .ply files.
 
     Args:
-        prediction: a mesh or Gaussians, sampled over their surface, or points, taken as they are.
+        prediction: a mesh, sampled over its surface, Gaussians, whose centres count, or points, taken as they are.
         truth: the same.
         up: axis that points up in both files, for the alignment's starts.
         points: that are sampled; of a larger cloud so many are drawn.

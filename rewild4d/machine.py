@@ -21,6 +21,7 @@ PACKAGES = (
     "kernels",
     "leaderboard",
     "metrics",
+    "metrics.networks",
     "ours",
     "ours.fused",
     "priors",

@@ -62,8 +62,8 @@ def read_splats(path: Path) -> Splats:
 def read_surface(path: Path, count: int, seed: int) -> Tensor:
     """Points that stand for the surface in a PLY file, float64, [n, 3].
 
-    A mesh is sampled uniformly by area, Gaussians by `sample_gaussians`, both ``count`` points; of a plain cloud all
-    points are taken as they are.
+    A mesh is sampled uniformly by area, ``count`` points; Gaussians stand with their centres (`sample_gaussians`); of a
+    plain cloud all points are taken as they are.
 
     Raises:
         UserError: as `read_mesh` and `read_splats`, or a mesh without area.

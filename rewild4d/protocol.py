@@ -2,22 +2,26 @@
 
 from collections.abc import Iterable, Iterator
 from importlib import resources
-from typing import Literal
+from typing import Any, NamedTuple
 
 import msgspec
 import torch
 from torch import Tensor
 
+from rewild4d import geometry_scores, image_scores, novel_views
 from rewild4d.contracts import Log, Reconstruction, Selection
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import digest
 from rewild4d.harmonics import seen_colors
-from rewild4d.image_scores import Beside, measure, summarize
 from rewild4d.leaderboard.records import Score
+from rewild4d.metrics.samples import Distance
+from rewild4d.novel_views import NovelViews
 from rewild4d.rasterizer import rasterize
-from rewild4d.types import Camera, Frame, Splats, Truth
+from rewild4d.scoring import Networks, load_networks
+from rewild4d.types import Camera, Clip, Frame, Splats, Truth
 
-ScoreName = Literal["psnr", "ssim", "psnr_fg", "iou"]
+SCORES = (*image_scores.NAMES, *geometry_scores.NAMES, *novel_views.NAMES)
+"""Everything that a protocol may ask for."""
 
 
 class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -29,10 +33,12 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         title: for table captions.
         description: one paragraph that travels with the numbers.
         background: grey level in [0, 1] behind prediction and truth alike.
-        scores: what is measured on each held-out image.
+        scores: what is measured: on each held-out image, on the shape, on novel views as a set; out of `SCORES`.
         floors: methods that are always printed beside the others.
         selection: what a method gets and what is held out.
-        default: the data set's protocol where the user names none.
+        default: the data set's protocol where the user names none; the highest version where several say so.
+        points: drawn from each cloud for scores of the shape.
+        novel: how novel views are drawn for scores of sets.
     """
 
     name: str
@@ -40,15 +46,49 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     title: str
     description: str
     background: float
-    scores: tuple[ScoreName, ...]
+    scores: tuple[str, ...]
     floors: tuple[str, ...]
     selection: Selection
     default: bool = False
+    points: int | None = None
+    novel: NovelViews | None = None
+
+    def __post_init__(self) -> None:
+        for name in self.scores:
+            if name not in SCORES:
+                raise ValueError(f"unknown score '{name}'")
+        if self.points is None and any(name in geometry_scores.NAMES for name in self.scores):
+            raise ValueError("scores of the shape need 'points'")
+        if self.novel is None and any(name in novel_views.NAMES for name in self.scores):
+            raise ValueError("scores of novel views need a table 'novel'")
 
     @property
     def digest(self) -> str:
-        """SHA-256 over every setting."""
-        return digest(msgspec.json.encode(self, order="deterministic"))
+        """SHA-256 over every setting; one that is left out, and came later than the protocol, changes nothing."""
+        later = {"points": self.points, "novel": self.novel}
+        given = msgspec.to_builtins(self)
+        for name, value in later.items():
+            if value is None:
+                del given[name]
+        return digest(msgspec.json.encode(given))
+
+
+class Evaluation(NamedTuple):
+    """What was measured.
+
+    Attributes:
+        scores: by name.
+        items: label of each held-out image, as in ``Score.per_item`` of image scores.
+        distances: between sets of images or clips, with all that decides their values.
+        alignments: by which shapes were laid on the truth.
+        networks: SHA-256 of the weights that scores leaned on.
+    """
+
+    scores: dict[str, Score]
+    items: list[str]
+    distances: list[Distance]
+    alignments: list[dict[str, Any]]
+    networks: dict[str, str]
 
 
 def load_protocols() -> dict[str, Protocol]:
@@ -70,7 +110,8 @@ def find_protocol(dataset: str, name: str | None) -> Protocol:
     """
     protocols = load_protocols()
     if name is None:
-        name = next((p.name for p in protocols.values() if p.dataset == dataset and p.default), None)
+        names = [p.name for p in protocols.values() if p.dataset == dataset and p.default]
+        name = max(names, key=lambda text: int(text.rpartition("-v")[2]), default=None)
         if name is None:
             raise UserError(f"--protocol: the data set '{dataset}' has no default; name one of its protocols.")
     if name not in protocols:
@@ -103,23 +144,67 @@ def render(splats: Splats, camera: Camera, device: torch.device | None = None) -
 
 
 def evaluate(
-    reconstruction: Reconstruction, truth: Truth, protocol: Protocol, log: Log
-) -> tuple[dict[str, Score], list[str]]:
-    """Score a reconstruction on all that is held out.
+    reconstruction: Reconstruction, clip: Clip, truth: Truth, protocol: Protocol, log: Log, device: torch.device
+) -> Evaluation:
+    """Score a reconstruction by all that a protocol asks for.
 
-    Returns:
-        The scores by name, and the label of each held-out image.
+    Args:
+        reconstruction: of the clip.
+        clip: what the method saw: the reference of novel views, and the moments at which shapes are compared.
+        truth: what it did not see.
+        protocol: what is measured.
+        log: progress.
+        device: where the metric networks compute.
     """
-    values: dict[str, list[float | None]] = {name: [] for name in protocol.scores}
+    networks = load_networks(_families(protocol.scores), device)
+    scores, items = _score_images(reconstruction, truth, protocol, networks, log)
+    shape = [name for name in protocol.scores if name in geometry_scores.NAMES]
+    found, alignments = geometry_scores.score_geometry(reconstruction, truth, clip.times, shape, protocol.points or 0)
+    scores |= found
+    sets = [name for name in protocol.scores if name in novel_views.NAMES]
+    distances: list[Distance] = []
+    if protocol.novel is not None and sets:
+        distances = novel_views.novel_view_distances(
+            reconstruction, clip, protocol.novel, names=sets, background=protocol.background, render=render,
+            images=networks.images, videos=networks.videos, log=log,
+        )  # fmt: skip
+        scores |= novel_views.as_scores(distances, sets, dict(networks.missing))
+    used = {name: network.digest for name, network in networks.lpips.items()}
+    used |= {distance.extractor: distance.digest for distance in distances}
+    return Evaluation({name: scores[name] for name in protocol.scores}, items, distances, alignments, used)
+
+
+def _families(scores: Iterable[str]) -> list[str]:
+    """The networks that scores need, by the names of `scoring.load_networks`."""
+    found = set()
+    for name in scores:
+        metric = image_scores.split_name(name)[0]
+        if metric.startswith("lpips"):
+            found.add(metric.replace("_", "-"))
+        elif name in novel_views.NAMES:
+            found.add("kid" if name == "kid_v" else "fvd")
+    return sorted(found)
+
+
+def _score_images(
+    reconstruction: Reconstruction, truth: Truth, protocol: Protocol, networks: Networks, log: Log
+) -> tuple[dict[str, Score], list[str]]:
+    """The scores of held-out images, and the label of each image."""
+    names = [name for name in protocol.scores if name in image_scores.NAMES]
+    absent = {name: networks.missing.get(image_scores.split_name(name)[0].replace("_", "-")) for name in names}
+    values: dict[str, list[float | None]] = {name: [] for name in names if not absent[name]}
     labels = []
-    total = len(truth.held_out)
-    for batch in _batches(truth.held_out, 16):
+    total = len(truth.held_out) if names else 0
+    for batch in _batches(truth.held_out if names else (), 16):
         rendered = list(_render_frames(reconstruction, batch))
-        for name, scored in _score_batch(batch, rendered, protocol).items():
-            values[name] += scored
+        shown = _beside(batch, rendered, protocol.background)
+        for name in values:
+            values[name] += image_scores.measure(name, shown, networks.lpips)
         labels += [f"view {frame.view} at {frame.time:.4f} s" for frame in batch]
         log(len(labels), total, {})
-    return {name: summarize(name, items) for name, items in values.items()}, labels
+    scores = {name: image_scores.summarize(name, items) for name, items in values.items()}
+    scores |= {name: image_scores.without_value(name, reason) for name, reason in absent.items() if reason}
+    return scores, labels
 
 
 def _render_frames(reconstruction: Reconstruction, frames: Iterable[Frame]) -> Iterator[tuple[Tensor, Tensor]]:
@@ -140,15 +225,12 @@ def _require_finite(splats: Splats, time: float) -> None:
             raise UserError(f"the reconstruction's {name} at {time:.4f} s hold a NaN or an infinite value.")
 
 
-def _score_batch(
-    frames: list[Frame], rendered: list[tuple[Tensor, Tensor]], protocol: Protocol
-) -> dict[str, list[float | None]]:
-    target = torch.stack([frame.over(protocol.background) for frame in frames])
+def _beside(frames: list[Frame], rendered: list[tuple[Tensor, Tensor]], background: float) -> image_scores.Beside:
+    target = torch.stack([frame.over(background) for frame in frames])
     mask = torch.stack([frame.mask for frame in frames])
     alpha = torch.stack([alpha for _, alpha in rendered])
-    image = (torch.stack([color for color, _ in rendered]) + (1 - alpha) * protocol.background).clamp(0, 1)
-    shown = Beside(image, target, alpha, mask, protocol.background)
-    return {name: measure(name, shown, {}) for name in protocol.scores}
+    image = (torch.stack([color for color, _ in rendered]) + (1 - alpha) * background).clamp(0, 1)
+    return image_scores.Beside(image, target.clamp(0, 1), alpha, mask, background)
 
 
 def _batches(frames: Iterable[Frame], size: int) -> Iterator[list[Frame]]:

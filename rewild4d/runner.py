@@ -215,7 +215,7 @@ class Job:
             reconstruction, fit_seconds = self._fit(case)
             begin = time.perf_counter()
             progress = Progress(f"{self.title}: evaluate")
-            scores, items = evaluate(reconstruction, case.truth, self.plan.protocol, progress)
+            found = evaluate(reconstruction, case.clip, case.truth, self.plan.protocol, progress, self.plan.device)
             progress.close()
             seconds = time.perf_counter() - begin
             pictures = save_pictures(reconstruction, case.clip, case.truth, self.folder)
@@ -224,7 +224,7 @@ class Job:
         except Exception as error:  # a bug or a diverged fit: the record keeps the message, the terminal the traceback
             traceback.print_exc(file=sys.stderr)
             return self.fail(f"{type(error).__name__}: {error}", case)
-        record = self._record(case, "ok", "", scores=scores, items=items, coverage=seen, pictures=pictures,
+        record = self._record(case, "ok", "", **found._asdict(), coverage=seen, pictures=pictures,
                               diagnostics=_diagnostics(reconstruction), marks=_marks(self.entry.method, reconstruction),
                               timing=self._timing(fit_seconds, seconds))  # fmt: skip
         path = write_record(record, self.folder)

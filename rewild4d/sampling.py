@@ -4,7 +4,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rewild4d.transforms import quat_to_matrix
 from rewild4d.types import Splats
 
 OPACITY = 0.1
@@ -39,37 +38,26 @@ def sample_mesh(vertices: Tensor, faces: Tensor, count: int, seed: int) -> Tenso
 
 
 def sample_gaussians(splats: Splats, count: int, seed: int, opacity: float = OPACITY) -> Tensor:
-    """Points that stand for the surface that Gaussians draw.
+    """Points that stand for the surface that Gaussians draw: their centres (METHOD section 8).
 
-    The rule: Gaussians of at least the given opacity count. A point falls on one with a chance proportional to its
-    opacity times its area (product of its two largest scales), and there uniformly into the ellipse of one standard
-    deviation that its two largest axes span. Nothing is left out for being far from the rest: an image shows a floater
-    too. The alignment's trimming deals with them.
+    The rule: Gaussians of at least the given opacity count, each with its centre; of more than ``count`` so many are
+    drawn. Points spread over the ellipses instead would stand one deviation outside wherever Gaussians are round.
+    Nothing is left out for being far from the rest: an image shows a floater too. The alignment's trimming deals with
+    them.
 
     Args:
         splats: the Gaussians of one moment, activated values.
-        count: points to draw.
+        count: most points.
         seed: the same seed draws the same points.
         opacity: the threshold, in [0, 1].
 
     Returns:
-        float64, [count, 3]; [0, 3] where no Gaussian counts.
+        float64, [m, 3], m <= count; [0, 3] where no Gaussian counts.
     """
-    kept = splats.opacities >= opacity
-    means, quats, scales, opacities = (
-        value[kept].detach().cpu().double() for value in (splats.means, splats.quats, splats.scales, splats.opacities)
-    )
-    order = scales.argsort(dim=1, descending=True, stable=True)[:, :2]
-    spans = scales.gather(1, order)
-    ends = np.cumsum((spans.prod(dim=1) * opacities).numpy())
-    if not len(ends) or not 0 < ends[-1] < np.inf:
-        return torch.empty(0, 3, dtype=torch.float64)
-    rng = np.random.default_rng(seed)
-    rows = torch.from_numpy(_draw(ends, count, rng))
-    radius, angle = np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
-    flat = torch.from_numpy(np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=1)) * spans[rows]
-    axes = quat_to_matrix(quats[rows]).gather(2, order[rows][:, None, :].expand(-1, 3, -1))
-    return means[rows] + torch.einsum("nak,nk->na", axes, flat)
+    centers = splats.means[splats.opacities >= opacity].detach().cpu().double()
+    if len(centers) <= count:
+        return centers
+    return centers[torch.from_numpy(np.sort(np.random.default_rng(seed).permutation(len(centers))[:count]))]
 
 
 def _draw(ends: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:

@@ -246,8 +246,8 @@ def test_image_features_read_any_sizes_and_report_progress() -> None:
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (torch.full((3, 4, 4), 255.0), r"expected an image in \[0, 1\], got values from 255.0 to 255.0"),
-        (torch.full((3, 4, 4), math.nan), r"expected an image in \[0, 1\], got values from nan to nan"),
+        (torch.full((3, 4, 4), 255.0), r"expected values in \[0, 1\], got 255 to 255"),
+        (torch.full((3, 4, 4), math.nan), r"expected values in \[0, 1\], got nan to nan"),
         (torch.zeros(4, 4, 3), r"expected a float image of shape \[3, H, W\], got torch.float32 \(4, 4, 3\)"),
         (torch.zeros(3, 4, 4, dtype=torch.uint8), "got torch.uint8"),
     ],

@@ -75,7 +75,13 @@ def test_imports_are_absolute_and_run_one_way() -> None:
             "rewild4d.runner",
         ),
     }
-    allowed = ("rewild4d.metrics", "rewild4d.leaderboard.records", "rewild4d.types")
+    allowed = (
+        "rewild4d.metrics",
+        "rewild4d.leaderboard.records",
+        "rewild4d.types",
+        "rewild4d.errors",
+        "rewild4d.files",
+    )
     for file in sources():
         relative = str(file.relative_to(ROOT))
         for node in ast.walk(ast.parse(file.read_text())):
@@ -107,4 +113,5 @@ def test_the_wheel_carries_code_and_data(tmp_path: Path) -> None:
     assert "rewild4d/leaderboard/tables/ablation.toml" in names
     assert "rewild4d/leaderboard/paper/artemis.json" in names
     assert "rewild4d/baselines/presets/ours.toml" in names
+    assert "rewild4d/metrics/weights.toml" in names
     assert {name.split("/")[0] for name in names if not name.startswith("rewild4d-")} == {"rewild4d"}

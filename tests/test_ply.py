@@ -153,13 +153,12 @@ def test_polygons_are_cut_into_fans(order: str, tmp_path: Path) -> None:
     assert read_mesh(file(tmp_path, header, body))[1].tolist() == [[0, 1, 2], [4, 3, 2], [4, 2, 1]]
 
 
-def test_gaussians_are_sampled_as_a_surface(tmp_path: Path) -> None:
+def test_gaussians_stand_with_their_centres(tmp_path: Path) -> None:
     one = splats(0)
-    one.opacities[:] = torch.tensor((0.05,) * 6 + (1.0,))
+    one.opacities[:] = torch.tensor((0.05,) * 4 + (1.0,) * 3)
     write_splats(tmp_path / "a.ply", one)
-    points = read_surface(tmp_path / "a.ply", 500, 0)
-    reach = float(one.scales[6].max()) + 1e-5
-    assert len(points) == 500 and float((points - one.means[6]).norm(dim=1).max()) <= reach
+    torch.testing.assert_close(read_surface(tmp_path / "a.ply", 500, 0), one.means[4:].double())
+    assert len(read_surface(tmp_path / "a.ply", 2, 0)) == 2
     assert len(read_points(tmp_path / "a.ply")) == 7
 
 
@@ -175,24 +174,60 @@ SPLAT = "".join(f"property float {n}\n" for n in ("f_dc_0", "f_dc_1", "f_dc_2", 
 WHOLE = SPLAT + "".join(f"property float {n}\n" for n in ("scale_2", "rot_0", "rot_1", "rot_2", "rot_3"))
 
 BROKEN = {
-    "cut off": (f"{BINARY}element vertex 3\n{XYZ}", b"\0" * 35, "expected 3 rows of 'vertex', but the file ends before"),
-    "cut off ascii": (f"{ASCII}element vertex 2\n{XYZ}", b"0 1 2 3 4", "expected 2 rows of 'vertex', but the file ends"),
+    "cut off": (
+        f"{BINARY}element vertex 3\n{XYZ}",
+        b"\0" * 35,
+        "expected 3 rows of 'vertex', but the file ends before",
+    ),
+    "cut off ascii": (
+        f"{ASCII}element vertex 2\n{XYZ}",
+        b"0 1 2 3 4",
+        "expected 2 rows of 'vertex', but the file ends",
+    ),
     "too many claimed": (f"{BINARY}element vertex 99999999999999\n{XYZ}", b"\0" * 36, "expected 99999999999999 rows"),
-    "unknown type": (f"{ASCII}element vertex 1\nproperty quad x\n", b"", "a PLY type such as float or uchar, got 'quad'"),
+    "unknown type": (
+        f"{ASCII}element vertex 1\nproperty quad x\n",
+        b"",
+        "a PLY type such as float or uchar, got 'quad'",
+    ),
     "unknown format": (f"format morse 1.0\nelement vertex 1\n{XYZ}", b"", "a PLY 1.0 header, got 'format morse 1.0'"),
     "no format": (f"element vertex 1\n{XYZ}", b"0 0 0", "expected a line 'format' in the PLY header, got none"),
     "bad line": (f"{ASCII}element vertex many\n", b"", "a line of a PLY 1.0 header, got 'element vertex many'"),
-    "twice": (f"{ASCII}element vertex 1\n{XYZ}property int x\n", b"0 0 0 0", "with different names, got one name twice"),
+    "twice": (
+        f"{ASCII}element vertex 1\n{XYZ}property int x\n",
+        b"0 0 0 0",
+        "with different names, got one name twice",
+    ),
     "words": (f"{ASCII}element vertex 1\n{XYZ}", b"0 zero 0", "expected numbers in the body of an ASCII PLY file"),
-    "no z": (f"{ASCII}element vertex 1\nproperty float x\nproperty float y\n", b"0 0", "x, y, z, got none of the name z"),
+    "no z": (
+        f"{ASCII}element vertex 1\nproperty float x\nproperty float y\n",
+        b"0 0",
+        "x, y, z, got none of the name z",
+    ),
     "no vertices": (f"{ASCII}element tree 1\nproperty int x\n", b"0", "expected an element 'vertex', got tree"),
-    "nan": (f"{ASCII}element vertex 2\n{XYZ}", b"0 0 0 0 nan 0", "finite x to z, got a NaN or an infinite value in vertex 1"),
+    "nan": (
+        f"{ASCII}element vertex 2\n{XYZ}",
+        b"0 0 0 0 nan 0",
+        "finite x to z, got a NaN or an infinite value in vertex 1",
+    ),
     "far face": (f"{ASCII}element vertex 1\n{XYZ}{FACE}", b"0 0 0 3 0 0 7", "faces of vertices 0 to 0, got vertex 7"),
     "faces": (f"{ASCII}element vertex 1\n{XYZ}element face 1\nproperty int a\n", b"0 0 0 1", "a list 'vertex_indices'"),
-    "list length": (f"{ASCII}element vertex 1\n{XYZ}{FACE}", b"0 0 0 -3 0 0 0", "lists of zero or more entries, got one of -3"),
-    "flat": (f"{ASCII}element vertex 1\n{XYZ}{FACE}", b"0 0 0 3 0 0 0", "triangles with an area, got 1 triangles without"),
-    "long list": (f"{BINARY}element vertex 1\n{XYZ}{FACE}", b"\0" * 12 + b"\3\0\0", "expected 1 rows of 'face', but the file ends"),
-}  # fmt: skip
+    "list length": (
+        f"{ASCII}element vertex 1\n{XYZ}{FACE}",
+        b"0 0 0 -3 0 0 0",
+        "lists of zero or more entries, got one of -3",
+    ),
+    "flat": (
+        f"{ASCII}element vertex 1\n{XYZ}{FACE}",
+        b"0 0 0 3 0 0 0",
+        "triangles with an area, got 1 triangles without",
+    ),
+    "long list": (
+        f"{BINARY}element vertex 1\n{XYZ}{FACE}",
+        b"\0" * 12 + b"\3\0\0",
+        "expected 1 rows of 'face', but the file ends",
+    ),
+}
 
 
 @pytest.mark.parametrize("name", BROKEN)

@@ -1,4 +1,4 @@
-"""`score`: folders as people have them. Known errors by arithmetic, every image format, one sentence for bad input."""
+"""`score`: folders as people have them. Known errors by arithmetic, every image format, clips, clouds."""
 
 import json
 import math
@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 import torch
 from extractors import LinearNetwork, LinearVideoNetwork, SquaredError
+from pictures import clips, flat, noise, refused, with_alpha, write
 
 from rewild4d import cli
 from rewild4d.commands import score as command
 from rewild4d.metrics.image import PSNR_CAP
-from rewild4d.scoring import Networks
+from rewild4d.scoring import FAMILIES, Networks, load_networks
 
 FETCH = "weights missing, run: rewild4d-bench weights fetch"
 Call = Callable[..., dict]  # type: ignore[type-arg]
@@ -41,49 +42,6 @@ def score(networks: Networks, capsys: pytest.CaptureFixture[str]) -> Call:
         return json.loads(out)
 
     return call
-
-
-def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    """The one sentence that a refused command leaves on standard error (behind its progress)."""
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["score", *map(str, words)])
-    out, err = capsys.readouterr()
-    assert (stop.value.code, out) == (2, "")
-    assert "Traceback" not in err
-    said = err[err.index("rewild4d-bench: ") :].strip()
-    assert len(said.splitlines()) == 1
-    return said
-
-
-def flat(*color: int, size: tuple[int, int] = (40, 48), dtype: type = np.uint8) -> np.ndarray:
-    """One colour, OpenCV's channel order, [h, w, c]."""
-    return np.full((*size, len(color)), color, dtype=dtype)
-
-
-def noise(seed: int, size: tuple[int, int] = (40, 48)) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)
-
-
-def write(path: Path, image: np.ndarray) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".npy":
-        np.save(path, image)
-    else:
-        assert cv2.imwrite(str(path), image)
-    return path
-
-
-def with_alpha(image: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
-    alpha = np.zeros((*image.shape[:2], 1), dtype=np.uint8)
-    alpha[rows, columns] = 255
-    return np.concatenate((image, alpha), axis=2)
-
-
-def clips(folder: Path, names: str, frames: int, seed: int) -> Path:
-    for i, name in enumerate(names):
-        for frame in range(frames):
-            write(folder / name / f"{frame}.png", noise(1000 * seed + 100 * i + frame, (16, 16)))
-    return folder
 
 
 def test_a_known_error(score: Call, tmp_path: Path) -> None:
@@ -303,99 +261,6 @@ def test_table_and_file(networks: Networks, capsys: pytest.CaptureFixture[str], 
     assert record["code"]["version"] and record["seconds"] > 0
 
 
-def damaged(image: np.ndarray) -> bytes:
-    return cv2.imencode(".png", image)[1].tobytes()[:-20]
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "sentence"),
-    [
-        ("a.png", damaged(noise(1)), "a.png: expected a whole image, got a PNG"),
-        ("a.png", b"", "a.png: expected a whole image, got an empty file"),
-        ("a.png", flat(0, 0, 0, size=(40, 47)), "a.png: expected 48x40 pixels like"),
-        ("b.png", noise(1), "expected the 1 names of"),
-        ("a.npy", np.full((40, 48, 3), np.nan), "a.npy: expected values in [0, 1], got a NaN"),
-        ("a.npy", np.full((40, 48, 3), 255.0), "a.npy: expected values in [0, 1], got 255 to 255"),
-        (
-            "a.npy",
-            np.zeros((3, 40, 48)),
-            "a.npy: expected an array [h, w], [h, w, 3] or [h, w, 4], got float64 [3, 40, 48]",
-        ),
-        (
-            "a.npy",
-            np.zeros((40, 48), dtype=np.int64),
-            "a.npy: expected floats in [0, 1] or unsigned integers, got int64",
-        ),
-        ("a.npy", np.array([{"a": 1}], dtype=object), "a.npy: expected a whole .npy array of numbers, but:"),
-        ("a.npy", b"\x93NUMPY", "a.npy: expected a whole .npy array of numbers, but:"),
-        ("a.txt", b"", "expected images (.png, .jpg, .jpeg, .npy), folders of frames or videos"),
-        (None, b"", "got an empty folder"),
-    ],
-)
-def test_bad_predictions_are_one_sentence(
-    networks: Networks, capsys: pytest.CaptureFixture[str], tmp_path: Path,
-    name: str | None, content: bytes | np.ndarray, sentence: str,
-) -> None:  # fmt: skip
-    write(tmp_path / "t" / "a.png", noise(0))
-    (tmp_path / "p").mkdir()
-    if isinstance(content, np.ndarray):
-        write(tmp_path / "p" / str(name), content)
-    elif name:
-        (tmp_path / "p" / name).write_bytes(content)
-    out = tmp_path / "out.json"
-    words = ["--pred", tmp_path / "p", "--truth", tmp_path / "t", "--out", out]
-    if name == "b.png":  # a shared name, and one that is not
-        write(tmp_path / "p" / "a.png", noise(1))
-    assert sentence in refused(capsys, *words)
-    assert not out.exists()
-
-
-@pytest.mark.parametrize(
-    ("mask", "sentence"),
-    [
-        (flat(1)[..., 0], "expected a mask that is white (255, or 1.0) inside, got no value above 1 of 255"),
-        (flat(0, 0, 128), "got no value above 38.3 of 255"),  # DAVIS's first palette colour
-        (flat(255, size=(40, 40))[..., 0], "a.png: expected 48x40 pixels like"),
-    ],
-)
-def test_bad_masks_are_one_sentence(
-    networks: Networks, capsys: pytest.CaptureFixture[str], tmp_path: Path, mask: np.ndarray, sentence: str
-) -> None:
-    write(tmp_path / "t" / "a.png", noise(0))
-    write(tmp_path / "m" / "a.png", mask)
-    words = ["--pred", tmp_path / "t", "--truth", tmp_path / "t"]
-    assert sentence in refused(capsys, *words, "--masks", tmp_path / "m")
-    assert sentence in refused(capsys, *words, "--pred-masks", tmp_path / "m")
-
-
-def test_folders_that_do_not_fit_are_one_sentence(
-    networks: Networks, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    images, two = write(tmp_path / "t" / "a.png", noise(0)).parent, clips(tmp_path / "c", "ab", 2, 0)
-    write(tmp_path / "mixed" / "a.png", noise(0))
-    clips(tmp_path / "mixed", "ab", 2, 0)
-    write(tmp_path / "twice" / "a.png", noise(0))
-    write(tmp_path / "twice" / "a.jpg", noise(0))
-    (tmp_path / "hollow" / "a").mkdir(parents=True)
-    video = tmp_path / "v.mp4"
-    video.write_bytes(b"nothing")
-    for words, sentence in (
-        ([tmp_path / "none", images], "none: expected a folder of images or clips, but: No such file or directory"),
-        ([images, two], "expected clips like"),
-        ([tmp_path / "mixed", images], "expected either images or clips, got a.png beside a"),
-        ([tmp_path / "twice", images], "expected one image of that name, but there is a.jpg too"),
-        ([tmp_path / "hollow", two], "expected a clip's frames (.png, .jpg, .jpeg, .npy), got none"),
-        ([video, two], "v.mp4: expected a video that ffmpeg can read, got a damaged or another file"),
-        ([tmp_path / "a.ply", images], "score: expected two .ply files or none"),
-        ([images, images, "--only", "psn"], "unknown score 'psn'. Did you mean 'psnr'?"),
-        ([images, images, "--background", "2"], "--background: expected a grey level from 0 to 1, got 2"),
-        ([images, images, "--fps", "0"], "--fps: expected a number above 0, got 0"),
-        ([images, images, "--device", "tpu"], "--device: expected auto, cpu or cuda, got 'tpu'"),
-        ([images, images, "--out", video / "x.json"], "expected a folder that can be written"),
-    ):
-        assert sentence in refused(capsys, "--pred", words[0], "--truth", words[1], *words[2:])
-
-
 def ascii_ply(path: Path, points: torch.Tensor) -> Path:
     lines = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *(f"property float {axis}" for axis in "xyz")]
     rows = [" ".join(f"{value:.9g}" for value in row) for row in points.tolist()]
@@ -420,3 +285,34 @@ def test_clouds_are_aligned_and_measured(score: Call, tmp_path: Path, capsys: py
     assert "--points: expected a number of at least 1, got 0" in refused(
         capsys, "--pred", truth, "--truth", truth, "--points", "0"
     )
+
+
+def test_the_real_networks_without_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in ("REWILD4D_WEIGHTS", "REWILD4D_CACHE", "TORCH_HOME"):
+        monkeypatch.setenv(name, str(tmp_path / name))
+    found = load_networks(FAMILIES, torch.device("cpu"))
+    assert found.missing == dict.fromkeys(("lpips-alex", "lpips-vgg", "kid", "fvd"), FETCH)
+    assert load_networks(("psnr", "ssim", "silhouette"), torch.device("cpu")).missing == {}
+
+
+def test_the_real_networks(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Plain names, the weights' digests, zero for equal clips; values are checked where the networks are."""
+    missing = load_networks(FAMILIES, torch.device("cpu")).missing
+    if missing:
+        pytest.skip(f"no weights here: {FETCH}")
+    folder = clips(tmp_path / "p", "ab", 9, 0)
+    for clip in folder.iterdir():
+        for file in clip.iterdir():
+            write(file, cv2.resize(cv2.imread(str(file)), (48, 40)))
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["score", "--pred", str(folder), "--truth", str(folder), "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert stop.value.code == 0
+    distances = {d["name"]: d for d in found["distances"]}
+    assert list(distances) == ["KID", "KID-u", "FVD", "KVD", "KVD-u", "I3D-dist (paired, N=1)"]
+    assert distances["KID-u"]["value"] == distances["KVD-u"]["value"] == 0.0
+    assert distances["FVD"]["value"] == pytest.approx(0, abs=1e-6)
+    assert distances["KID"]["value"] < 0, "the paired trap"
+    assert found["scores"]["lpips_alex"]["value"] == found["scores"]["lpips_vgg"]["value"] == 0.0
+    assert found["networks"].keys() == {"lpips_alex", "lpips_vgg", "inception-fid", "i3d-k400"}
+    assert all(len(digest) == 64 for digest in found["networks"].values())

@@ -18,12 +18,12 @@ def resize_images(images: Tensor, size: int, how: str) -> Tensor:
     "bilinear-antialias" is that of torchmetrics 1.9.
 
     Args:
-        images: of any range, [B, C, H, W].
+        images: floats of any range, [B, C, H, W].
         size: in pixels.
         how: one of `IMAGE_RESIZES`.
 
     Returns:
-        Float32; bicubic may overshoot the input's range, [B, C, size, size].
+        Bicubic may overshoot the input's range, [B, C, size, size].
     """
     if images.shape[2:] == (size, size):
         return images
@@ -36,7 +36,7 @@ def resize_images(images: Tensor, size: int, how: str) -> Tensor:
 def _bilinear_tf1(images: Tensor, size: int) -> Tensor:
     """Along the last axis: output i reads position i * length / size."""
     length = images.shape[-1]
-    position = torch.arange(size, dtype=torch.float32, device=images.device) * (length / size)
+    position = torch.arange(size, dtype=images.dtype, device=images.device) * (length / size)
     low = position.long().clamp_max(length - 1)
     high = (low + 1).clamp_max(length - 1)
     return torch.lerp(images[..., low], images[..., high], position - low)

@@ -70,12 +70,12 @@ def score_again(folder: Path, options: Options) -> RunRecord:
     reconstruction = load_method(record.method).load(saved, device)
     set_default(rasterizer)
     progress = Progress(f"{record.case}: evaluate")
-    scores, items = evaluate(reconstruction, truth, protocol, progress)
+    found = evaluate(reconstruction, clip, truth, protocol, progress, device)
     progress.close()
     pictures = save_pictures(reconstruction, clip, truth, folder)
     settings = {"digest": protocol.digest, **msgspec.to_builtins(protocol)}
     renewed = msgspec.structs.replace(
-        record, status="ok", error="", scores=scores, items=items, pictures=pictures, protocol=settings,
+        record, status="ok", error="", **found._asdict(), pictures=pictures, protocol=settings,
         code=code_version(), machine=machine(device, rasterizer),
     )  # fmt: skip
     return read_record(write_record(renewed, folder))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from rewild4d.config import parse_flags, preset_names
 from rewild4d.leaderboard.specs import load_specs
-from rewild4d.protocol import load_protocols
+from rewild4d.protocol import find_protocol, load_protocols
 from rewild4d.registry import BUILTIN, load_dataset, load_method, names
 
 
@@ -28,7 +28,8 @@ def main(arguments: list[str]) -> int:
         print(f"  {name:<12} {(load_dataset(name).__doc__ or '').strip().splitlines()[0].rstrip('.')}{made}")
     print("protocols")
     for name, protocol in load_protocols().items():
-        print(f"  {name:<24} {protocol.title}" + (" (default)" if protocol.default else ""))
+        chosen = protocol.default and find_protocol(protocol.dataset, None).name == name
+        print(f"  {name:<24} {protocol.title}" + (" (default)" if chosen else ""))
     print("tables")
     for name, spec in load_specs().items():
         print(f"  {name:<24} {spec.title}")

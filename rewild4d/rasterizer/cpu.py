@@ -239,7 +239,7 @@ class _Blend(torch.autograd.Function):
         height: int,
     ) -> tuple[Tensor, Tensor]:
         views, channels = radii.shape[0], features.shape[1]
-        lists = _bin(*(tensor.numpy() for tensor in (records, radii, depths, tiles, slots)), width, height)
+        lists = _bin(records.numpy(), radii.numpy(), depths.numpy(), tiles.numpy(), slots.numpy(), width, height)
         image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
         call = (
             np.zeros(1, np.int64), *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.pair_bits,

@@ -147,7 +147,7 @@ def _number_slots(view: int, begin: int, end: int, count: int, tiles: np.ndarray
         slots[view * (count + 1) + n] = number
         place = 4 * (view * count + n)
         wide, high = tiles[place + 1] - tiles[place], tiles[place + 3] - tiles[place + 2]
-        number += np.int64(wide * high)
+        number += int(wide * high)
     return number
 
 

@@ -1,0 +1,190 @@
+"""Novel views without truth: sixteen cameras around the animal, compared as a set with the frames of the input video.
+
+KID-V looks at single images; FVD-F and FVD-Diag, with their kernel companions KVD, at clips (METRICS, sections 4 and
+5). None of them needs a true view, so they score any reconstruction; all of them need many samples, so every result
+carries how many there were.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+
+import msgspec
+import torch
+from torch import Tensor
+
+from rewild4d.contracts import Log, Reconstruction
+from rewild4d.errors import UserError
+from rewild4d.leaderboard.records import Score
+from rewild4d.metrics.distribution import VIEWS, kid_v
+from rewild4d.metrics.samples import Conditions, Distance, ImageExtractor, Images
+from rewild4d.metrics.video import VideoExtractor, clip_distances, diagonal_clips, frame_clips
+from rewild4d.orbit import orbit_cameras
+from rewild4d.types import Camera, Clip, Frame, Splats
+
+NAMES = ("kid_v", "fvd_f", "kvd_f", "fvd_diag", "kvd_diag")
+TITLES = {"KID-V": "kid_v", "FVD-F": "fvd_f", "KVD-F": "kvd_f", "FVD-Diag": "fvd_diag", "KVD-Diag": "kvd_diag"}
+"""What a distance calls itself -> its name among the scores."""
+
+
+class NovelViews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How novel views are drawn and compared; a protocol holds one.
+
+    Attributes:
+        frames: moments, evenly spaced over the clip, that KID-V sees from every view.
+        clip: frames T of a clip that FVD sees; a shorter video is padded with its last frame.
+        stride: frames from the start of one clip to that of the next.
+    """
+
+    frames: int = 8
+    clip: int = 16
+    stride: int = 8
+
+
+Render = Callable[[Splats, Camera], tuple[Tensor, Tensor]]
+"""Gaussians and a camera -> colour premultiplied by alpha [3, h, w] and alpha [1, h, w]."""
+
+
+def novel_view_distances(
+    reconstruction: Reconstruction,
+    clip: Clip,
+    settings: NovelViews,
+    *,
+    names: Sequence[str],
+    background: float,
+    render: Render,
+    images: ImageExtractor | None,
+    videos: VideoExtractor | None,
+    log: Log,
+) -> list[Distance]:
+    """Compare sixteen novel views with the input video.
+
+    The orbit's middle is the median Gaussian over the clip, its radius and elevation are the medians of the input
+    cameras', its first view stands where the first input camera does, and it has that camera's intrinsics and size.
+
+    Args:
+        reconstruction: what is scored.
+        clip: the input video, the reference: masked, on the same background, at its own size.
+        settings: of the protocol.
+        names: out of `NAMES`.
+        background: grey level in [0, 1] behind both sets.
+        render: draws one view.
+        images: network of KID-V; None leaves it out.
+        videos: network of FVD and KVD; None leaves them out.
+        log: progress.
+
+    Raises:
+        UserError: the clip has no camera.
+    """
+    orbit = _Orbit(reconstruction, clip, background, render)
+    reference = [frame.over(background).clamp(0, 1) for frame in clip.frames]
+    conditions = Conditions(f"grey {background:g}", "full frame", clip.fps)
+    found: list[Distance] = []
+
+    def progress(done: int, total: int) -> None:
+        log(done, total, {})
+
+    if "kid_v" in names and images is not None:
+        chosen = _spread(len(clip.frames), settings.frames)
+        shown = _Lazy(len(chosen) * VIEWS, lambda i: orbit.image(i % VIEWS, chosen[i // VIEWS]))
+        found.append(kid_v([shown], [reference], images, conditions=conditions))
+    windows = _windows(len(clip.frames), settings)
+    for suffix, cut in (("-F", frame_clips), ("-Diag", diagonal_clips)):
+        if videos is None or not any(name.endswith(suffix.lower().replace("-", "_")) for name in names):
+            continue
+        clips = [part for window in windows for part in cut(orbit.matrix(window))]
+        truths = [[reference[i] for i in window] for window in windows]
+        found += clip_distances(
+            [clips], [truths], videos, paired=False, suffix=suffix, conditions=conditions, progress=progress
+        )
+    return [distance for distance in found if TITLES.get(distance.name.split(" [")[0]) in names]
+
+
+def as_scores(distances: Sequence[Distance], names: Sequence[str], missing: dict[str, str]) -> dict[str, Score]:
+    """The distances as scores of a record; those that are missing say why, by family ("kid", "fvd")."""
+    by_name = {TITLES[distance.name.split(" [")[0]]: distance for distance in distances}
+    scores = {}
+    for name in names:
+        distance = by_name.get(name)
+        if distance is None:
+            family = "kid" if name == "kid_v" else "fvd"
+            scores[name] = Score(None, "1", "lower", 0, [], f"not computed: {missing.get(family, 'no network')}")
+            continue
+        frames = f", T = {distance.frames}" if distance.frames else ""
+        note = f"n = {distance.n}, m = {distance.m}{frames}" + (f"; {distance.note}" if distance.note else "")
+        if distance.value is None:
+            note = distance.note
+        scores[name] = Score(distance.value, "1", "lower", distance.n, [], note)
+    return scores
+
+
+class _Orbit:
+    """Renders of the closed circle of cameras; the Gaussians of the last few moments are kept."""
+
+    def __init__(self, reconstruction: Reconstruction, clip: Clip, background: float, render: Render) -> None:
+        self.times, self.background, self.render = clip.times, background, render
+        self.at = lru_cache(maxsize=24)(reconstruction.at)
+        self.cameras = _cameras(clip.frames, self._middle())
+
+    def _middle(self) -> Tensor:
+        """Median over all Gaussians of some moments, [3]; the origin where there are none."""
+        means = torch.cat([self.at(self.times[i]).means.double().cpu() for i in _spread(len(self.times), 8)])
+        return means.median(0).values if len(means) else torch.zeros(3, dtype=torch.float64)
+
+    def image(self, view: int, frame: int) -> Tensor:
+        """One render on the background, [3, h, w]."""
+        color, alpha = self.render(self.at(self.times[frame]), self.cameras[view])
+        return (color + (1 - alpha) * self.background).clamp(0, 1)
+
+    def matrix(self, window: Sequence[int]) -> "list[Images]":
+        """The image matrix M[v][f] of a window of frames, rendered when read."""
+
+        def row(view: int) -> Images:
+            return _Lazy(len(window), lambda i: self.image(view, window[i]))
+
+        return [row(view) for view in range(VIEWS)]
+
+
+class _Lazy:
+    """A sequence of images made when asked for."""
+
+    def __init__(self, count: int, make: Callable[[int], Tensor]) -> None:
+        self.count, self.make = count, make
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int, /) -> Tensor:
+        if not 0 <= index < self.count:
+            raise IndexError(index)
+        return self.make(index)
+
+
+def _cameras(frames: Sequence[Frame], middle: Tensor) -> list[Camera]:
+    """The sixteen views of a clip."""
+    known = [frame.camera for frame in frames if frame.camera is not None]
+    if not known:
+        raise UserError("novel views need a camera of the input video, but the clip has none.")
+    up = torch.nn.functional.normalize(-torch.stack([c.world_to_camera[1, :3] for c in known]).mean(0), dim=0)
+    offsets = torch.stack([camera.center - middle for camera in known])
+    radii = offsets.norm(dim=1)
+    elevations = torch.asin((offsets @ up / radii.clamp_min(1e-9)).clamp(-1, 1))
+    limit = math.radians(80)  # straight above there is no azimuth
+    elevation = min(max(float(elevations.median()), -limit), limit)
+    first = known[0]
+    return orbit_cameras(
+        middle, float(radii.median()), elevation, intrinsics=first.intrinsics, width=first.width, height=first.height,
+        up=up, ahead=offsets[0], views=VIEWS,
+    )  # fmt: skip
+
+
+def _windows(frames: int, settings: NovelViews) -> list[list[int]]:
+    """Frames of each clip: windows of equal length, the last one ending with the video; a short video is padded."""
+    starts = list(range(0, max(0, frames - settings.clip) + 1, settings.stride))
+    if starts[-1] + settings.clip < frames:
+        starts.append(frames - settings.clip)
+    return [[min(start + i, frames - 1) for i in range(settings.clip)] for start in starts]
+
+
+def _spread(count: int, most: int) -> list[int]:
+    return list(range(count)) if count <= most else [i * count // most for i in range(most)]
