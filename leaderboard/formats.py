@@ -58,7 +58,7 @@ def html(table: Table) -> str:
     head = [*(f"<th>{_text(stub)}</th>" for stub in table.stubs), *map(_html_head, table.columns)]
     lines = [
         f'<table id="{_text(table.name)}">',
-        f"<caption>{_text(table.title)}. {_text(table.caption)}</caption>",
+        f"<caption><span>{_text(table.title)}. {_text(table.caption)}</span></caption>",
         "<thead>",
     ]
     if any(group for group, _ in groups):

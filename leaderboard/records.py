@@ -125,8 +125,17 @@ def read_record(path: Path) -> RunRecord:
     return record
 
 
-def read_records(folder: Path) -> list[RunRecord]:
-    """All records below a folder, sorted by path."""
+def find_records(folder: Path) -> list[tuple[Path, RunRecord]]:
+    """All records below a folder, sorted by path, each with the folder that holds it.
+
+    Raises:
+        UserError: no such folder, or a record that cannot be read.
+    """
     if not folder.is_dir():
         raise UserError(f"{folder}: expected a folder of runs, but there is no such folder.")
-    return [read_record(path) for path in sorted(folder.rglob(FILE))]
+    return [(path.parent, read_record(path)) for path in sorted(folder.rglob(FILE))]
+
+
+def read_records(folder: Path) -> list[RunRecord]:
+    """All records below a folder, sorted by path; see `find_records`."""
+    return [record for _, record in find_records(folder)]

@@ -171,6 +171,11 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
     )
 
 
+def columns_of(records: Sequence[RunRecord]) -> tuple[Column, ...]:
+    """The columns of a protocol's scores."""
+    return _columns(_frame(records, ()), records)
+
+
 def _frame(records: Sequence[RunRecord], remarks: Sequence[str]) -> Frame:
     protocol = records[0].protocol
     caption = f"`{protocol['name']}`; {coverage_text(records)}"
