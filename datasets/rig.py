@@ -161,7 +161,7 @@ def _skinned_surfaces(document: Document, skeleton: _Skeleton, node: int) -> lis
             indices, weights = _influences(document, primitive)
             if indices.max(initial=0) >= len(bones):
                 raise document.error(f"expected joint indices below {len(bones)}, but one is {indices.max()}")
-            surfaces.append(_surface(document, primitive, to_world, bones[indices], weights))
+            surfaces.append(read_surface(document, primitive, to_world, bones[indices], weights))
     return surfaces
 
 
@@ -183,7 +183,7 @@ def _attached_surfaces(document: Document, skeleton: _Skeleton, node: int) -> li
         if primitive.mode in (None, TRIANGLES, STRIP, FAN):
             count = document.tree.accessors[primitive.attributes.POSITION].count
             indices, weights = np.full((count, 1), bone), np.ones((count, 1))
-            surfaces.append(_surface(document, primitive, to_world, indices, weights))
+            surfaces.append(read_surface(document, primitive, to_world, indices, weights))
     return surfaces
 
 
@@ -201,9 +201,10 @@ def _influences(document: Document, primitive: pygltflib.Primitive) -> tuple[NDA
     return np.where(shares > 0, joints, joints[:, :1]), shares / np.where(total <= 0, 1.0, total)
 
 
-def _surface(
+def read_surface(
     document: Document, primitive: pygltflib.Primitive, to_world: Floats, indices: NDArray[np.int64], weights: Floats
 ) -> Surface:
+    """One primitive with its colours, vertices moved by ``to_world`` and bound as given."""
     positions = document.floats(primitive.attributes.POSITION)
     material = document.tree.materials[primitive.material] if primitive.material is not None else None
     pbr = material.pbrMetallicRoughness if material else None

@@ -13,6 +13,7 @@ METHODS = {
     "ours": "rewild4d.ours.method:Ours",
     "prior-only": "rewild4d.baselines.prior_only:PriorOnly",
     "empty": "rewild4d.baselines.empty:Empty",
+    "external": "rewild4d.baselines.external:External",
 }
 DATASETS = {"artemis": "rewild4d.datasets.artemis:Artemis"}
 BUILTIN = {"artemis": "rewild4d.datasets.synthetic:ensure"}

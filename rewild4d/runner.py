@@ -133,6 +133,7 @@ def execute(plan: Plan) -> list[RunRecord]:
 
 def pieces(plan: Plan) -> list["Job"]:
     """All that the plan lists, in its order, finished or not; nothing is run."""
+    plan = replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device))
     return [job for name in plan.cases for job in _jobs(plan, name, *plan.reader.load(name, plan.protocol.selection))]
 
 
@@ -198,7 +199,7 @@ class Job:
         self.run_id = make_run_id(
             method=entry.method, config=entry.config, clip=clip.digest, truth=truth.digest, prior=prior_id,
             protocol=plan.protocol.digest, seed=seed, code=code_version(), device=plan.device.type,
-            rasterizer=plan.rasterizer,
+            rasterizer=plan.rasterizer, **_inputs(entry, clip.name),
         )  # fmt: skip
         self.folder = folder / f"{entry.method}-{entry.preset}-seed{seed}-{self.run_id[:8]}"
         self.title = f"{clip.name}: {entry.method}"
@@ -300,6 +301,12 @@ def _describe(prior: Prior | None) -> dict[str, Any]:
 def _diagnostics(reconstruction: Reconstruction) -> dict[str, Any]:
     describe = getattr(reconstruction, "diagnostics", None)
     return describe() if describe else {}
+
+
+def _inputs(entry: Entry, case: str) -> dict[str, str]:
+    """What decides a result beside the settings: files that a method reads, if it says so."""
+    asked = getattr(load_method(entry.method), "inputs", None)
+    return {"inputs": asked(entry.config, case)} if asked else {}
 
 
 def _marks(method: str, reconstruction: Reconstruction) -> list[str]:

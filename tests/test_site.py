@@ -58,9 +58,11 @@ def runs(tmp_path: Path) -> Path:
     """Three runs: one with pictures and curves, one that failed, one of a method with an odd name."""
     items = [f"view {view} at {time:.4f} s" for time in (0.0, 0.5) for view in (1, 2)]
     scores = {"psnr": Score(20.0, "dB", "higher", 4, [10.0, 20.0, 20.0, 30.0])}
-    whole = record(run_id="a" * 16, scores=scores, items=items,
-                   pictures=["orbit.mp4", "comparison.png", "canonical.png"], config={"loss": {"ssim": 0.2}}, data={"clip": "c1", "licence": "CC0 1.0"},
-                   machine={"processor": "abacus"}, diagnostics={"joint_angle_mean": [1.5, 2.5]})  # fmt: skip
+    whole = record(
+        run_id="a" * 16, scores=scores, items=items, pictures=["orbit.mp4", "comparison.png", "canonical.png"],
+        config={"loss": {"ssim": 0.2}}, data={"clip": "c1", "licence": "CC0 1.0"}, machine={"processor": "abacus"},
+        diagnostics={"joint_angle_mean": [1.5, 2.5]},
+    )  # fmt: skip
     keep(tmp_path / "runs" / "a", whole, "comparison.png", "orbit.mp4")
     failed = record(run_id="b" * 16, method="gart", status="failed", error=f"it diverged {NASTY}", scores={})
     keep(tmp_path / "runs" / "b", failed)

@@ -1,0 +1,255 @@
+"""Anybody's program as a competitor: it gets the clip as files and leaves Gaussians or meshes as files.
+
+`--command "conda run -n theirs python run.py {clip} {out}"` runs a program; `--folder results/{case}` takes what one
+left before. `external_folder.README` says what the two folders hold, `--profile` names other layouts.
+
+A result that does not stand where the input cameras see it is rotated, scaled and shifted to the best input-view PSNR,
+as the paper does for such methods. It has then been shown the answer, so it carries the mark "upper bound" in its
+record and in every table, and no rank.
+"""
+
+import json
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import msgspec
+import torch
+from torch import Tensor
+
+from rewild4d.baselines.external_alignment import Placement, place_by_search, place_fauna
+from rewild4d.baselines.external_folder import crop_box, find_outputs, run_program, write_clip
+from rewild4d.baselines.external_profiles import PROFILES, Profile
+from rewild4d.baselines.external_reading import Moment, moved, moved_discs, painted, read_moments
+from rewild4d.contracts import Log, MethodInfo
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.files import atomic, digest, write_text
+from rewild4d.meshes import Discs
+from rewild4d.priors.motion import pose_at
+from rewild4d.transforms import skin_points, split_similarity
+from rewild4d.types import Camera, Clip, Frame, Prior, Splats
+
+STATE = "external.pt"
+DONE = "done.json"
+Shots = list[tuple[Frame, Camera]]
+
+
+class ExternalConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Whose program, and how its files are read."""
+
+    program: str = ""
+    """Its name, for tables; the profile's where it is left out."""
+    profile: str = "frames"
+    """Layout of its files: frames, glb, gvfdiffusion, dreammesh4d or 3d-fauna."""
+    command: str = ""
+    """Words that start it; {clip} and {out} stand for the two folders, {case} and {seed} for what they say."""
+    folder: str = ""
+    """Where its results are already, instead of a command; {case} stands for <animal>__<motion>."""
+    placed: Literal["profile", "yes", "no"] = "profile"
+    """Whether results stand in the world of the cameras; "no" rotates them to the best input-view PSNR."""
+    up: Literal["profile", "y", "-y", "z"] = "profile"
+    """Axis of its results that points up, where they are rotated."""
+    points: int = 20_000
+    """Gaussians on a mesh."""
+    timeout: float = 6 * 3600.0
+    """Seconds that the program may take."""
+
+
+@dataclass(frozen=True)
+class ExternalReconstruction:
+    """Somebody's moments, in the world.
+
+    Attributes:
+        times: of the moments in seconds, ascending.
+        moments: Gaussians of each.
+        cameras: input camera by time.
+        marks: what tables say beside the numbers.
+        notes: figures for the record.
+    """
+
+    times: tuple[float, ...]
+    moments: tuple[Splats, ...]
+    cameras: dict[float, Camera | None]
+    marks: tuple[str, ...]
+    notes: dict[str, Any]
+
+    def at(self, time: float) -> Splats:
+        """The moment nearest to a time: nothing is known of what lies between."""
+        return self.moments[min(range(len(self.times)), key=lambda i: abs(self.times[i] - time))]
+
+    def camera(self, time: float) -> Camera | None:
+        return self.cameras.get(time)
+
+    def diagnostics(self) -> dict[str, Any]:
+        """How it was placed, and how many Gaussians there are."""
+        return {**self.notes, "gaussians": sum(map(len, self.moments)) / len(self.moments)}
+
+    def save(self, folder: Path) -> None:
+        cameras = {t: c and (c.world_to_camera, c.intrinsics, c.width, c.height) for t, c in self.cameras.items()}
+        moments = [(m.means, m.quats, m.scales, m.opacities, m.colors) for m in self.moments]
+        state = {"times": self.times, "moments": moments, "cameras": cameras, "marks": self.marks, "notes": self.notes}
+        with atomic(folder / STATE) as path:
+            torch.save(state, path)
+
+
+class External:
+    """A program of others (contracts.Method)."""
+
+    info: ClassVar[MethodInfo] = MethodInfo(
+        title="anybody's program, by files", paper="that of the program", licence="that of the program"
+    )
+    Config: ClassVar[type[ExternalConfig]] = ExternalConfig
+
+    def inputs(self, config: ExternalConfig, case: str) -> str:
+        """Digest of the files that decide the result beside the settings: those of a folder that is already there."""
+        if not config.folder:
+            return ""
+        folder = _folder(config, case)
+        return digest(*(part for path in sorted(folder.rglob("*")) if path.is_file()
+                        for part in (str(path.relative_to(folder)), path.read_bytes())))  # fmt: skip
+
+    def fit(
+        self, clip: Clip, prior: Prior, *, config: ExternalConfig, seed: int, device: torch.device, log: Log,
+        workdir: Path | None,
+    ) -> ExternalReconstruction:  # fmt: skip
+        """Run the program, or take what it left, and read it; see contracts.Method."""
+        profile = _profile(config)
+        if bool(config.command) == bool(config.folder):
+            raise UserError("external: expected either --command (a program to run) or --folder (its results).")
+        for frame in clip.frames:
+            crop_box(frame.mask)  # an empty mask is said before hours of work
+        if config.folder:
+            return _read(_folder(config, clip.name), clip, prior, profile, config, seed, log)
+        with tempfile.TemporaryDirectory() as spare:
+            work = workdir or Path(spare)
+            _run(work, clip, prior, profile, config, seed)
+            return _read(work / "out", clip, prior, profile, config, seed, log)
+
+    def load(self, folder: Path, device: torch.device) -> ExternalReconstruction:
+        state = torch.load(folder / STATE, weights_only=True)
+        cameras = {time: values and Camera(*values) for time, values in state["cameras"].items()}
+        moments = tuple(Splats(*values) for values in state["moments"])
+        return ExternalReconstruction(state["times"], moments, cameras, tuple(state["marks"]), state["notes"])
+
+
+def _profile(config: ExternalConfig) -> Profile:
+    """The profile with the settings that override it."""
+    if config.profile not in PROFILES:
+        raise unknown_name("profile", config.profile, PROFILES)
+    profile = PROFILES[config.profile]
+    placed = profile.placed if config.placed == "profile" else config.placed == "yes"
+    return msgspec.structs.replace(profile, placed=placed, up=profile.up if config.up == "profile" else config.up)
+
+
+def _folder(config: ExternalConfig, case: str) -> Path:
+    return Path(config.folder.replace("{case}", case.replace("/", "__")))
+
+
+def _run(work: Path, clip: Clip, prior: Prior, profile: Profile, config: ExternalConfig, seed: int) -> None:
+    """Run the program, unless it has already run in this folder on the same input to its end."""
+    identity = digest(msgspec.json.encode(config), clip.digest, prior.digest, str(seed))
+    done = work / DONE
+    if done.is_file() and json.loads(done.read_text()) == identity:
+        return
+    for name in ("clip", "out"):
+        shutil.rmtree(work / name, ignore_errors=True)
+    write_clip(work / "clip", clip, prior, profile.crops)
+    run_program(
+        config.command, clip=work / "clip", out=work / "out", case=clip.name.replace("/", "__"), seed=seed,
+        timeout=config.timeout, log=work / "program.log",
+    )  # fmt: skip
+    write_text(done, json.dumps(identity) + "\n")
+
+
+def _read(
+    folder: Path, clip: Clip, prior: Prior, profile: Profile, config: ExternalConfig, seed: int, log: Log
+) -> ExternalReconstruction:
+    """Files to Gaussians in the world."""
+    paths = find_outputs(folder, profile, len(clip.frames))
+    moments = read_moments(paths, len(clip.frames), config.points, seed)
+    times = _times(clip, len(moments), profile.spread)
+    shots = [(frame, _camera(frame, prior)) for frame in clip.frames]
+    nearest = [min(range(len(shots)), key=lambda i: abs(clip.frames[i].time - time)) for time in times]
+    placed: Sequence[Moment] = moments
+    marks: tuple[str, ...] = ()
+    notes: dict[str, Any] = {"program": config.program or profile.title, "files": len(paths)}
+    if profile.crops:
+        placed = [_placed_by_fauna(*pair, prior) for pair in zip(paths, moments, shots, strict=True)]
+    elif not profile.placed:
+        found = _search(moments, times, clip, prior, shots, profile, log)
+        placed = [_moved(moment, found.matrix) for moment in moments]
+        marks = ("upper bound: rotated, scaled and shifted to the best input-view PSNR",)
+        notes |= {"placed_azimuth": found.azimuth, "placed_elevation": found.elevation, "placed_scale": found.scale,
+                  "placed_psnr": found.psnr}  # fmt: skip
+    splats = _colored(placed, [shots[index] for index in nearest])
+    cameras = {frame.time: camera for frame, camera in shots}
+    return ExternalReconstruction(tuple(times), tuple(splats), dict(cameras), marks, notes)
+
+
+def _times(clip: Clip, count: int, spread: bool) -> list[float]:
+    """Seconds of each moment: those of the frames, or spread so that as many moments as frames fall on the frames."""
+    if not spread:
+        return list(clip.times)
+    first, last, frames = clip.times[0], clip.times[-1], len(clip.times)
+    step = (last - first) / max(1, frames - 1)
+    return [first + step * ((index + 1) / (count + 1) * (frames + 1) - 1) for index in range(count)]
+
+
+def _search(
+    moments: Sequence[Moment],
+    times: Sequence[float],
+    clip: Clip,
+    prior: Prior,
+    shots: Shots,
+    profile: Profile,
+    log: Log,
+) -> Placement:
+    """Rotate to the best input-view PSNR; a mesh without colour is compared in the animal's mean colour."""
+    mean = sum(frame.rgb.sum((1, 2)) for frame in clip.frames) / sum(frame.mask.sum() for frame in clip.frames)
+    plain = [m.splats(torch.as_tensor(mean).expand(len(m.points), 3) if m.colors is None else m.colors)
+             if isinstance(m, Discs) else m for m in moments]  # fmt: skip
+    at = [plain[min(range(len(times)), key=lambda i: abs(times[i] - frame.time))] for frame in clip.frames]
+    return place_by_search(at, shots, _depth(prior, *shots[0]), profile.up, profile.elevation, log)
+
+
+def _placed_by_fauna(path: Path, moment: Moment, shot: tuple[Frame, Camera], prior: Prior) -> Moment:
+    frame, camera = shot
+    pose = path.with_name(path.name.removesuffix("_mesh.obj") + "_pose.txt")
+    return _moved(moment, place_fauna(pose, crop_box(frame.mask), camera, _depth(prior, frame, camera)))
+
+
+def _moved(moment: Moment, matrix: Tensor) -> Moment:
+    return moved_discs(moment, matrix) if isinstance(moment, Discs) else moved(moment, matrix)
+
+
+def _colored(moments: Sequence[Moment], shots: Shots) -> list[Splats]:
+    """Gaussians of all moments; a mesh without colour is painted from the frames."""
+    bare = [moment for moment in moments if isinstance(moment, Discs) and moment.colors is None]
+    if bare:
+        if len(bare) < len(moments):
+            raise UserError("external: expected meshes that all have colours or all have none, got some of either.")
+        return painted(bare, shots)
+    return [m.splats(m.colors) if isinstance(m, Discs) and m.colors is not None else m for m in moments]  # type: ignore[misc]
+
+
+def _camera(frame: Frame, prior: Prior) -> Camera:
+    """The frame's camera in the world; where nobody knows it, the prior's."""
+    if frame.camera is not None:
+        return frame.camera
+    row = int((prior.times - frame.time).abs().argmin())
+    matrix = prior.object_to_world[row].double()
+    scale = float(split_similarity(matrix)[0])
+    grow = torch.diag(torch.tensor((scale, scale, scale, 1.0), dtype=torch.float64))
+    camera = prior.cameras[row]
+    return replace(camera, world_to_camera=grow @ camera.world_to_camera.double() @ torch.linalg.inv(matrix))
+
+
+def _depth(prior: Prior, frame: Frame, camera: Camera) -> float:
+    """Depth of the prior's middle before a camera."""
+    object_to_world, transforms = pose_at(prior, frame.time)
+    posed = skin_points(prior.vertices, prior.weights, transforms).double()
+    middle = object_to_world[:3, :3] @ posed.median(0).values + object_to_world[:3, 3]
+    return float((camera.world_to_camera.double() @ torch.cat((middle, torch.ones(1).double())))[2])

@@ -1,0 +1,193 @@
+"""The folder contract: what a program of others is given, how it is run, and which of its files are its answer."""
+
+import json
+import math
+import os
+import re
+import shlex
+import signal
+import subprocess
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from rewild4d.baselines.external_profiles import Profile
+from rewild4d.errors import UserError
+from rewild4d.files import write_text
+from rewild4d.priors.io import save_prior
+from rewild4d.types import Clip, Frame, Prior
+
+CROP = 256
+"""Side of the square crops that 3D-Fauna takes, pixels."""
+PAD = 0.15
+"""Added to the animal's box on every side of a crop, as a share of its longer side."""
+README = """What this folder is
+
+frames/0000.png ...   the video, on white          masks/0000.png ...   its mattes (255 = animal)
+rgba/0000.png ...     both in one file             prior.npz            the template that every method starts from
+clip.json             name, fps, size, and for each frame its time in seconds, its files and its camera
+                      (OpenCV axes, world_to_camera 4x4, intrinsics 3x3 with pixel centres at +0.5; null: not known)
+
+What to write into the output folder: frame_0000.ply ... , one for each frame: 3D Gaussians in the layout of 3DGS, or
+meshes (.ply, .obj, coloured or not), in the world of the cameras; or a single animated .glb (`--profile glb`).
+"""
+
+
+def write_clip(folder: Path, clip: Clip, prior: Prior, crops: bool) -> None:
+    """Write all that a program may see: the clip and the prior.
+
+    Args:
+        folder: made where it is not there.
+        clip: the frames.
+        prior: a start.
+        crops: write 3D-Fauna's square crops too.
+    """
+    listed = []
+    for index, frame in enumerate(clip.frames):
+        name = f"{index:04d}.png"
+        white, matte = frame.over(1.0), frame.mask
+        straight = torch.where(matte > 1e-3, frame.rgb / matte.clamp_min(1e-3), torch.ones_like(frame.rgb))
+        _write_png(folder / "frames" / name, white)
+        _write_png(folder / "masks" / name, matte)
+        _write_png(folder / "rgba" / name, torch.cat((straight, matte)))
+        if crops:
+            _write_crop(folder / "crops", f"{index:04d}", frame)
+        camera = frame.camera and {
+            "world_to_camera": frame.camera.world_to_camera.tolist(), "intrinsics": frame.camera.intrinsics.tolist(),
+        }  # fmt: skip
+        listed.append({"index": index, "time": frame.time, "frame": f"frames/{name}", "mask": f"masks/{name}",
+                       "rgba": f"rgba/{name}", "camera": camera})  # fmt: skip
+    height, width = clip.frames[0].mask.shape[1:]
+    about = {"name": clip.name, "fps": clip.fps, "width": width, "height": height, "licence": clip.licence,
+             "frames": listed}  # fmt: skip
+    save_prior(prior, folder / "prior.npz")
+    write_text(folder / "README.txt", README)
+    write_text(folder / "clip.json", json.dumps(about, indent=1) + "\n")
+
+
+def crop_box(mask: Tensor) -> tuple[float, float, float]:
+    """Left, top and side of the square around the animal, in pixels; it may reach beyond the image.
+
+    Raises:
+        UserError: the mask is empty.
+    """
+    rows, columns = (mask[0] > 0.5).nonzero().unbind(1)
+    if not len(rows):
+        raise UserError("expected an animal in every frame, but a mask is empty.")
+    top, bottom = float(rows.min()), float(rows.max()) + 1
+    left, right = float(columns.min()), float(columns.max()) + 1
+    side = math.ceil(max(bottom - top, right - left) * (1 + 2 * PAD))
+    return round((left + right - side) / 2), round((top + bottom - side) / 2), side
+
+
+def run_program(command: str, *, clip: Path, out: Path, case: str, seed: int, timeout: float, log: Path) -> None:
+    """Run a program of others until it ends.
+
+    Args:
+        command: its words, with {clip} and {out} for the two folders, and {case} and {seed} where it wants them.
+        clip: what `write_clip` wrote.
+        out: where it writes; made, and empty.
+        case: name of the case.
+        seed: of the run.
+        timeout: seconds.
+        log: file for what it prints.
+
+    Raises:
+        UserError: it cannot be started, does not end in time, or ends with another status than 0.
+    """
+    given = {"clip": str(clip), "out": str(out), "case": case, "seed": str(seed)}
+    try:
+        words = [word.format(**given) for word in shlex.split(command)]
+    except (KeyError, IndexError, ValueError) as error:
+        raise UserError(
+            f"--command: expected words with {{clip}}, {{out}}, {{case}} or {{seed}}, got '{command}'."
+        ) from error
+    if "{clip}" not in command or "{out}" not in command:
+        raise UserError(
+            f"--command: expected {{clip}} and {{out}} for the two folders among its words, got '{command}'."
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    with log.open("wb") as file:
+        try:
+            process = subprocess.Popen(
+                words, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, start_new_session=True
+            )
+        except OSError as error:
+            raise UserError(
+                f"--command: expected a program that can be started, but '{words[0]}': {error.strerror}."
+            ) from error
+        try:
+            status = process.wait(timeout)
+        except subprocess.TimeoutExpired as error:
+            raise UserError(
+                f"{words[0]}: expected an end within {timeout:g} s, but it was still running (log: {log})."
+            ) from error
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+    if status != 0:
+        raise UserError(f"{words[0]}: ended with status {status}; its last words: '{_last_words(log)}' (log: {log}).")
+
+
+def find_outputs(folder: Path, profile: Profile, frames: int) -> list[Path]:
+    """A program's files in the order of time, by the last number in their names.
+
+    Raises:
+        UserError: the folder is not there, no file fits, or their number is not that of the frames.
+    """
+    if not folder.is_dir():
+        raise UserError(f"{folder}: expected the folder of a program's results, but there is no such folder.")
+    found = next(filter(None, (sorted(folder.glob(pattern)) for pattern in profile.patterns)), [])
+    wanted = " or ".join(profile.patterns)
+    if not found:
+        raise UserError(f"{folder}: expected files {wanted}, found none.")
+    found.sort(key=lambda path: (number(path), str(path)))
+    single = found[0].suffix.lower() in (".glb", ".gltf")
+    if single and len(found) > 1:
+        raise UserError(f"{folder}: expected one animated file {wanted}, found {len(found)}.")
+    if not single and not profile.spread and len(found) != frames:
+        numbers = {number(path) for path in found}
+        missing = [str(index) for index in range(frames) if index not in numbers]
+        some = f"; the first that is missing is {missing[0]}" if missing and min(numbers) == 0 else ""
+        raise UserError(f"{folder}: expected {frames} files {wanted}, one a frame, found {len(found)}{some}.")
+    return found
+
+
+def number(path: Path) -> int:
+    """The last number in a file's name, -1 where there is none."""
+    digits = re.findall(r"\d+", path.stem)
+    return int(digits[-1]) if digits else -1
+
+
+def _last_words(log: Path) -> str:
+    lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    return lines[-1][:200] if lines else "none"
+
+
+def _write_crop(folder: Path, name: str, frame: Frame) -> None:
+    """Image, mask and box of one frame as 3D-Fauna's data sets have them."""
+    left, top, side = crop_box(frame.mask)
+    height, width = frame.mask.shape[1:]
+    rows, columns = (torch.arange(int(side)) + int(start) for start in (top, left))
+    inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
+    picked = (
+        torch.cat((frame.rgb, frame.mask))[:, rows.clamp(0, height - 1)][:, :, columns.clamp(0, width - 1)] * inside
+    )
+    small = interpolate(picked[None], (CROP, CROP), mode="area" if side > CROP else "bilinear")[0]
+    _write_png(folder / f"{name}_rgb.png", small[:3])
+    _write_png(folder / f"{name}_mask.png", small[3:])
+    write_text(folder / f"{name}_box.txt", f"{int(name)} {left:g} {top:g} {side:g} {side:g} {width} {height} 1\n")
+
+
+def _write_png(path: Path, image: Tensor) -> None:
+    """Write [1, 3 or 4, h, w] channels in [0, 1]."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = (image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
+    order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[pixels.shape[2]]
+    if not cv2.imwrite(str(path), np.ascontiguousarray(pixels[..., order])):
+        raise UserError(f"{path}: could not be written.")

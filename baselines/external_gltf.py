@@ -1,0 +1,97 @@
+"""An animated glTF file as meshes: skinned, with morph targets, or rigid parts that move."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rewild4d.datasets.animal import Surface
+from rewild4d.datasets.gltf import Document, Floats, sample
+from rewild4d.datasets.rig import clips, load_rig, read_surface
+from rewild4d.errors import UserError
+from rewild4d.meshes import Mesh
+
+
+def read_animation(path: Path, frames: int) -> list[list[Mesh]]:
+    """The parts of an animated file at moments spread evenly over its clip, the first at its start.
+
+    Args:
+        path: a .glb or .gltf file with one animation.
+        frames: how many moments.
+
+    Returns:
+        For each moment its parts; a part keeps its place in the list.
+
+    Raises:
+        UserError: no glTF, not exactly one animation, or nothing that could be seen.
+    """
+    names = clips(path)
+    if len(names) != 1:
+        raise UserError(f"{path}: expected one animation, got {', '.join(names) or 'none'}.")
+    document = Document(path)
+    nodes = [document.tree.nodes[i] for i in document.scene_nodes()]
+    if any(node.mesh is not None and node.skin is not None for node in nodes):
+        animal = load_rig(path, names[0], frames)
+        posed = [animal.posed(frame) for frame in range(frames)]
+        return [[_mesh(s, v) for s, v in zip(animal.surfaces, each, strict=True)] for each in posed]
+    start, end = document.clip_range(0)
+    times = start + (end - start) * np.arange(frames) / frames
+    world = document.global_matrices(document.local_matrices(0, times))
+    parts = [part for index in document.scene_nodes() for part in _parts(document, index, times, world[:, index])]
+    if not parts:
+        raise UserError(f"{path}: expected a mesh, but the file's scene has none.")
+    return [[part[frame] for part in parts] for frame in range(frames)]
+
+
+def _parts(document: Document, index: int, times: Floats, world: Floats) -> list[list[Mesh]]:
+    """The triangle primitives of one node, each as its meshes over time."""
+    node = document.tree.nodes[index]
+    if node.mesh is None:
+        return []
+    found = document.tree.meshes[node.mesh]
+    parts = []
+    for primitive in found.primitives:
+        if primitive.mode not in (None, 4, 5, 6):
+            continue
+        count = document.tree.accessors[primitive.attributes.POSITION].count
+        surface = read_surface(document, primitive, np.eye(4), np.zeros((count, 1), np.int64), np.ones((count, 1)))
+        targets = [_offsets(document, target, count) for target in primitive.targets or []]
+        weights = _weights(document, index, len(targets), found.weights, times)
+        shapes = surface.vertices + np.einsum("tk,knd->tnd", weights, np.stack(targets)) if targets else None
+        meshes = []
+        for frame, matrix in enumerate(world):
+            points = surface.vertices if shapes is None else shapes[frame]
+            meshes.append(_mesh(surface, points @ matrix[:3, :3].T + matrix[:3, 3]))
+        parts.append(meshes)
+    return parts
+
+
+def _offsets(document: Document, target: object, count: int) -> Floats:
+    """Displacements of a morph target, zero where it moves nothing, [n, 3]."""
+    accessor = target.get("POSITION") if isinstance(target, dict) else getattr(target, "POSITION", None)
+    return np.zeros((count, 3)) if accessor is None else document.floats(accessor)
+
+
+def _weights(document: Document, node: int, targets: int, still: list[float] | None, times: Floats) -> Floats:
+    """Weights of the morph targets at given times, [T, targets]."""
+    animation = document.tree.animations[0]
+    for channel in animation.channels:
+        if targets and channel.target.node == node and channel.target.path == "weights":
+            sampler = animation.samplers[channel.sampler]
+            keys = document.floats(sampler.input)[:, 0]
+            values = document.floats(sampler.output).reshape(-1, targets)
+            return sample(keys, values, sampler.interpolation, times, False)
+    return np.tile(np.array(still or [0.0] * targets)[:targets], (len(times), 1))
+
+
+def _mesh(surface: Surface, points: Floats) -> Mesh:
+    """A surface of the rig reader at one moment; its texture coordinates begin at the upper left corner."""
+    uv: Tensor | None = None
+    texture: Tensor | None = None
+    if surface.uv is not None and surface.texture is not None:
+        corners = torch.from_numpy(surface.uv)[torch.from_numpy(surface.faces)].float()
+        uv = torch.stack((corners[..., 0], 1 - corners[..., 1]), dim=-1)
+        texture = torch.from_numpy(surface.texture).float() / 255
+    vertices, faces = torch.from_numpy(points).float(), torch.from_numpy(surface.faces)
+    return Mesh(vertices, faces, torch.from_numpy(surface.colors).float(), uv, texture)
