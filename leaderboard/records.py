@@ -51,7 +51,7 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         status: "ok" or "failed"; ``error`` then holds the message.
         config: every setting of the method, defaults included.
         data: digests of the clip and of the truth, and the folder they came from.
-        prior: name, provenance, digest and the quality of its fit.
+        prior: name, provenance, digest and the quality of its fit; what the run asked for ("choice", "config").
         protocol: name, digest and settings.
         coverage: what the numbers lean on (see rewild4d.coverage).
         items: label of each held-out image, as in ``Score.per_item`` of image scores.
@@ -59,6 +59,7 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         alignments: by which shapes were laid on the truth.
         networks: SHA-256 of the weights of the metric networks that scores leaned on.
         diagnostics: what the method says of itself (Gaussians, joint motion, ...).
+        marks: what a table has to say beside the numbers, such as "upper bound: ..."; such rows compete with nobody.
         pictures: files written beside the record, relative to it.
         machine: see `rewild4d.machine.machine`; records from before there was a choice do not name the rasterizer.
     """
@@ -84,6 +85,7 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     code: dict[str, str]
     machine: dict[str, str]
     timing: Timing
+    marks: list[str] = []
     distances: list[Distance] = []
     alignments: list[dict[str, Any]] = []
     networks: dict[str, str] = {}
@@ -123,8 +125,17 @@ def read_record(path: Path) -> RunRecord:
     return record
 
 
-def read_records(folder: Path) -> list[RunRecord]:
-    """All records below a folder, sorted by path."""
+def find_records(folder: Path) -> list[tuple[Path, RunRecord]]:
+    """All records below a folder, sorted by path, each with the folder that holds it.
+
+    Raises:
+        UserError: no such folder, or a record that cannot be read.
+    """
     if not folder.is_dir():
         raise UserError(f"{folder}: expected a folder of runs, but there is no such folder.")
-    return [read_record(path) for path in sorted(folder.rglob(FILE))]
+    return [(path.parent, read_record(path)) for path in sorted(folder.rglob(FILE))]
+
+
+def read_records(folder: Path) -> list[RunRecord]:
+    """All records below a folder, sorted by path; see `find_records`."""
+    return [record for _, record in find_records(folder)]

@@ -1,109 +1,323 @@
-"""Tables from records, and from nothing else."""
+"""Tables from records, and from nothing else: one per protocol, or one whose rows somebody named."""
 
 import statistics
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
-from rewild4d.leaderboard.records import RunRecord
+from rewild4d.errors import unknown_name
+from rewild4d.leaderboard.formats import markdown as to_markdown
+from rewild4d.leaderboard.layout import Cell, Column, Row, Table
+from rewild4d.leaderboard.records import RunRecord, Score
+from rewild4d.leaderboard.specs import Reported, ReportedCell
+from rewild4d.leaderboard.statistics import Estimate, estimate, paired, ranks
+from rewild4d.leaderboard.variants import Variant, coverage_text, is_floor, latest, marks, variants
 
-TITLES = {"psnr": "PSNR", "ssim": "SSIM", "psnr_fg": "PSNR foreground", "iou": "mask IoU"}
-DIGITS = {"dB": 2, "1": 3}
+TITLES = {
+    "psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS-alex", "lpips_vgg": "LPIPS-vgg",
+    "psnr_fg": "PSNR foreground", "psnr_union": "PSNR union", "psnr_crop": "PSNR crop", "iou": "mask IoU",
+    "chamfer_relative": "CD / diagonal", "chamfer_relative_framewise": "CD / diagonal, per frame",
+    "fscore_1": "F@1 %", "fscore_2": "F@2 %", "fscore_5": "F@5 %",
+    "kid_v": "KID-16V", "fvd_f": "FVD-F", "fvd_diag": "FVD-Diag", "kvd_f": "KVD-F", "kvd_diag": "KVD-Diag",
+}  # fmt: skip
+DIGITS = {"dB": 2, "chamfer_relative": 4, "chamfer_relative_framewise": 4, "kid_v": 4, "fvd_f": 1, "fvd_diag": 1}
+"""Printed after the point, by the score's name or unit; three for all others."""
+LESS_IS_BETTER = ("lpips", "chamfer", "kid", "fvd", "kvd")
+"""Beginnings of such scores' names; asked only where no record says it."""
+Values = dict[str, dict[int, float]]
+"""Case -> seed -> value."""
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """A row to fill.
+
+    Attributes:
+        label: as printed.
+        records: of the row, under each condition.
+        absent: why there can be none, or "".
+        notes: sentences on the row.
+    """
+
+    label: str
+    records: tuple[tuple[RunRecord, ...], ...]
+    absent: str = ""
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a table is about, before its rows.
+
+    Attributes:
+        name: for labels and files.
+        title: as printed.
+        caption: how to read it.
+        conditions: titles, "" for a single one.
+        scores: names.
+        remarks: sentences below.
+    """
+
+    name: str
+    title: str
+    caption: str
+    conditions: tuple[str, ...]
+    scores: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
 
 
 def markdown(records: Sequence[RunRecord]) -> str:
-    """One Markdown table per (data set, protocol): a row per method and case, and the mean where cases are several.
+    """One Markdown table per (data set, protocol); see `protocol_tables`."""
+    return "\n\n".join(map(to_markdown, protocol_tables(records))) or "no records"
+
+
+def protocol_tables(records: Sequence[RunRecord]) -> list[Table]:
+    """A table per (data set, protocol): a row per case and method, and the mean where cases are several.
 
     A cell is the mean over seeds, with the standard deviation where there are several. Methods are averaged over cases
-    only where they were run on the same set of cases; otherwise the mean row says which are missing.
+    only where they were run on the same set of cases; otherwise a note says which are missing.
     """
+    tables = []
+    for group in by_protocol(records):
+        kept, remarks = latest(group)
+        cases = list(dict.fromkeys(record.case for record in kept))
+        named = variants(kept)
+        frame = _frame(kept, remarks)
+        columns = (*_columns(frame, kept), Column("seeds"), Column("fit, s"))
+        rows = [
+            _timed_row(case, variant, [case], frame.scores)
+            for case in cases
+            for variant in named
+            if any(record.case == case for record in variant.records)
+        ]
+        if len(cases) > 1:
+            rows += [_timed_row("**mean**", variant, cases, frame.scores) for variant in named]
+        tables.append(
+            Table(frame.name, frame.title, frame.caption, ("case", "method"), columns, tuple(rows), frame.remarks)
+        )
+    return tables
+
+
+def standings(records: Sequence[RunRecord]) -> list[Table]:
+    """A table per (data set, protocol): one row a method, its mean over the cases, ranked."""
+    tables = []
+    for group in by_protocol(records):
+        kept, remarks = latest(group)
+        entrants = [Entrant(found.label, (found.records,)) for found in variants(kept)]
+        tables.append(named_table(_frame(kept, remarks), entrants))
+    return tables
+
+
+def by_protocol(records: Sequence[RunRecord]) -> list[list[RunRecord]]:
+    """Records grouped by data set and protocol, in their names' order."""
     groups: dict[tuple[str, str], list[RunRecord]] = defaultdict(list)
     for record in records:
         groups[record.dataset, record.protocol["name"]].append(record)
-    return "\n\n".join(_table(group) for _, group in sorted(groups.items())) or "no records"
+    return [group for _, group in sorted(groups.items())]
 
 
-def _table(records: list[RunRecord]) -> str:
+def named_table(frame: Frame, entrants: Sequence[Entrant], reported: Reported | None = None) -> Table:
+    """Rows are entrants, columns are scores under conditions, a cell is the mean over the cases of its condition.
+
+    The best of a column is bold and the second underlined, as `rewild4d.leaderboard.statistics.ranks` tells them apart
+    by the spread over seeds. Reported rows and those that had what the others had not are never ranked.
+
+    Args:
+        frame: titles, conditions and scores.
+        entrants: rows with their records; the cases of a condition are those that any entrant was run on.
+        reported: what the paper printed, below the others.
+    """
+    everything = [record for entrant in entrants for under in entrant.records for record in under]
+    columns = _columns(frame, everything)
+    rows = [_named_row(entrant, entrants, columns, frame) for entrant in entrants]
+    rows = _ranked(rows, entrants, columns, frame)
+    order = {"method": 0, "unranked": 1, "floor": 2}
+    rows.sort(key=lambda row: order[row.kind])
+    remarks = list(frame.remarks)
+    if reported is not None:
+        rows += _reported_rows(reported, columns)
+        remarks += [f"Reported: {reported.source}. {reported.note}"]
+    return Table(frame.name, frame.title, frame.caption, ("method",), columns, tuple(rows), tuple(remarks))
+
+
+def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) -> Table:
+    """Every row less a reference row: mean of the cases' differences, and its 95 % bootstrap interval in brackets.
+
+    Raises:
+        UserError: no row of that name.
+    """
+    reference = next((entrant for entrant in entrants if entrant.label.lower() == against.lower()), None)
+    if reference is None:
+        raise unknown_name("row", against, [entrant.label for entrant in entrants])
+    everything = [record for entrant in entrants for under in entrant.records for record in under]
+    columns = _columns(frame, everything)
+    rows = []
+    for entrant in entrants:
+        if entrant is reference:
+            continue
+        cells = []
+        for index in range(len(frame.conditions)):
+            pair = entrant.records[index], reference.records[index]
+            cells += [_difference(*pair, name) for name in frame.scores]
+        rows.append(Row((entrant.label,), tuple(cells), _kind(entrant), (*entrant.notes,)))
+    return Table(
+        f"{frame.name}-difference",
+        f"{frame.title}: difference to {reference.label}",
+        "mean of the cases' differences; in brackets the 95 % interval of a bootstrap over cases and seeds",
+        ("method",),
+        columns,
+        tuple(rows),
+        frame.remarks,
+    )
+
+
+def columns_of(records: Sequence[RunRecord]) -> tuple[Column, ...]:
+    """The columns of a protocol's scores."""
+    return _columns(_frame(records, ()), records)
+
+
+def _frame(records: Sequence[RunRecord], remarks: Sequence[str]) -> Frame:
     protocol = records[0].protocol
-    scores = list(protocol["scores"])
-    units = {name: score.unit for record in records for name, score in record.scores.items()}
-    head = ["case", "method", *(_title(name, units) for name in scores), "seeds", "fit, s"]
-    rows = [head, ["---"] * 2 + ["---:"] * (len(head) - 2)]
-    cases = list(dict.fromkeys(record.case for record in records))
-    methods = list(dict.fromkeys((record.method, record.preset) for record in records))
-    for case in cases:
-        for method in methods:
-            runs = [r for r in records if r.case == case and (r.method, r.preset) == method]
-            if runs:
-                rows.append([case, _label(method, methods), *_cells(runs, scores)])
-    if len(cases) > 1:
-        rows += [_mean_row(method, methods, records, cases, scores) for method in methods]
-    lines = ["| " + " | ".join(row) + " |" for row in rows]
-    notes = sorted({f"{r.case}, {r.method}: failed: {r.error}" for r in records if r.status != "ok"})
-    caption = f"**{protocol['title']}** (`{protocol['name']}`; {_coverage(records)})"
-    return "\n".join([caption, "", *lines, *(f"\n{note}" for note in notes)])
+    caption = f"`{protocol['name']}`; {coverage_text(records)}"
+    return Frame(protocol["name"], protocol["title"], caption, ("",), tuple(protocol["scores"]), tuple(remarks))
 
 
-def _title(name: str, units: dict[str, str]) -> str:
-    unit = units.get(name, "1")
-    return TITLES.get(name, name) + (f", {unit}" if unit != "1" else "")
+def _columns(frame: Frame, records: Sequence[RunRecord]) -> tuple[Column, ...]:
+    known = {name: score for record in records for name, score in record.scores.items()}
+    columns = []
+    for condition in frame.conditions:
+        for name in frame.scores:
+            score = known.get(name)
+            unit = f", {score.unit}" if score and score.unit != "1" else ""
+            less = score.better == "lower" if score else name.startswith(LESS_IS_BETTER)
+            columns.append(Column(TITLES.get(name, name) + unit, "lower" if less else "higher", condition, name))
+    return tuple(columns)
 
 
-def _label(method: tuple[str, str], methods: Iterable[tuple[str, str]]) -> str:
-    """The method, with its preset where the table holds several of it."""
-    several = sum(other[0] == method[0] for other in methods) > 1
-    return f"{method[0]} ({method[1]})" if several else method[0]
-
-
-def _cells(runs: list[RunRecord], scores: list[str]) -> list[str]:
+def _timed_row(title: str, variant: Variant, cases: list[str], scores: Sequence[str]) -> Row:
+    """A row of one case or of the mean over several, with the number of seeds and the time of a fit."""
+    runs = [record for record in variant.records if record.case in cases]
     good = [run for run in runs if run.status == "ok"]
+    whole = {run.case for run in good} == set(cases)
+    seeds = "" if len(cases) > 1 else str(len(good)) if len(good) == len(runs) else f"{len(good)} of {len(runs)}"
+    seconds = f"{statistics.fmean(run.timing.fit_seconds for run in good):.0f}" if whole else "-"
+    cells = (*(cell(runs, cases, name) for name in scores), Cell(seeds), Cell(seconds))
+    return Row((title, variant.label), cells, "floor" if variant.is_floor else "method", variant.marks)
+
+
+def _named_row(entrant: Entrant, entrants: Sequence[Entrant], columns: Sequence[Column], frame: Frame) -> Row:
     cells = []
-    for name in scores:
-        found = [run.scores[name] for run in good if name in run.scores]
-        values = [score.value for score in found if score.value is not None]
-        cells.append(_number(values, found[0].unit) if values else (found[0].note if found else "failed"))
-    seeds = str(len(good)) if len(good) == len(runs) else f"{len(good)} of {len(runs)}"
-    seconds = f"{statistics.fmean(run.timing.fit_seconds for run in good):.0f}" if good else "-"
-    return [*cells, seeds, seconds]
+    for index in range(len(frame.conditions)):
+        cases = list(dict.fromkeys(record.case for other in entrants for record in other.records[index]))
+        for name in frame.scores:
+            if entrant.absent or not cases:
+                cells.append(Cell("n/a", note=entrant.absent or "no record yet"))
+            else:
+                cells.append(cell(entrant.records[index], cases, name))
+    everything = [record for under in entrant.records for record in under]
+    return Row((entrant.label,), tuple(cells), _kind(entrant), (*entrant.notes, *marks(everything)))
 
 
-def _mean_row(
-    method: tuple[str, str],
-    methods: list[tuple[str, str]],
-    records: list[RunRecord],
-    cases: list[str],
-    scores: list[str],
-) -> list[str]:
-    """Mean over cases of the mean over seeds, or what is missing: unequal sets are not averaged."""
-    own = [r for r in records if (r.method, r.preset) == method and r.status == "ok"]
-    missing = [case for case in cases if case not in {r.case for r in own}]
-    label = _label(method, methods)
+def _kind(entrant: Entrant) -> str:
+    records = [record for under in entrant.records for record in under]
+    if marks(records):
+        return "unranked"
+    return "floor" if records and is_floor(records[0]) else "method"
+
+
+def _ranked(rows: list[Row], entrants: Sequence[Entrant], columns: Sequence[Column], frame: Frame) -> list[Row]:
+    """The same rows with the best and the second of each column marked; floors compete too."""
+    competing = [index for index, row in enumerate(rows) if row.kind != "unranked"]
+    for place, column in enumerate(columns):
+        cells = [rows[index].cells[place] for index in competing]
+        known = [Estimate(c.value, c.deviation, 0) if c.value is not None else None for c in cells]
+        digits = max((len(c.text.partition(".")[2]) for c in cells if c.value is not None), default=0)
+        for index, mark in zip(competing, ranks(known, column.better, digits), strict=True):
+            marked = list(rows[index].cells)
+            marked[place] = replace(marked[place], mark=mark)
+            rows[index] = replace(rows[index], cells=tuple(marked))
+    return rows
+
+
+def cell(records: Sequence[RunRecord], cases: Sequence[str], name: str) -> Cell:
+    """Mean and spread of a score over cases, or why there is none: unequal sets are not averaged.
+
+    Args:
+        records: of one row under one condition.
+        cases: every one must have a value.
+        name: of the score.
+    """
+    wanted = [record for record in records if record.case in cases]
+    good = [record for record in wanted if record.status == "ok"]
+    for case in cases:
+        failed = next((record for record in wanted if record.case == case and record.status != "ok"), None)
+        if failed and not any(record.case == case for record in good):
+            return Cell("failed", note=f"{case}, {failed.method}: failed: {failed.error}")
+    missing = [case for case in cases if not any(record.case == case for record in good)]
     if missing:
-        return ["**mean**", label, *[f"not computed: no result for {', '.join(missing)}"] * len(scores), "", ""]
-    cells = []
-    for name in scores:
-        per_case = [[r.scores[name].value for r in own if r.case == case] for case in cases]
-        known = [[v for v in values if v is not None] for values in per_case]
-        if all(known):
-            mean = statistics.fmean(statistics.fmean(values) for values in known)
-            cells.append(f"{mean:.{DIGITS.get(own[0].scores[name].unit, 3)}f}")
-        else:
-            cells.append("not computed")
-    seconds = f"{statistics.fmean(r.timing.fit_seconds for r in own):.0f}"
-    return ["**mean**", label, *cells, "", seconds]
+        whole = len(missing) == len(cases)
+        return Cell("n/a", note="no record yet" if whole else f"not computed: no result for {', '.join(missing)}")
+    found = [(record, record.scores.get(name)) for record in good]
+    values, unit = _values(good, name)
+    for record, score in found:
+        if record.case not in values:
+            reason = score.note if score else f"not computed: {record.protocol['name']} does not measure it"
+            return Cell("n/a", note=reason)
+    lost = len(wanted) - len(good)
+    note = f"{lost} of {len(wanted)} runs failed: {next(r.error for r in wanted if r.status != 'ok')}" if lost else ""
+    return _number(estimate(values), _digits(name, unit), note)
 
 
-def _number(values: list[float], unit: str) -> str:
-    digits = DIGITS.get(unit, 3)
-    text = f"{statistics.fmean(values):.{digits}f}"
-    return f"{text} ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else text
+def _values(records: Sequence[RunRecord], name: str) -> tuple[Values, str]:
+    """Values by case and seed of good records, and their unit."""
+    values: Values = defaultdict(dict)
+    unit = "1"
+    for record in records:
+        score: Score | None = record.scores.get(name) if record.status == "ok" else None
+        if score is not None and score.value is not None:
+            values[record.case][record.seed] = score.value
+            unit = score.unit
+    return dict(values), unit
 
 
-def _coverage(records: list[RunRecord]) -> str:
-    """What the table's numbers lean on, averaged over its cases."""
-    by_case = {record.case: record.coverage for record in records if record.coverage}
-    parts = []
-    for key, text in (("foreground", "of a held-out image is animal"), ("seen_surface", "of its surface ever shown")):
-        values = [found[key] for found in by_case.values() if key in found]
-        if values:
-            parts.append(f"{100 * statistics.fmean(values):.0f} % {text}")
-    return ", ".join(parts) or "coverage unknown"
+def _difference(records: Sequence[RunRecord], reference: Sequence[RunRecord], name: str) -> Cell:
+    (values, unit), (others, _) = _values(records, name), _values(reference, name)
+    shared = [case for case in values if case in others]
+    if not shared:
+        return Cell("n/a", note="no case in common")
+    found, digits = paired(values, others), _digits(name, unit)
+    interval = " [" + ", ".join(_signed(end, digits) for end in found.interval) + "]" if found.interval else ""
+    left = sorted(set(values) ^ set(others))
+    note = f"over {len(shared)} cases; only one side has {', '.join(left)}" if left else ""
+    return Cell(_signed(found.mean, digits) + interval, note=note, value=found.mean, interval=found.interval)
+
+
+def _digits(name: str, unit: str) -> int:
+    return DIGITS.get(name, DIGITS.get(unit, 3))
+
+
+def _number(found: Estimate, digits: int, note: str) -> Cell:
+    spread = "" if found.spread is None else f"{found.spread:.{digits}f}"
+    return Cell(f"{found.mean:.{digits}f}", spread, note=note, value=found.mean, deviation=found.spread)
+
+
+def _signed(value: float, digits: int) -> str:
+    return f"{value:+.{digits}f}".replace("-", "−")
+
+
+def _reported_rows(reported: Reported, columns: Sequence[Column]) -> list[Row]:
+    rows = []
+    for line in reported.rows:
+        cells = tuple(_reported_cell(line.cells.get(column.score), column.score) for column in columns)
+        rows.append(Row((f"{line.label} (reported)",), cells, "reported", (line.note,) if line.note else ()))
+    return rows
+
+
+def _reported_cell(found: ReportedCell | None, name: str) -> Cell:
+    if found is None:
+        return Cell("")
+    if found.value is not None:
+        digits = _digits(name, "dB" if name.startswith("psnr") else "1")
+        return Cell(f"{found.value:.{digits}f}", value=found.value)
+    sign = "+" if (found.difference or 0) > 0 else "−"
+    return Cell(f"ours {sign} {abs(found.difference or 0)}")

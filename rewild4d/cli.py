@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable
 
 from rewild4d import __version__
-from rewild4d.commands import bench, check, evaluate, make, overview, run, score, table, weights
+from rewild4d.commands import bench, check, evaluate, leaderboard, make, overview, run, score, table, weights
 from rewild4d.errors import UserError, unknown_name
 
 COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {
@@ -13,7 +13,8 @@ COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {
     "evaluate": (evaluate.main, "score a saved reconstruction again"),
     "score": (score.main, "score two folders of images or clips, or two .ply files, without our methods"),
     "table": (table.main, "print a table of what was found"),
-    "list": (overview.main, "methods, data sets, protocols and presets"),
+    "leaderboard": (leaderboard.main, "make a static page of what was found"),
+    "list": (overview.main, "methods, data sets, protocols, presets and tables"),
     "check": (check.main, "verify a data set's folder, or that a method keeps the contract"),
     "make": (make.main, "render a rigged, animated glTF as a data set with exact truth"),
     "weights": (weights.main, "list, fetch, import and verify the networks behind LPIPS, KID and FVD"),
@@ -23,7 +24,7 @@ COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {
 
 def usage() -> str:
     """The overview that `--help` prints."""
-    rows = "\n".join(f"  {name:<10} {text}" for name, (_, text) in COMMANDS.items())
+    rows = "\n".join(f"  {name:<12} {text}" for name, (_, text) in COMMANDS.items())
     return (
         f"rewild4d-bench {__version__}: a benchmark for 4D animals from one monocular video\n\n"
         f"usage: rewild4d-bench COMMAND [options]      (COMMAND --help tells its options)\n\n{rows}\n\n"

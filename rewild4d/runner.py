@@ -1,5 +1,6 @@
 """From a plan to records: load, prior, fit, evaluate, write; finished runs are skipped, killed ones resume."""
 
+import contextlib
 import json
 import multiprocessing
 import os
@@ -32,7 +33,7 @@ from rewild4d.priors.choose import PriorChoice, make_prior
 from rewild4d.protocol import Protocol, evaluate
 from rewild4d.rasterizer import pick_rasterizer, set_default
 from rewild4d.registry import load_method
-from rewild4d.types import Case, Clip, Truth
+from rewild4d.types import Case, Clip, Prior, Truth
 from rewild4d.view import save_pictures
 
 
@@ -50,8 +51,8 @@ class Entry:
 class Plan:
     """Everything that decides what is run; the same plan gives the same run ids.
 
-    `jobs` cases run at a time, each in a process with `threads` threads: the tensors of one fit are small, so two
-    cases side by side finish sooner than one with two threads. `rasterizer` is one of rewild4d.rasterizer.BACKENDS.
+    `jobs` fits run at a time, each in a process with `threads` threads: the tensors of one fit are small, so two fits
+    side by side finish sooner than one with two threads. `rasterizer` is one of rewild4d.rasterizer.BACKENDS.
     """
 
     dataset: str
@@ -116,14 +117,23 @@ def execute(plan: Plan) -> list[RunRecord]:
     plan.out.mkdir(parents=True, exist_ok=True)
     for name in plan.cases:
         plan.reader.load(name, plan.protocol.selection)
-    jobs = min(plan.jobs, len(plan.cases))
+    parts = [(name, entry, seed) for name in plan.cases for entry in plan.entries for seed in entry.seeds]
+    fits = sum(entry.method not in plan.protocol.floors for _, entry, _ in parts)
+    jobs = min(plan.jobs, max(len(plan.cases), fits))
     if jobs <= 1:
         torch.set_num_threads(plan.threads)
         set_default(plan.rasterizer)
         return [record for name in plan.cases for record in _run_case(plan, name)]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context, _start_worker, (plan.threads, plan.rasterizer, os.getpid())) as pool:
-        return [record for records in pool.map(_run_case, repeat(plan), plan.cases) for record in records]
+        # Every fit of a case starts from its prior, so the priors come first.
+        list(pool.map(_prepare, repeat(plan), plan.cases))
+        return list(pool.map(_run_part, repeat(plan), *zip(*parts, strict=True)))
+
+
+def pieces(plan: Plan) -> list["Job"]:
+    """All that the plan lists, in its order, finished or not; nothing is run."""
+    return [job for name in plan.cases for job in _jobs(plan, name, *plan.reader.load(name, plan.protocol.selection))]
 
 
 def _start_worker(threads: int, rasterizer: str, parent: int) -> None:
@@ -139,26 +149,48 @@ def _start_worker(threads: int, rasterizer: str, parent: int) -> None:
     Thread(target=watch, daemon=True).start()
 
 
+def _prepare(plan: Plan, name: str) -> None:
+    """Make the prior of a case where a fit still needs it; what is wrong with it is said by those fits."""
+    clip, truth = plan.reader.load(name, plan.protocol.selection)
+    if not all(job.finished() for job in _jobs(plan, name, clip, truth)):
+        with contextlib.suppress(UserError):
+            _prior(plan, clip, truth)
+
+
+def _run_part(plan: Plan, name: str, entry: Entry, seed: int) -> RunRecord:
+    (record,) = _run_case(replace(plan, entries=(replace(entry, seeds=(seed,)),)), name)
+    return record
+
+
 def _run_case(plan: Plan, name: str) -> list[RunRecord]:
     clip, truth = plan.reader.load(name, plan.protocol.selection)
-    prior_id = plan.prior.identity(clip, truth)
-    folder = plan.out / plan.protocol.name / name.replace("/", "__")
-    jobs = [_Job(plan, entry, seed, clip, truth, prior_id, folder) for entry in plan.entries for seed in entry.seeds]
+    jobs = _jobs(plan, name, clip, truth)
     if all(job.finished() for job in jobs):
         return [read_record(job.folder / FILE) for job in jobs]
-    progress = Progress(f"{name}: prior")
     try:
-        prior = make_prior(plan.prior, clip, truth, plan.out / "priors" / f"{prior_id}.npz", progress)
+        case = Case(clip, _prior(plan, clip, truth), truth)
     except UserError as error:
         return [job.fail(str(error)) for job in jobs]
-    finally:
-        progress.close()
-    case = Case(clip, prior, truth)
     seen = coverage(clip, truth)
     return [read_record(job.folder / FILE) if job.finished() else job.run(case, seen) for job in jobs]
 
 
-class _Job:
+def _jobs(plan: Plan, name: str, clip: Clip, truth: Truth) -> list["Job"]:
+    prior_id = plan.prior.identity(clip, truth)
+    folder = plan.out / plan.protocol.name / name.replace("/", "__")
+    return [Job(plan, entry, seed, clip, truth, prior_id, folder) for entry in plan.entries for seed in entry.seeds]
+
+
+def _prior(plan: Plan, clip: Clip, truth: Truth) -> Prior:
+    progress = Progress(f"{clip.name}: prior")
+    try:
+        path = plan.out / "priors" / f"{plan.prior.identity(clip, truth)}.npz"
+        return make_prior(plan.prior, clip, truth, path, progress)
+    finally:
+        progress.close()
+
+
+class Job:
     """One method on one case with one seed."""
 
     def __init__(self, plan: Plan, entry: Entry, seed: int, clip: Clip, truth: Truth, prior_id: str, folder: Path):
@@ -193,7 +225,7 @@ class _Job:
             traceback.print_exc(file=sys.stderr)
             return self.fail(f"{type(error).__name__}: {error}", case)
         record = self._record(case, "ok", "", **found._asdict(), coverage=seen, pictures=pictures,
-                              diagnostics=_diagnostics(reconstruction),
+                              diagnostics=_diagnostics(reconstruction), marks=_marks(self.entry.method, reconstruction),
                               timing=self._timing(fit_seconds, seconds))  # fmt: skip
         path = write_record(record, self.folder)
         shutil.rmtree(self.folder / "work", ignore_errors=True)
@@ -227,7 +259,7 @@ class _Job:
         return Timing(self.started, round(fit, 2), round(evaluation, 2), round(peak_memory_mib(), 1))
 
     def _record(self, case: Case | None, status: str, error: str, **found: Any) -> RunRecord:
-        plan, prior = self.plan, case.prior if case else None
+        plan = self.plan
         fields: dict[str, Any] = {
             "schema": SCHEMA, "run_id": self.run_id, "method": self.entry.method, "dataset": plan.dataset,
             "case": self.clip.name, "seed": self.seed, "preset": self.entry.preset, "status": status, "error": error,
@@ -235,8 +267,8 @@ class _Job:
             "config": msgspec.to_builtins(self.entry.config),
             "data": {"root": str(plan.root), "licence": self.clip.licence, "clip": self.clip.digest,
                      "truth": self.truth.digest},
-            "prior": {"name": prior.name, "provenance": prior.provenance, "digest": prior.digest,
-                      "quality": prior.quality} if prior else {"name": plan.prior.name},
+            "prior": {"choice": plan.prior.name, "config": msgspec.to_builtins(plan.prior.config), 
+                      **_describe(case.prior if case else None)},
             "protocol": {"digest": plan.protocol.digest, **msgspec.to_builtins(plan.protocol)},
             "code": code_version(), "machine": machine(plan.device, plan.rasterizer),
         }  # fmt: skip
@@ -258,6 +290,19 @@ def save_reconstruction(reconstruction: Reconstruction, folder: Path) -> None:
         shutil.rmtree(building, ignore_errors=True)
 
 
+def _describe(prior: Prior | None) -> dict[str, Any]:
+    """What a record says of the prior that was made, if any was."""
+    if prior is None:
+        return {"name": "none"}
+    return {"name": prior.name, "provenance": prior.provenance, "digest": prior.digest, "quality": prior.quality}
+
+
 def _diagnostics(reconstruction: Reconstruction) -> dict[str, Any]:
     describe = getattr(reconstruction, "diagnostics", None)
     return describe() if describe else {}
+
+
+def _marks(method: str, reconstruction: Reconstruction) -> list[str]:
+    """What stands beside the numbers in every table: the method has seen test frames, and what the result says."""
+    seen = ["has seen the test frames"] if load_method(method).info.sees_test_frames else []
+    return seen + list(getattr(reconstruction, "marks", ()))

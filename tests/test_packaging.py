@@ -39,7 +39,22 @@ def test_imports_are_absolute_and_run_one_way() -> None:
     """Ground floor below methods, data sets and metrics; metrics alone; tables read records and nothing else."""
     forbidden = {
         "metrics/": ("rewild4d.",),
-        "leaderboard/tables.py": ("rewild4d.",),
+        "leaderboard/": tuple(
+            f"rewild4d.{name}"
+            for name in (
+                "baselines",
+                "commands",
+                "config",
+                "datasets",
+                "ours",
+                "planning",
+                "priors",
+                "protocol",
+                "registry",
+                "rasterizer",
+                "runner",
+            )
+        ),
         "rewild4d/types.py": ("rewild4d.",),
         "rewild4d/transforms.py": ("rewild4d.ours", "rewild4d.baselines", "rewild4d.datasets", "rewild4d.metrics"),
         "rewild4d/rasterizer/": ("rewild4d.ours", "rewild4d.baselines", "rewild4d.datasets", "rewild4d.metrics"),
@@ -95,6 +110,8 @@ def test_the_wheel_carries_code_and_data(tmp_path: Path) -> None:
         "rewild4d/py.typed",
     } <= names
     assert "rewild4d/leaderboard/protocols/artemis-sweep-256-v1.toml" in names
+    assert "rewild4d/leaderboard/tables/ablation.toml" in names
+    assert "rewild4d/leaderboard/paper/artemis.json" in names
     assert "rewild4d/baselines/presets/ours.toml" in names
     assert "rewild4d/metrics/weights.toml" in names
     assert {name.split("/")[0] for name in names if not name.startswith("rewild4d-")} == {"rewild4d"}

@@ -1,30 +1,15 @@
 """Records: round trip, strict reading, and tables that refuse to average what cannot be averaged."""
 
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import pytest
+from records_for_tests import psnr, record
 
 from rewild4d.errors import UserError
 from rewild4d.image_scores import summarize
-from rewild4d.leaderboard.records import RunRecord, Score, Timing, make_run_id, read_record, to_json, write_record
+from rewild4d.leaderboard.records import make_run_id, read_record, to_json, write_record
 from rewild4d.leaderboard.tables import markdown
-
-
-def record(**changes: Any) -> RunRecord:
-    fields: dict[str, Any] = {
-        "schema": 1, "run_id": "0" * 16, "method": "ours", "dataset": "artemis", "case": "wolf/Run", "seed": 0,
-        "preset": "quick", "status": "ok", "error": "", "scores": psnr(20.0), "coverage": {"foreground": 0.1},
-        "config": {}, "data": {}, "prior": {}, "diagnostics": {}, "items": [], "pictures": [],
-        "protocol": {"name": "p-v1", "title": "P", "scores": ["psnr"]}, "code": {}, "machine": {},
-        "timing": Timing("2026-01-01T00:00:00+00:00", 60.0, 1.0, 100.0),
-    }  # fmt: skip
-    return RunRecord(**{**fields, **changes})
-
-
-def psnr(value: float) -> dict[str, Score]:
-    return {"psnr": Score(value, "dB", "higher", 1, [value])}
 
 
 def test_round_trip(tmp_path: Path) -> None:
@@ -64,12 +49,13 @@ def test_table_averages_cases_only_over_equal_sets() -> None:
     full = [record(case=case, scores=psnr(value)) for case, value in (("a/x", 10.0), ("b/x", 30.0))]
     assert "| **mean** | ours | 20.00 |" in markdown(full)
     partial = [*full, record(method="gart", case="a/x", scores=psnr(12.0))]
-    assert "| **mean** | gart | not computed: no result for b/x |" in markdown(partial)
+    assert "| **mean** | gart | n/a [1] |" in markdown(partial)
+    assert "[1] not computed: no result for b/x" in markdown(partial)
 
 
 def test_a_failure_is_a_row() -> None:
     table = markdown([record(), record(method="gart", status="failed", error="it diverged", scores={})])
-    assert "| wolf/Run | gart | failed | 0 of 1 | - |" in table
+    assert "| wolf/Run | gart | failed [1] | 0 of 1 | - |" in table
     assert "wolf/Run, gart: failed: it diverged" in table
 
 

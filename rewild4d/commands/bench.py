@@ -11,7 +11,7 @@ from rewild4d.benchmarks.results import Result, Row, default_path, to_json, writ
 from rewild4d.benchmarks.step_bench import bench_step
 from rewild4d.benchmarks.tables import markdown
 from rewild4d.benchmarks.timing import threads
-from rewild4d.commands.run import require_writable
+from rewild4d.commands.shared import require_writable
 from rewild4d.config import load_preset, parse_flags
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.ours.config import Config

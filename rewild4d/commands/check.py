@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from rewild4d.commands.run import open_dataset
+from rewild4d.commands.shared import open_dataset
 from rewild4d.config import parse_flags
 from rewild4d.conformance import check_method
 from rewild4d.contracts import Finding

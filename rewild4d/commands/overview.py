@@ -1,8 +1,9 @@
-"""`list`: methods, data sets, protocols and presets."""
+"""`list`: methods, data sets, protocols, presets and tables."""
 
 from dataclasses import dataclass
 
 from rewild4d.config import parse_flags, preset_names
+from rewild4d.leaderboard.specs import load_specs
 from rewild4d.protocol import find_protocol, load_protocols
 from rewild4d.registry import BUILTIN, load_dataset, load_method, names
 
@@ -29,4 +30,7 @@ def main(arguments: list[str]) -> int:
     for name, protocol in load_protocols().items():
         chosen = protocol.default and find_protocol(protocol.dataset, None).name == name
         print(f"  {name:<24} {protocol.title}" + (" (default)" if chosen else ""))
+    print("tables")
+    for name, spec in load_specs().items():
+        print(f"  {name:<24} {spec.title}")
     return 0

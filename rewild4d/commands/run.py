@@ -8,8 +8,9 @@ from typing import Any
 
 import msgspec
 
-from rewild4d.config import load_preset, parse_flags, preset_names, with_method_flags
-from rewild4d.contracts import DatasetReader
+from rewild4d.commands import run_table
+from rewild4d.commands.shared import check_numbers, floor_entry, open_dataset, require_writable
+from rewild4d.config import load_preset, parse_flags, with_method_flags
 from rewild4d.errors import UserError
 from rewild4d.leaderboard.records import RunRecord, to_json
 from rewild4d.leaderboard.tables import markdown
@@ -19,11 +20,12 @@ from rewild4d.priors.config import PRESETS as PRIOR_PRESETS
 from rewild4d.priors.config import STANDARD
 from rewild4d.protocol import find_protocol
 from rewild4d.rasterizer import pick_rasterizer
-from rewild4d.registry import load_builtin, load_dataset, load_method
-from rewild4d.runner import Entry, Plan, Progress, choose_cases, execute
+from rewild4d.registry import load_dataset, load_method
+from rewild4d.runner import Entry, Plan, choose_cases, execute
 
 DESCRIPTION = """Fit a method on every case of a data set and score it on the views that it never saw.
-Finished runs are skipped and a killed one resumes. Without --data the built-in animals are made on first use."""
+Finished runs are skipped and a killed one resumes. Without --data the built-in animals are made on first use.
+`run --table NAME` runs all that a table needs instead; its flags: `run --table NAME --help`."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,8 @@ class Options:
 
 def main(arguments: list[str]) -> int:
     """Run the command; 0 where every run has scores, 1 where one failed."""
+    if _peek(arguments, "--table") is not None:
+        return run_table.main(arguments)
     wanted = _peek(arguments, "--method") or Options.method
     preset = _peek(arguments, "--preset") or Options.preset
     method = load_method(wanted)
@@ -89,15 +93,13 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
     rasterizer = pick_rasterizer(options.rasterizer, device)
     load_dataset(options.dataset)  # an unknown data set is the first thing to say
     protocol = find_protocol(options.dataset, options.protocol)
-    for flag, value, least in (("--jobs", options.jobs, 0), ("--threads", options.threads, 1)):
-        if value < least:
-            raise UserError(f"{flag}: expected a number of at least {least}, got {value}.")
+    check_numbers(options.jobs, options.threads)
     if not options.seeds:
         raise UserError("--seeds: expected at least one number, got none.")
     require_writable(options.out)
     root, reader = open_dataset(options.dataset, options.data)
     cases = choose_cases(reader.cases(protocol.selection), options.case)
-    floors = [_floor(name) for name in protocol.floors if name != options.method]
+    floors = [floor_entry(name) for name in protocol.floors if name != options.method]
     entry = Entry(options.method, options.preset, config, tuple(dict.fromkeys(options.seeds)))
     prior = PriorChoice(options.prior, PRIOR_PRESETS.get(options.preset, STANDARD))
     cores = 1 if device.type == "cuda" else len(os.sched_getaffinity(0))
@@ -115,37 +117,6 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
         threads=options.threads,
         rasterizer=rasterizer,
     )
-
-
-def open_dataset(dataset: str, data: Path | None) -> tuple[Path, DatasetReader]:
-    """The folder and a reader on it; without a folder the built-in data, made where it is not there yet."""
-    reader = load_dataset(dataset)
-    if data is not None:
-        return data.absolute(), reader(data.absolute())
-    make_builtin = load_builtin(dataset)
-    if make_builtin is None:
-        raise UserError(f"--data: the data set '{dataset}' has no built-in data; name its folder.")
-    progress = Progress("built-in animals")
-    root = make_builtin(progress)
-    progress.close()
-    return root, reader(root)
-
-
-def require_writable(folder: Path) -> None:
-    """Fail before hours of work, not after."""
-    probe = folder / ".writable"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise UserError(f"--out {folder}: expected a folder that can be written, but: {error.strerror}.") from error
-
-
-def _floor(name: str) -> Entry:
-    presets = preset_names(name)
-    config_type = load_method(name).Config
-    return Entry(name, "default", load_preset(name, config_type, presets[0]) if presets else config_type(), (0,))
 
 
 def _peek(arguments: list[str], flag: str) -> str | None:

@@ -1,11 +1,23 @@
 """`table`: what was found, from records alone."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
+import tyro
+
+from rewild4d import planning
 from rewild4d.config import parse_flags
-from rewild4d.leaderboard.records import read_records
-from rewild4d.leaderboard.tables import markdown
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.leaderboard.formats import FORMATS
+from rewild4d.leaderboard.layout import Table
+from rewild4d.leaderboard.records import RunRecord, read_records
+from rewild4d.leaderboard.specs import find_spec
+from rewild4d.leaderboard.tables import difference_table, named_table, protocol_tables
+
+DESCRIPTION = """Print what was found, from the records in a folder: with a name one of the tables in leaderboard/tables
+(see `list`), rows averaged over the cases, the best bold, the second underlined; without one everything, a table per
+protocol, case by case."""
 
 
 @dataclass(frozen=True)
@@ -13,24 +25,56 @@ class Options:
     """Flags of `table`.
 
     Attributes:
+        name: of a table; everything where it is left out.
         runs: folder of runs (what `run --out` named).
-        protocol: only this protocol's runs.
+        format: md, latex (booktabs), html or csv (one line a figure, for programs).
+        against: label of a row: adds the difference of all others to it, case by case, with a bootstrap interval.
+        protocol: only this protocol's runs; of a table with one condition, that condition.
+        preset: of the runs in a named table; the table's own where it is left out.
         case: only these cases.
     """
 
+    name: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     runs: Path = Path("runs")
-    protocol: str | None = None
+    format: str = "md"
+    against: str = ""
+    protocol: str = ""
+    preset: str = ""
     case: tuple[str, ...] = ()
 
 
 def main(arguments: list[str]) -> int:
-    options = parse_flags(
-        Options, arguments, prog="rewild4d-bench table", description="Print Markdown tables of the records in a folder."
-    )
-    records = [
-        record
-        for record in read_records(options.runs)
-        if options.protocol in (None, record.protocol["name"]) and (not options.case or record.case in options.case)
-    ]
-    print(markdown(records))
+    options = parse_flags(Options, arguments, prog="rewild4d-bench table", description=DESCRIPTION)
+    if options.format not in FORMATS:
+        raise unknown_name("format", options.format, FORMATS)
+    if len(options.name) > 1:
+        raise UserError(f"table: expected the name of one table, got {' '.join(options.name)}.")
+    if options.against and not options.name:
+        raise UserError("--against: expected the name of a table too, as in `table artemis --against ours`.")
+    tables = _named(options) if options.name else _everything(options)
+    print("\n\n".join(FORMATS[options.format](table) for table in tables) or "no records")
     return 0
+
+
+def _everything(options: Options) -> list[Table]:
+    records = _records(options)
+    return protocol_tables([r for r in records if options.protocol in ("", r.protocol["name"])])
+
+
+def _named(options: Options) -> list[Table]:
+    name = options.name[0]
+    choice = planning.Choice(options.preset, options.protocol)
+    spec = planning.with_choice(name, find_spec(name), choice)
+    entrants, remarks = planning.entrants(name, spec, _records(options))
+    frame = planning.frame(name, spec)
+    gaps = [entrant.label for entrant in entrants if not entrant.absent and not all(entrant.records)]
+    if gaps:
+        command = f"rewild4d-bench run --table {name} --preset {spec.preset}"
+        remarks = [*remarks, f"Without records: {', '.join(gaps)}; `{command}` makes what is missing."]
+    frame = replace(frame, remarks=tuple(remarks))
+    tables = [named_table(frame, entrants, planning.reported(spec))]
+    return [*tables, difference_table(frame, entrants, options.against)] if options.against else tables
+
+
+def _records(options: Options) -> list[RunRecord]:
+    return [record for record in read_records(options.runs) if not options.case or record.case in options.case]

@@ -114,26 +114,46 @@ class Gaussians(nn.Module):
             return Splats(self.means, quats, self.scales(self.scales_log()), self.opacities(), self.splat_colors(quats))
 
 
-def initial_gaussians(prior: Prior, count: int, config: Canonical, generator: torch.Generator) -> dict[str, Tensor]:
+def initial_gaussians(
+    prior: Prior, count: int, config: Canonical, generator: torch.Generator, shape: bool = True
+) -> dict[str, Tensor]:
     """Flat Gaussians on the rest surface (METHOD section 3): radius sqrt(area / pi n), normal along the third axis.
+
+    Without the shape: round ones anywhere in its bounding box, of half the side of the share of it that each one has.
 
     Args:
         prior: its rest surface is sampled.
         count: number of Gaussians.
         config: thickness and opacity at the start.
         generator: the only source of chance.
+        shape: False takes nothing of the prior but its size.
 
     Returns:
         The five attributes by name; colours are mid-grey.
     """
-    surface = sample_surface(prior, count, generator)
+    means, quats, scales = (_on_surface if shape else _in_box)(prior, count, config.thickness, generator)
     colors = torch.zeros(count, (config.sh_degree + 1) ** 2, 3)
     colors[:, 0] = 0.5
-    scales = surface.radius * torch.tensor((1.0, 1.0, config.thickness))
     return {
-        "means": surface.points,
-        "quats": quats_from_normals(surface.normals),
+        "means": means,
+        "quats": quats,
         "log_scales": scales.log().expand(count, 3),
         "logit_opacities": torch.full((count,), math.log(config.opacity / (1 - config.opacity))),
         "colors": colors,
     }
+
+
+def _on_surface(
+    prior: Prior, count: int, thickness: float, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    surface = sample_surface(prior, count, generator)
+    scales = surface.radius * torch.tensor((1.0, 1.0, thickness))
+    return surface.points, quats_from_normals(surface.normals), scales
+
+
+def _in_box(prior: Prior, count: int, thickness: float, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    """Points as `_on_surface` gives them; round ones have no thickness of their own."""
+    low, high = prior.vertices.float().aminmax(dim=0)
+    means = low + (high - low) * torch.rand(count, 3, generator=generator)
+    quats = normalize(torch.randn(count, 4, generator=generator), dim=-1)
+    return means, quats, 0.5 * ((high - low).prod() / count) ** (1 / 3) * torch.ones(3)

@@ -4,6 +4,8 @@ Section numbers are the design's method notes. "fraction" means a share of `Conf
 length follow one schedule. Lengths without a unit are in the object frame, whose rest diagonal is 5.
 """
 
+from typing import Literal
+
 import msgspec
 
 
@@ -57,6 +59,9 @@ class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """At 0.1 all joints turn alike for ever; 1 tells them apart."""
     frequencies: int = 4
     """Octaves of the time code; 4 fitted better than 6 in the measured prototype."""
+    encoding: Literal["group", "view"] = "group"
+    """Sign that turns time in the code: the group's m, or the image's v (the paper's "w/o Symm. Enc.", emb(t v) + v:
+    both groups share one code). Without effect where `tied`: poses are then mirrored, not coded."""
     explicit_group: bool = False
     """Append the group sign m to the code."""
     width: int = 128
@@ -80,6 +85,8 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     enabled: bool = True
     """False is the paper's "w/o Deform" ablation."""
+    anchors: bool = True
+    """The query holds skinning weights times part anchors; False: the weights themselves ("w/o Part Anchors")."""
     width: int = 64
     """Hidden width; the dearest network of the method. 128 for 64: +0.03 dB on one horse, +0.3 on one cow (one seed,
     3,000 steps, preset standard), and 1.3 times the time of the whole fit."""
@@ -100,8 +107,11 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the prior's poses do after the start (section 4)."""
+    """What the prior's shape gives to the start, and its poses to what follows (sections 3 and 4)."""
 
+    shape: bool = True
+    """Start on the prior's rest surface; False: anywhere in its bounding box (the paper's "w/o Shape Prior"; skinning
+    and poses still start from the prior)."""
     blend: bool = False
     """Blend the prior's poses into the network's (paper; off on Artemis: after a warm-up it only undoes that)."""
     blend_until: float = 0.35

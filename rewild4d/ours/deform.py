@@ -29,10 +29,10 @@ class DeformNetwork(nn.Module):
     of the attention are folded into the few keys and values, so a Gaussian costs two small matrix products.
     """
 
-    def __init__(self, anchor_size: int, features: int, config: DeformConfig, generator: torch.Generator) -> None:
+    def __init__(self, parts: int, features: int, config: DeformConfig, generator: torch.Generator) -> None:
         super().__init__()
         self.config = config
-        self.inputs = anchor_size + 3 * (1 + 2 * config.frequencies) + 4 + 3
+        self.inputs = parts + 3 * (1 + 2 * config.frequencies) + 4 + 3
         width = config.width
         self.query, self.skip = nn.Linear(self.inputs, width), nn.Linear(self.inputs, width)
         self.key, self.value = nn.Linear(features, width), nn.Linear(features, width)
@@ -46,7 +46,7 @@ class DeformNetwork(nn.Module):
 
         Args:
             features: part features F_J, [J, K].
-            parts: part mixture of each Gaussian, weights times anchors, [n, D].
+            parts: part mixture of each Gaussian, weights times anchors, or the weights themselves, [n, D].
             posed: skinned Gaussians; gradients pass through to them, but not through the query.
             strength: the ramp, in [0, 1].
 

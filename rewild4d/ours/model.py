@@ -42,7 +42,8 @@ class Model(nn.Module):
         self.config = config
         self.gaussians, self.field = gaussians, field
         self.network = PoseNetwork(len(parents), config.pose, generator)
-        self.deform = DeformNetwork(config.pose.anchor_size, config.pose.width, config.deform, generator)
+        parts = config.pose.anchor_size if config.deform.anchors else len(parents)
+        self.deform = DeformNetwork(parts, config.pose.width, config.deform, generator)
         self.register_buffer("pivots", pivots)
         self.register_buffer("mirror", mirror)
         self.register_buffer("parents", parents)
@@ -53,8 +54,9 @@ class Model(nn.Module):
         view = torch.tensor([float(key.view) for key in keys])
         group = torch.tensor([float(key.group) for key in keys])
         if not pose_config.tied:
+            sign = group if pose_config.encoding == "group" else view
             return self.network(
-                time_code(times, group, view, pose_config.frequencies, pose_config.explicit_group).to(self.pivots)
+                time_code(times, sign, view, pose_config.frequencies, pose_config.explicit_group).to(self.pivots)
             )
         ones = torch.ones_like(view)
         pose = self.network(
@@ -101,7 +103,8 @@ class Model(nn.Module):
         if strength == 0 or not self.config.deform.enabled:
             return posed
         features = pose.features[0].detach() if self.config.deform.detach_features else pose.features[0]
-        return self.deform(features, weights.detach() @ self.network.anchors, posed, strength)
+        parts = weights.detach() @ self.network.anchors if self.config.deform.anchors else weights.detach()
+        return self.deform(features, parts, posed, strength)
 
     def moved(self, pose: Pose, weights: Tensor, strength: float) -> tuple[Posed, Posed]:
         """Skinned Gaussians, and the same deformed, of the appearance branch at a pose of one code."""
@@ -111,7 +114,7 @@ class Model(nn.Module):
 
 def build_model(config: Config, prior: Prior, generator: torch.Generator) -> Model:
     """The model at its start: Gaussians on the prior's rest surface, the field filled from its weights."""
-    values = initial_gaussians(prior, config.canonical.samples, config.canonical, generator)
+    values = initial_gaussians(prior, config.canonical.samples, config.canonical, generator, config.prior.shape)
     field = build_field(prior.vertices.float(), prior.weights.float(), prior.mirror.long(), config.skinning)
     skeleton = (prior.bones[:, 0].float(), prior.parents.long(), prior.mirror.long())
     return Model(config, Gaussians(values, config.canonical.max_scale), field, *skeleton, generator)

@@ -1,0 +1,183 @@
+"""The leaderboard as a static page: records in, a folder of HTML out that needs no server and no network."""
+
+import os
+import re
+import shutil
+from collections.abc import Iterator, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+
+from rewild4d.errors import UserError
+from rewild4d.leaderboard.curves import curve, moments
+from rewild4d.leaderboard.formats import ARROWS, html
+from rewild4d.leaderboard.layout import Table
+from rewild4d.leaderboard.records import FILE, RunRecord
+from rewild4d.leaderboard.tables import by_protocol, cell, columns_of, standings
+from rewild4d.leaderboard.variants import variants
+
+TITLE = "Reconstructing 4D animals from one video"
+MARKER = ".rewild4d-leaderboard"
+"""Lies in every folder that was built, so that only such a folder is ever replaced."""
+CAPTIONS = {
+    "comparison.png": "Input, render, and a view that was held out: truth and render. One row a moment.",
+    "canonical.png": "Canonical Gaussians, coloured by the parts that move them.",
+    "input.mp4": "Input beside render, from the input view.",
+    "orbit.mp4": "One turn around the moving animal.",
+}
+Found = tuple[Path, RunRecord]
+
+
+def build_site(found: Sequence[Found], out: Path, tables: Sequence[Table] = ()) -> Path:
+    """Write the page of all records; an older one in the same place is replaced once the new one is complete.
+
+    Args:
+        found: records with the folders that hold them and their pictures.
+        out: a folder that is not there, is empty, or was built before.
+        tables: named ones, to be shown below those of the protocols.
+
+    Returns:
+        The path of its first page.
+
+    Raises:
+        UserError: the folder holds something else, or cannot be written.
+    """
+    if out.exists() and not (out.is_dir() and ((out / MARKER).is_file() or not any(out.iterdir()))):
+        raise UserError(f"{out}: expected an empty folder or an earlier leaderboard, but it holds something else.")
+    building = out.with_name(f".{out.name}.{os.getpid()}")
+    try:
+        building.mkdir(parents=True)
+        _write(_unique(found), building, tables)
+        if out.exists():
+            shutil.rmtree(out)
+        building.rename(out)
+    except OSError as error:
+        raise UserError(f"{out}: the leaderboard could not be written: {error.strerror or error}.") from error
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+    return out / "index.html"
+
+
+def _write(found: Sequence[Found], folder: Path, tables: Sequence[Table]) -> None:
+    (folder / MARKER).touch()
+    pages = jinja2.Environment(
+        loader=jinja2.FunctionLoader(_template), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    assets = {"style": Markup(_template("style.css")), "script": Markup(_template("script.js"))}
+    for source, record in found:
+        page = folder / _place(record)
+        page.mkdir(parents=True)
+        pictures = list(_copy_pictures(source, record, page))
+        shutil.copyfile(source / FILE, page / FILE)
+        text = pages.get_template("run.html").render(
+            title=f"{record.method} on {record.case}", record=record, scores=_scores(record), curves=_curves(record),
+            pictures=pictures, provenance=_provenance(record), **assets,
+        )  # fmt: skip
+        (page / "index.html").write_text(text, encoding="utf-8")
+    named = [{"name": t.name, "title": t.title, "html": Markup(html(t))} for t in tables]
+    text = pages.get_template("index.html").render(
+        title=TITLE, counts=_counts(found), sections=_sections([record for _, record in found]), tables=named,
+        arrows=ARROWS, **assets,
+    )  # fmt: skip
+    (folder / "index.html").write_text(text, encoding="utf-8")
+
+
+def _template(name: str) -> str:
+    return (resources.files("rewild4d.leaderboard") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _unique(found: Sequence[Found]) -> list[Found]:
+    """One of each run, should a folder hold copies."""
+    return list({record.run_id: (source, record) for source, record in found}.values())
+
+
+def _place(record: RunRecord) -> Path:
+    """Where a run's page lies; a record is a file from anybody, so its id is no path until it looks like one."""
+    if not re.fullmatch(r"[0-9A-Za-z_-]{1,64}", record.run_id):
+        raise UserError(f"expected a run id of letters and digits, got '{record.run_id}'.")
+    return Path("runs") / record.run_id
+
+
+def _counts(found: Sequence[Found]) -> str:
+    records = [record for _, record in found]
+    cases, methods = len({r.case for r in records}), len({r.method for r in records})
+    return f"{len(records)} runs of {methods} methods on {cases} cases."
+
+
+def _sections(records: Sequence[RunRecord]) -> list[dict[str, Any]]:
+    """What the first page shows of each protocol."""
+    sections = []
+    for group, table in zip(by_protocol(records), standings(records), strict=True):
+        labels = {record.run_id: variant.label for variant in variants(group) for record in variant.records}
+        protocol = group[0].protocol
+        sections.append({
+            "name": table.name, "title": table.title, "description": protocol.get("description", ""),
+            "standings": Markup(html(table)), "columns": columns_of(group),
+            "runs": [_run_row(record, labels[record.run_id]) for record in group],
+        })  # fmt: skip
+    return sections
+
+
+def _run_row(record: RunRecord, label: str) -> dict[str, Any]:
+    return {
+        "id": record.run_id, "href": f"{_place(record).as_posix()}/index.html", "case": record.case, "label": label,
+        "preset": record.preset, "seed": record.seed, "status": record.status, "seconds": record.timing.fit_seconds,
+        "cells": [cell([record], [record.case], name) for name in record.protocol["scores"]],
+    }  # fmt: skip
+
+
+def _scores(record: RunRecord) -> list[dict[str, Any]]:
+    rows = []
+    for column in columns_of([record]):
+        score = record.scores.get(column.score)
+        if score is not None:
+            shown = cell([record], [record.case], column.score)
+            title = f"{column.title.partition(',')[0]} {ARROWS[column.better]}"
+            rows.append({"title": title, "value": score.value, "text": shown.text, "unit": score.unit,
+                         "count": score.count, "note": score.note})  # fmt: skip
+    return rows
+
+
+def _curves(record: RunRecord) -> list[Markup]:
+    """A curve of each score that has values at several moments."""
+    curves = []
+    for column in columns_of([record]):
+        score = record.scores.get(column.score)
+        points = moments(score, record.items) if score else []
+        if len(points) > 1:
+            curves.append(Markup(curve(column.title, points)))
+    return curves
+
+
+def _copy_pictures(source: Path, record: RunRecord, page: Path) -> Iterator[dict[str, Any]]:
+    """Pictures that lie beside the record, held-out comparison first."""
+    order = list(CAPTIONS)
+    names = sorted({Path(name).name for name in record.pictures}, key=lambda n: order.index(n) if n in order else 9)
+    for name in names:
+        if (source / name).is_file():
+            shutil.copyfile(source / name, page / name)
+            yield {"name": name, "caption": CAPTIONS.get(name, name), "video": name.endswith(".mp4")}
+
+
+def _provenance(record: RunRecord) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Every part of the record that is no score, as tables of names and values."""
+    parts = {
+        "Settings of the method": record.config, "Data": record.data, "Prior": record.prior,
+        "Protocol": record.protocol, "What the numbers lean on": record.coverage,
+        "What the method says of itself": record.diagnostics, "Networks of the metrics": record.networks,
+        "Code": record.code, "Machine": record.machine,
+        "Time": {"started": record.timing.started, "fit, s": record.timing.fit_seconds,
+                 "evaluation, s": record.timing.evaluate_seconds, "peak memory, MiB": record.timing.peak_memory_mib},
+    }  # fmt: skip
+    return [(title, list(_rows(part))) for title, part in parts.items() if part]
+
+
+def _rows(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from _rows(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, ", ".join(map(str, value)) if isinstance(value, list) else str(value)

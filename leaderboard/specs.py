@@ -1,0 +1,148 @@
+"""Tables as data (leaderboard/tables/*.toml) and what the paper printed (leaderboard/paper/*.json)."""
+
+from collections.abc import Mapping
+from importlib import resources
+from typing import Any, TypeVar
+
+import msgspec
+
+from rewild4d.errors import UserError, unknown_name
+
+T = TypeVar("T")
+
+
+class Condition(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What every row is measured under: a group of columns.
+
+    Attributes:
+        title: of the group; may be left out where there is only one.
+        protocol: its name; without a version the newest one.
+        prior: what `run --prior` says.
+        cases: patterns of cases, all where it is left out.
+    """
+
+    protocol: str
+    title: str = ""
+    prior: str = "template"
+    cases: tuple[str, ...] = ()
+
+
+class Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One row.
+
+    Attributes:
+        label: as printed.
+        method: its name in the registry.
+        settings: what differs from the preset, nested as in a preset file.
+        preset: another one than the table's.
+        note: a sentence that the table prints below.
+    """
+
+    label: str
+    method: str
+    settings: dict[str, Any] = {}
+    preset: str | None = None
+    note: str = ""
+
+
+class Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One table.
+
+    Attributes:
+        title: as printed.
+        description: how to read it.
+        dataset: name of a data set.
+        scores: names of the scores, a column each under every condition.
+        conditions: groups of columns.
+        rows: labels, methods and settings.
+        preset: where the command line names none.
+        seeds: where the command line names none.
+        paper: name of the file of reported numbers, "" for none.
+    """
+
+    title: str
+    dataset: str
+    scores: tuple[str, ...]
+    conditions: tuple[Condition, ...]
+    rows: tuple[Line, ...]
+    description: str = ""
+    preset: str = "standard"
+    seeds: tuple[int, ...] = (0, 1, 2)
+    paper: str = ""
+
+
+class ReportedCell(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A number that the paper printed, or of which only the difference to its own method is known.
+
+    Attributes:
+        value: as printed; None where it is not known.
+        difference: the row's value less that of the paper's method; None where `value` is known.
+        origin: where it was read.
+    """
+
+    origin: str
+    value: float | None = None
+    difference: float | None = None
+
+
+class ReportedRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One row of the paper's table: cells by the name of the score."""
+
+    label: str
+    cells: dict[str, ReportedCell]
+    note: str = ""
+
+
+class Reported(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One table of the paper, as far as its numbers are known.
+
+    Attributes:
+        source: the paper and its table.
+        note: what is not known, and why a comparison is loose.
+    """
+
+    source: str
+    note: str
+    rows: tuple[ReportedRow, ...]
+
+
+def load_specs() -> dict[str, Spec]:
+    """All tables that ship with the package, by name."""
+    return {name: _decode(f"tables/{name}.toml", data, Spec) for name, data in _files("tables", ".toml").items()}
+
+
+def find_spec(name: str) -> Spec:
+    """The table of that name.
+
+    Raises:
+        UserError: there is none.
+    """
+    specs = load_specs()
+    if name not in specs:
+        raise unknown_name("table", name, specs)
+    return specs[name]
+
+
+def load_reported(name: str) -> Reported:
+    """The paper's table of that name.
+
+    Raises:
+        UserError: there is none.
+    """
+    files = _files("paper", ".json")
+    if name not in files:
+        raise unknown_name("table of the paper", name, files)
+    return _decode(f"paper/{name}.json", files[name], Reported)
+
+
+def _files(folder: str, suffix: str) -> Mapping[str, bytes]:
+    entries = sorted((resources.files("rewild4d.leaderboard") / folder).iterdir(), key=lambda entry: entry.name)
+    return {entry.name.removesuffix(suffix): entry.read_bytes() for entry in entries if entry.name.endswith(suffix)}
+
+
+def _decode(path: str, data: bytes, kind: type[T]) -> T:
+    decode = msgspec.json.decode if path.endswith(".json") else msgspec.toml.decode
+    try:
+        return decode(data, type=kind)
+    except (msgspec.MsgspecError, ValueError) as error:
+        raise UserError(f"leaderboard/{path}: expected {kind.__name__}, but {error}.") from error

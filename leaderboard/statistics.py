@@ -1,0 +1,123 @@
+"""What several seeds and several cases say together: means, spreads, ranks, paired differences."""
+
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+Seeds = Mapping[int, float]
+"""Seed -> value."""
+Cases = Mapping[str, Seeds]
+"""Case -> seed -> value."""
+DRAWS = 10_000
+"""Of the bootstrap; with ten thousand the ends of a 95 % interval stand still to two digits."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over cases of the mean over seeds.
+
+    Attributes:
+        mean: of the cases.
+        spread: standard deviation over seeds of the mean over cases, None where fewer than two seeds are complete.
+        seeds: how many seeds every case has.
+    """
+
+    mean: float
+    spread: float | None
+    seeds: int
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How much higher one method is than another, over the same cases.
+
+    Attributes:
+        mean: of the cases' differences.
+        interval: ends of the 95 % interval, None where there is one case and one seed.
+        cases: how many cases.
+    """
+
+    mean: float
+    interval: tuple[float, float] | None
+    cases: int
+
+
+def estimate(values: Cases) -> Estimate:
+    """Mean and spread; every case counts once, however many seeds it has.
+
+    Args:
+        values: at least one case, each with at least one seed.
+    """
+    mean = statistics.fmean(statistics.fmean(seeds.values()) for seeds in values.values())
+    common = set.intersection(*(set(seeds) for seeds in values.values()))
+    per_seed = [statistics.fmean(seeds[seed] for seeds in values.values()) for seed in sorted(common)]
+    return Estimate(mean, statistics.stdev(per_seed) if len(per_seed) > 1 else None, len(per_seed))
+
+
+def paired(values: Cases, reference: Cases) -> Difference:
+    """Difference to a reference, case by case, with a bootstrap interval.
+
+    Cases are drawn with replacement, then the seeds of either side within each, so that the interval holds both what
+    another set of animals and what another set of seeds would change. With one case only the seeds vary.
+
+    Args:
+        values: of one method.
+        reference: of the other; cases that only one side has are left out.
+
+    Raises:
+        ValueError: no case in common.
+    """
+    shared = [case for case in values if case in reference]
+    if not shared:
+        raise ValueError("expected at least one case in common, got none")
+    sides = [[np.array(list(side[case].values())) for case in shared] for side in (values, reference)]
+    mean = float(np.mean([a.mean() - b.mean() for a, b in zip(*sides, strict=True)]))
+    if len(shared) == 1 and all(len(side[0]) == 1 for side in sides):
+        return Difference(mean, None, 1)
+    generator = np.random.default_rng(0)
+    drawn = np.zeros((len(shared), DRAWS))
+    for sign, side in zip((1.0, -1.0), sides, strict=True):
+        for row, seeds in enumerate(side):
+            picks = generator.integers(len(seeds), size=(DRAWS, len(seeds)))
+            drawn[row] += sign * seeds[picks].mean(axis=1)
+    rows = generator.integers(len(shared), size=(len(shared), DRAWS))
+    means = np.take_along_axis(drawn, rows, axis=0).mean(axis=0)
+    low, high = np.quantile(means, (0.025, 0.975))
+    return Difference(mean, (float(low), float(high)), len(shared))
+
+
+def ranks(estimates: Sequence[Estimate | None], better: str, digits: int) -> list[str]:
+    """Which entries are "best" and which "second"; the others, and those without a value, get "".
+
+    An entry that the spread over seeds does not tell apart from the one before it is not ranked behind it: where the
+    lead of the best is within the larger of the two spreads nobody is best, and all those within it are second.
+
+    Args:
+        estimates: of the competitors.
+        better: "higher" or "lower".
+        digits: printed after the point; what prints alike is alike.
+    """
+    sign = -1 if better == "higher" else 1
+    known = [(sign * round(found.mean, digits), index) for index, found in enumerate(estimates) if found is not None]
+    marks = [""] * len(estimates)
+    first = _leaders(sorted(known), estimates)
+    if len(first) == 1 and len(known) > 1:
+        marks[first[0]] = "best"
+        first = _leaders(sorted(entry for entry in known if entry[1] != first[0]), estimates)
+    if len(known) > 1:
+        for index in first:
+            marks[index] = "second"
+    return marks
+
+
+def _leaders(ordered: Sequence[tuple[float, int]], estimates: Sequence[Estimate | None]) -> list[int]:
+    """Indices of the first and of all that the spread does not tell apart from it."""
+
+    def spread(index: int) -> float:
+        found = estimates[index]
+        return (found.spread or 0.0) if found else 0.0
+
+    value, best = ordered[0] if ordered else (0.0, 0)
+    return [index for other, index in ordered if other - value <= max(spread(best), spread(index))]

@@ -1,0 +1,134 @@
+"""Which records belong together: runs of one method with one set of settings, the latest of each."""
+
+import hashlib
+import json
+import statistics
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rewild4d.leaderboard.records import RunRecord
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A method with its settings.
+
+    Attributes:
+        label: method, with what tells it from other variants of it: preset, settings, prior.
+        records: all its runs.
+        is_floor: whether the protocol names it as one.
+        marks: what the records say beside their numbers ("upper bound: ...").
+    """
+
+    label: str
+    records: tuple[RunRecord, ...]
+    is_floor: bool
+    marks: tuple[str, ...]
+
+
+def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
+    """The records that may stand in one table, and sentences on those left out.
+
+    Of equal runs by several versions of the code the latest one counts. Of a case whose data has changed, and of a
+    protocol that has, only the runs on the latest one count.
+    """
+    remarks = []
+    kept: list[RunRecord] = []
+    cases: dict[tuple[str, str, str], list[RunRecord]] = defaultdict(list)
+    for record in records:
+        cases[record.dataset, record.protocol["name"], record.case].append(record)
+    for (_, protocol, case), runs in cases.items():
+        newest = max(runs, key=_age)
+        same = [run for run in runs if _ground(run) == _ground(newest)]
+        if len(same) < len(runs):
+            remarks.append(f"{protocol}, {case}: {len(runs) - len(same)} older records of other data left out.")
+        once: dict[tuple[str, int], RunRecord] = {}
+        for run in sorted(same, key=_age):
+            once[_identity(run), run.seed] = run
+        kept += [run for run in same if once[_identity(run), run.seed] is run]
+    versions = {record.code.get("sources", "") for record in kept if record.code}
+    if len(versions) > 1:
+        remarks.append(f"Runs of {len(versions)} versions of the code.")
+    return kept, remarks
+
+
+def variants(records: Sequence[RunRecord]) -> list[Variant]:
+    """Records grouped by method, preset, settings and prior, in the order in which they are met."""
+    groups: dict[str, list[RunRecord]] = defaultdict(list)
+    for record in records:
+        groups[_identity(record)].append(record)
+    found = list(groups.values())
+    return [
+        Variant(_label(group[0], [other[0] for other in found]), tuple(group), is_floor(group[0]), marks(group))
+        for group in found
+    ]
+
+
+def is_floor(record: RunRecord) -> bool:
+    """Whether the record's protocol names its method as a floor."""
+    return record.method in record.protocol.get("floors", ())
+
+
+def marks(records: Sequence[RunRecord]) -> tuple[str, ...]:
+    """What the records say beside their numbers, each sentence once."""
+    return tuple(dict.fromkeys(mark for record in records for mark in record.marks))
+
+
+def coverage_text(records: Sequence[RunRecord]) -> str:
+    """What the numbers lean on, averaged over the cases."""
+    by_case = {record.case: record.coverage for record in records if record.coverage}
+    parts = []
+    for key, text in (("foreground", "of a held-out image is animal"), ("seen_surface", "of its surface ever shown")):
+        values = [found[key] for found in by_case.values() if key in found]
+        if values:
+            parts.append(f"{100 * statistics.fmean(values):.0f} % {text}")
+    return ", ".join(parts) or "coverage unknown"
+
+
+def _age(record: RunRecord) -> tuple[str, str]:
+    return record.timing.started, record.run_id
+
+
+def _ground(record: RunRecord) -> tuple[Any, ...]:
+    """What two runs of a case must share to be compared."""
+    return record.data.get("clip"), record.data.get("truth"), record.protocol.get("digest")
+
+
+def _settings(record: RunRecord) -> dict[str, Any]:
+    """Everything that tells variants of a method apart, flat: "deform.enabled" -> False."""
+    fit = json.dumps(record.prior.get("config"), sort_keys=True).encode()
+    return _flat(record.config) | {
+        "--prior": record.prior.get("choice", record.prior.get("name")),
+        "prior fit": hashlib.sha256(fit).hexdigest()[:4],
+    }
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat
+
+
+def _identity(record: RunRecord) -> str:
+    return json.dumps([record.method, record.preset, _settings(record)], sort_keys=True)
+
+
+def _label(record: RunRecord, others: Sequence[RunRecord]) -> str:
+    """The method; its preset where there are several; the settings in which it differs from most of its variants."""
+    kin = [other for other in others if other.method == record.method]
+    peers = [_settings(other) for other in kin if other.preset == record.preset]
+    preset = f" ({record.preset})" if len({other.preset for other in kin}) > 1 else ""
+    changed = []
+    for name, value in _settings(record).items():
+        counts = Counter(json.dumps(peer.get(name)) for peer in peers).most_common(2)
+        alone = len(counts) == 1
+        usual = counts[0][0] if alone or counts[0][1] > counts[1][1] else None
+        if not alone and json.dumps(value) != usual:
+            changed.append(f"{name}={json.dumps(value)}")
+    return record.method + preset + (f" [{', '.join(changed)}]" if changed else "")

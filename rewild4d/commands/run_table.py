@@ -1,0 +1,123 @@
+"""`run --table NAME`: plan what a table needs, run what is missing, print it."""
+
+import os
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rewild4d import planning
+from rewild4d.commands.shared import check_numbers, floor_entry, open_dataset, require_writable
+from rewild4d.config import parse_flags
+from rewild4d.leaderboard.formats import markdown
+from rewild4d.leaderboard.layout import Table
+from rewild4d.leaderboard.records import RunRecord, to_json
+from rewild4d.leaderboard.specs import Spec, find_spec
+from rewild4d.leaderboard.tables import named_table
+from rewild4d.machine import pick_device
+from rewild4d.priors.choose import PriorChoice
+from rewild4d.priors.config import PRESETS as PRIOR_PRESETS
+from rewild4d.priors.config import STANDARD
+from rewild4d.rasterizer import pick_rasterizer
+from rewild4d.registry import load_dataset
+from rewild4d.runner import Plan, choose_cases, execute, pieces
+
+DESCRIPTION = """Fit what a table of leaderboard/tables (see `list`) needs and has no record for yet, on every case, and
+print it. Finished runs are skipped and a killed one resumes."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Flags of `run --table`.
+
+    Attributes:
+        table: which one.
+        data: one animal's folder or a folder of animals; the built-in animals where it is left out.
+        case: names or patterns of cases ("wolf/Run", "wolf/*"); all that the table wants where it is left out.
+        protocol: instead of the table's, where it has one condition.
+        preset: size of the effort: quick, standard or paper; the table's where it is left out.
+        seeds: one run for each; the table's where they are left out.
+        device: auto, cpu or cuda.
+        rasterizer: what renders: auto, numba (CPU), triton or gsplat (CUDA), or reference (small scenes only).
+        jobs: runs at a time; 0 is one for each processor core (one in all on a GPU).
+        threads: of each run; other numbers than 1 may change the last digits.
+        out: folder for runs.
+        plan: print what would be run, and run nothing.
+        json: print the records as a JSON array, and nothing else, to standard output.
+    """
+
+    table: str
+    data: Path | None = None
+    case: tuple[str, ...] = ()
+    protocol: str = ""
+    preset: str = ""
+    seeds: tuple[int, ...] = ()
+    device: str = "auto"
+    rasterizer: str = "auto"
+    jobs: int = 0
+    threads: int = 1
+    out: Path = Path("runs")
+    plan: bool = False
+    json: bool = False
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command; 0 where every run has scores, 1 where one failed."""
+    options = parse_flags(Options, arguments, prog="rewild4d-bench run", description=DESCRIPTION)
+    found = find_spec(options.table)
+    spec = planning.with_choice(options.table, found, planning.Choice(options.preset, options.protocol))
+    plans = make_plans(options, spec)
+    if options.plan:
+        for plan in plans:
+            _print_plan(plan)
+        return 0
+    records = [record for plan in plans for record in execute(plan)]
+    if options.json:
+        print("[" + ",\n".join(map(to_json, records)) + "]")
+    else:
+        print(markdown(_table(options, spec, records)))
+        print(f"\nrecords: {options.out}", file=sys.stderr)
+    return 0 if all(record.status == "ok" for record in records) else 1
+
+
+def make_plans(options: Options, spec: Spec) -> list[Plan]:
+    """A plan for each protocol and prior of the table.
+
+    Raises:
+        UserError: an unknown name, or a folder that is not there or cannot be written.
+    """
+    check_numbers(options.jobs, options.threads)
+    device = pick_device(options.device)
+    rasterizer = pick_rasterizer(options.rasterizer, device)
+    load_dataset(spec.dataset)
+    protocols = {one.protocol: planning.protocol_of(spec, one.protocol) for one in spec.conditions}
+    entries = planning.entries(options.table, spec, tuple(dict.fromkeys(options.seeds or spec.seeds)))
+    require_writable(options.out)
+    root, reader = open_dataset(spec.dataset, options.data)
+    cores = 1 if device.type == "cuda" else len(os.sched_getaffinity(0))
+    effort = PRIOR_PRESETS.get(spec.preset, STANDARD)
+    plans = []
+    for (name, prior), patterns in planning.grounds(spec).items():
+        protocol = protocols[name]
+        cases = choose_cases(choose_cases(reader.cases(protocol.selection), patterns), options.case)
+        own = {entry.method for entry in entries}
+        floors = [floor_entry(floor) for floor in protocol.floors if floor not in own]
+        plans.append(
+            Plan(
+                dataset=spec.dataset, reader=reader, root=root, cases=cases, protocol=protocol,
+                entries=(*floors, *entries), prior=PriorChoice(prior, effort), device=device,
+                out=options.out.absolute(), jobs=options.jobs or cores, threads=options.threads, rasterizer=rasterizer,
+            )
+        )  # fmt: skip
+    return plans
+
+
+def _table(options: Options, spec: Spec, records: list[RunRecord]) -> Table:
+    rows, remarks = planning.entrants(options.table, spec, records)
+    frame = replace(planning.frame(options.table, spec), remarks=tuple(remarks))
+    return named_table(frame, rows, planning.reported(spec))
+
+
+def _print_plan(plan: Plan) -> None:
+    """One line a run: whether it has a good record, and its folder."""
+    for job in pieces(plan):
+        print("done   " if job.finished() else "missing", job.folder)

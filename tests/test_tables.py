@@ -1,0 +1,298 @@
+"""Tables: means, spreads and ranks by hand, notes, refusals, and what the four writers make of them."""
+
+import csv
+import io
+import math
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from records_for_tests import PROTOCOL, lower, psnr, record
+
+from rewild4d.errors import UserError
+from rewild4d.leaderboard.formats import FORMATS, html, latex, markdown, tidy_csv
+from rewild4d.leaderboard.layout import Table
+from rewild4d.leaderboard.records import RunRecord, Timing
+from rewild4d.leaderboard.specs import Reported, ReportedCell, ReportedRow
+from rewild4d.leaderboard.statistics import Estimate, estimate, paired, ranks
+from rewild4d.leaderboard.tables import Entrant, Frame, difference_table, named_table, protocol_tables, standings
+
+FRAME = Frame("t", "Title", "How to read it", ("",), ("psnr",))
+
+
+def runs(values: dict[str, list[float]], **changes: object) -> tuple[RunRecord, ...]:
+    """Runs by case, a seed a value."""
+    return tuple(
+        record(case=case, seed=seed, scores=psnr(value), **changes)
+        for case, found in values.items()
+        for seed, value in enumerate(found)
+    )
+
+
+def table(**rows: tuple[RunRecord, ...]) -> Table:
+    return named_table(FRAME, [Entrant(label, (found,)) for label, found in rows.items()])
+
+
+def texts(made: Table) -> dict[str, tuple[str, str, str]]:
+    """Row -> text, spread and mark of its first cell."""
+    return {row.stubs[0]: (row.cells[0].text, row.cells[0].spread, row.cells[0].mark) for row in made.rows}
+
+
+def test_mean_and_spread_by_hand() -> None:
+    found = estimate({"a": {0: 10.0, 1: 12.0}, "b": {0: 20.0, 1: 26.0}})
+    assert found.mean == ((10 + 12) / 2 + (20 + 26) / 2) / 2
+    assert found.spread == pytest.approx(np.std([(10 + 20) / 2, (12 + 26) / 2], ddof=1))
+    assert estimate({"a": {0: 10.0, 1: 20.0}, "b": {0: 30.0}}) == Estimate((15 + 30) / 2, None, 1)
+
+
+def test_ranks_mind_the_spread() -> None:
+    def marks(*pairs: tuple[float, float | None] | None, better: str = "higher") -> list[str]:
+        return ranks([Estimate(*pair, 3) if pair else None for pair in pairs], better, 2)
+
+    assert marks((20, 0.1), (21, 0.1), (19, 0.1)) == ["second", "best", ""]
+    assert marks((20, 0.1), (21, 0.1), (19, 0.1), better="lower") == ["second", "", "best"]
+    # A lead of 0.05 within a spread of 0.1: nobody is best.
+    assert marks((20.00, 0.1), (20.05, 0.02), (19, 0.1)) == ["second", "second", ""]
+    # The second and the third are not told apart either.
+    assert marks((25, 0.1), (20.0, 0.3), (19.8, 0.1), (18, 0.1)) == ["best", "second", "second", ""]
+    # What prints alike is alike, also without a spread.
+    assert marks((20.001, None), (20.002, None)) == ["second", "second"]
+    assert marks((20.0, None), None, (19.0, None)) == ["best", "", "second"]
+    assert marks((20.0, None)) == [""], "one competitor beats nobody"
+    assert marks(None, None) == ["", ""]
+
+
+def test_a_paired_difference_beats_the_spread_of_cases() -> None:
+    """Cases differ by 10 dB, methods by 1 dB on every one of them: the interval holds 1 and not 0."""
+    one = {case: {0: base + 1.0} for case, base in (("a", 10.0), ("b", 20.0), ("c", 30.0))}
+    other = {case: {0: base} for case, base in (("a", 10.0), ("b", 20.0), ("c", 30.0))}
+    assert paired(one, other).mean == 1.0
+    assert paired(one, other).interval == (1.0, 1.0)
+    back = paired(other, one)
+    assert (back.mean, back.interval, back.cases) == (-1.0, (-1.0, -1.0), 3)
+
+
+def test_the_bootstrap_is_that_of_the_mean() -> None:
+    """For many cases the interval is the normal one: 1.96 standard errors either way."""
+    noise = np.random.default_rng(1).normal(2.0, 1.0, 400)
+    one = {str(i): {0: float(value)} for i, value in enumerate(noise)}
+    other = {str(i): {0: 0.0} for i in range(400)}
+    low, high = paired(one, other).interval or (math.nan, math.nan)
+    error = noise.std(ddof=1) / math.sqrt(400)
+    assert low == pytest.approx(noise.mean() - 1.96 * error, abs=0.15 * error)
+    assert high == pytest.approx(noise.mean() + 1.96 * error, abs=0.15 * error)
+
+
+def test_a_single_case_has_an_interval_from_its_seeds_only() -> None:
+    assert paired({"a": {0: 3.0}}, {"a": {0: 1.0}}).interval is None
+    low, high = paired({"a": {0: 3.0, 1: 5.0}}, {"a": {0: 1.0}}).interval or (math.nan, math.nan)
+    assert (low, high) == (3.0 - 1.0, 5.0 - 1.0)
+    with pytest.raises(ValueError, match="expected at least one case in common, got none"):
+        paired({"a": {0: 1.0}}, {"b": {0: 1.0}})
+
+
+def test_best_bold_and_second_underlined() -> None:
+    made = table(ours=runs({"a": [20.0, 20.2]}), gart=runs({"a": [15.0, 15.2]}), d3dgs=runs({"a": [18.0, 18.2]}))
+    spread = f"{np.std([0, 0.2], ddof=1):.2f}"
+    assert texts(made) == {
+        "ours": ("20.10", spread, "best"), "gart": ("15.10", spread, ""), "d3dgs": ("18.10", spread, "second"),
+    }  # fmt: skip
+    assert r"ours & \textbf{20.10} {\scriptsize $\pm$ 0.14} \\" in latex(made)
+    assert r"d3dgs & \underline{18.10}" in latex(made)
+    assert '<td data-value="20.1"><b>20.10</b> <small>± 0.14</small></td>' in html(made)
+    assert "| ours | **20.10** ± 0.14 |" in markdown(made)
+
+
+def test_less_is_better_where_the_record_says_so() -> None:
+    made = table(ours=(record(scores=lower(0.3)),), gart=(record(scores=lower(0.2)),))
+    assert texts(made)["gart"][2] == "best"
+    assert made.columns[0].better == "lower"
+    assert "PSNR ↓" in markdown(made)
+
+
+def test_unequal_sets_of_cases_are_not_averaged() -> None:
+    made = table(ours=runs({"a": [10.0], "b": [30.0]}), gart=runs({"a": [40.0]}))
+    assert texts(made) == {"ours": ("20.00", "", ""), "gart": ("n/a", "", "")}
+    assert made.notes == ("not computed: no result for b",)
+    assert "| gart | n/a [1] |" in markdown(made) and "[1] not computed: no result for b" in markdown(made)
+    assert r"gart & n/a\textsuperscript{1}" in latex(made)
+
+
+def test_what_has_no_number_says_why() -> None:
+    failed = record(status="failed", error="it diverged", scores={})
+    later = record(scores=psnr(None, "not computed: weights missing, run: rewild4d-bench weights fetch"))
+    other = record(scores={}, protocol=PROTOCOL)
+    made = named_table(FRAME, [
+        Entrant("failed", ((failed,),)), Entrant("without", ((later,),)), Entrant("unmeasured", ((other,),)),
+        Entrant("nobody", ((),)), Entrant("unknown", ((),), absent="unknown method 'x'."),
+        Entrant("fine", ((record(),),)),
+    ])  # fmt: skip
+    assert [row.cells[0].text for row in made.rows] == ["failed", "n/a", "n/a", "n/a", "n/a", "20.00"]
+    assert made.notes == (
+        "wolf/Run, ours: failed: it diverged",
+        "not computed: weights missing, run: rewild4d-bench weights fetch",
+        "not computed: p-v1 does not measure it",
+        "no record yet",
+        "unknown method 'x'.",
+    )
+
+
+def test_a_failed_seed_is_told_and_does_not_count() -> None:
+    some = (*runs({"a": [20.0, 22.0]}), record(case="a", seed=2, status="failed", error="it diverged", scores={}))
+    made = table(ours=some)
+    assert made.rows[0].cells[0].text == "21.00"
+    assert made.notes == ("1 of 3 runs failed: it diverged",)
+
+
+def test_floors_compete_and_come_last() -> None:
+    made = table(empty=runs({"a": [30.0]}, method="empty"), ours=runs({"a": [20.0]}))
+    assert [(row.stubs[0], row.kind, row.cells[0].mark) for row in made.rows] == [
+        ("ours", "method", "second"), ("empty", "floor", "best"),
+    ]  # fmt: skip
+
+
+def test_rows_with_an_advantage_are_marked_and_not_ranked() -> None:
+    mark = "upper bound: rotated to the best input-view PSNR"
+    made = table(ours=runs({"a": [20.0]}), rotated=runs({"a": [30.0]}, marks=[mark]), gart=runs({"a": [10.0]}))
+    assert {label: found[2] for label, found in texts(made).items()} == {
+        "ours": "best",
+        "gart": "second",
+        "rotated": "",
+    }
+    assert made.notes == (mark,)
+    assert "| rotated [1] | 30.00 |" in markdown(made)
+
+
+def test_reported_rows_are_marked_and_never_ranked() -> None:
+    cells = {"psnr": ReportedCell(value=99.0, origin="o")}, {"psnr": ReportedCell(difference=-4.0, origin="o")}
+    reported = Reported(source="Paper, its table", note="Loose.", rows=(
+        ReportedRow(label="Ours", cells=cells[0]), ReportedRow(label="GART", cells=cells[1]),
+        ReportedRow(label="None", cells={}),
+    ))  # fmt: skip
+    made = named_table(FRAME, [Entrant("ours", (runs({"a": [20.0]}),)), Entrant("g", (runs({"a": [10.0]}),))], reported)
+    assert texts(made) == {
+        "ours": ("20.00", "", "best"), "g": ("10.00", "", "second"), "Ours (reported)": ("99.00", "", ""),
+        "GART (reported)": ("ours − 4.0", "", ""), "None (reported)": ("", "", ""),
+    }  # fmt: skip
+    assert made.remarks == ("Reported: Paper, its table. Loose.",)
+    assert latex(made).count(r"\midrule") == 2, "a rule before the methods, one before what was reported"
+
+
+def test_differences_to_a_row() -> None:
+    rows = [Entrant("Ours", (runs({"a": [20.0], "b": [30.0]}),)), Entrant("gart", (runs({"a": [18.0], "b": [29.0]}),))]
+    made = difference_table(FRAME, rows, "ours")
+    assert [row.stubs for row in made.rows] == [("gart",)]
+    assert made.rows[0].cells[0].text == "−1.50 [−2.00, −1.00]"
+    partly = difference_table(FRAME, [rows[0], Entrant("gart", (runs({"a": [18.0]}),))], "ours").rows[0].cells[0]
+    assert (partly.text, partly.note) == ("−2.00", "over 1 cases; only one side has b")
+    with pytest.raises(UserError, match="unknown row 'our'. Did you mean 'Ours'"):
+        difference_table(FRAME, rows, "our")
+
+
+def test_conditions_are_column_groups_with_their_own_cases() -> None:
+    frame = replace(FRAME, conditions=("fixed", "sweep"))
+    made = named_table(frame, [Entrant("ours", (runs({"a@side": [10.0]}), runs({"a": [20.0]})))])
+    assert [cell.text for cell in made.rows[0].cells] == ["10.00", "20.00"]
+    assert r"\multicolumn{1}{c}{fixed} & \multicolumn{1}{c}{sweep} \\" in latex(made)
+    assert r"\cmidrule(lr){2-2} \cmidrule(lr){3-3}" in latex(made)
+    assert "| method | fixed PSNR, dB ↑ | sweep PSNR, dB ↑ |" in markdown(made)
+
+
+def test_csv_has_a_line_a_figure() -> None:
+    made = table(**{"a, b": runs({"a": [20.0, 21.0]})})
+    (line,) = csv.DictReader(io.StringIO(tidy_csv(made)))
+    assert (line["method"], line["score"], line["better"], line["condition"]) == ("a, b", "psnr", "higher", "")
+    assert float(line["value"]) == 20.5
+    assert float(line["spread"]) == pytest.approx(math.sqrt(0.5))
+    difference = difference_table(FRAME, [Entrant("x", (runs({"a": [1.0], "b": [3.0]}),)),
+                                          Entrant("y", (runs({"a": [1.0], "b": [2.0]}),))], "y")  # fmt: skip
+    (line,) = csv.DictReader(io.StringIO(tidy_csv(difference)))
+    assert (float(line["value"]), float(line["low"]), float(line["high"])) == (0.5, 0.0, 1.0)
+
+
+class Cells(HTMLParser):
+    """Counts what it meets, and fails on tags that are not closed in order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.widths: list[int] = []
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        self.open.append(tag)
+        if tag == "tr":
+            self.widths.append(0)
+        self.widths[-1:] = [self.widths[-1] + (tag in ("td", "th"))] if self.widths else []
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def test_every_format_survives_odd_names() -> None:
+    """Names of people's methods and folders: signs that mean something to Markdown, LaTeX or HTML."""
+    odd = r"a|b_c & 100 % <x> #1 {\y} $z$ ~^"
+    made = table(**{odd: runs({"a": [20.0]}), "plain": runs({"a": [10.0]})})
+    assert r"| a\|b_c & 100 %" in markdown(made)
+    escaped = r"a|b\_c \& 100 \% $<$x$>$ \#1 \{\textbackslash{}y\} \$z\$ \textasciitilde{}\textasciicircum{}"
+    assert escaped in latex(made)
+    reader = Cells()
+    reader.feed(html(made))
+    assert not reader.open and set(reader.widths) == {2}
+    assert set(FORMATS) == {"md", "latex", "html", "csv"}
+
+
+def test_latex_has_only_booktabs_and_equal_columns() -> None:
+    made = latex(table(ours=runs({"a": [20.0]}), gart=runs({"b": [20.0]})))
+    body = [line for line in made.splitlines() if line.endswith(r"\\")]
+    assert {line.count("&") for line in body} == {1}
+    assert made.index(r"\toprule") < made.index(r"\midrule") < made.index(r"\bottomrule")
+    assert made.startswith(r"\begin{table}") and made.endswith(r"\end{table}")
+
+
+def test_variants_of_a_method_are_rows_of_their_own() -> None:
+    """An ablation in the same folder is no further seed of the whole method."""
+    base = {"deform": {"enabled": True}, "steps": 5}
+    found = [
+        *runs({"a": [20.0, 22.0]}, config=base),
+        *runs({"a": [10.0]}, config={"deform": {"enabled": False}, "steps": 5}),
+        *runs({"a": [11.0]}, config={"deform": {"enabled": True}, "steps": 7}),
+    ]
+    (made,) = protocol_tables(found)
+    assert {row.stubs[1]: row.cells[0].text for row in made.rows} == {
+        "ours": "21.00", "ours [deform.enabled=false]": "10.00", "ours [steps=7]": "11.00",
+    }  # fmt: skip
+    (ranked,) = standings(found)
+    assert texts(ranked)["ours"][2] == "best"
+
+
+def test_presets_and_priors_tell_variants_apart() -> None:
+    noisy = {"choice": "coarse:1", "config": {}}
+    found = [
+        record(),
+        record(preset="standard"),
+        record(prior=noisy),
+        record(prior={"choice": "template", "config": {}}),
+    ]
+    (made,) = protocol_tables(found)
+    labels = [row.stubs[1] for row in made.rows]
+    assert len(set(labels)) == 4 and all("ours (" in label for label in labels)
+    assert any('--prior="coarse:1"' in label for label in labels)
+
+
+def test_the_latest_of_equal_runs_counts() -> None:
+    def at(day: int, value: float, code: str) -> RunRecord:
+        timing = Timing(f"2026-01-{day:02d}T00:00:00+00:00", 1.0, 1.0, 1.0)
+        return record(timing=timing, scores=psnr(value), code={"sources": code}, run_id=code)
+
+    (made,) = protocol_tables([at(2, 21.0, "new"), at(1, 10.0, "old")])
+    assert [row.cells[0].text for row in made.rows] == ["21.00"]
+    assert made.rows[0].cells[1].text == "1"
+
+
+def test_runs_on_data_that_has_changed_are_left_out_and_told() -> None:
+    old = record(method="gart", data={"truth": "1"}, timing=Timing("2026-01-01", 1.0, 1.0, 1.0))
+    new = record(data={"truth": "2"}, timing=Timing("2026-01-02", 1.0, 1.0, 1.0))
+    (made,) = protocol_tables([old, new])
+    assert [row.stubs[1] for row in made.rows] == ["ours"]
+    assert made.remarks == ("p-v1, wolf/Run: 1 older records of other data left out.",)
