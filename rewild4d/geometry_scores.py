@@ -31,7 +31,7 @@ def score_geometry(
         points: drawn from each cloud.
 
     Returns:
-        The scores by name, each with its floor in the note, and the alignments that they stand on.
+        The scores by name, each with its sampling floor, and the alignments that they stand on.
     """
     if not names:
         return {}, []
@@ -75,12 +75,9 @@ def _kind(name: str) -> tuple[str, str]:
 
 def _score(found: Comparison, name: str) -> Score:
     item = found.scores[name.removesuffix(_parts(name)[1])]
-    parts = [item.note] if item.note else []
-    if item.value is not None:
-        parts += [f"floor {item.floor:.4g}"] if item.floor is not None else []
-        parts.append(found.note)
+    parts = [part for part in (item.note, found.note if item.value is not None else "") if part]
     present = sum(value is not None for value in item.per_frame)
-    return Score(item.value, item.unit, item.better, present, list(item.per_frame), "; ".join(parts))
+    return Score(item.value, item.unit, item.better, present, list(item.per_frame), "; ".join(parts), item.floor)
 
 
 def _describe(found: Comparison, fit: Fit, points: int) -> list[dict[str, Any]]:

@@ -91,7 +91,7 @@ def test_the_exact_shape_is_at_the_floor_and_carries_its_alignment(case: Case, e
     found = evaluate(exact, case.clip, case.truth, wanted, quiet, CPU)
     assert list(found.scores) == list(wanted.scores) and found.items == []
     distance, agreement, plain, dense = (found.scores[name] for name in wanted.scores)
-    floor = float(distance.note.partition("floor ")[2].partition(";")[0])
+    floor = distance.floor or 0
     assert floor / 2 < (distance.value or 0) < 2 * floor
     assert (distance.unit, distance.better, distance.count) == ("1", "lower", len(case.clip.frames))
     assert (agreement.value or 0) > 0.9 and agreement.better == "higher"
