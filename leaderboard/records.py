@@ -23,6 +23,7 @@ class Score(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         count: how many items the mean is over.
         per_item: the value of each item, in the order of the record's ``items``; None for an item without a value.
         note: why there is no value, or what was left out of the mean.
+        floor: what a perfect result would get, where that is not the best value there is; None where nobody knows.
     """
 
     value: float | None
@@ -31,6 +32,7 @@ class Score(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     count: int
     per_item: list[float | None] = []
     note: str = ""
+    floor: float | None = None
 
 
 class Timing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

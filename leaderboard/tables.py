@@ -17,10 +17,19 @@ TITLES = {
     "psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS-alex", "lpips_vgg": "LPIPS-vgg",
     "psnr_fg": "PSNR foreground", "psnr_union": "PSNR union", "psnr_crop": "PSNR crop", "iou": "mask IoU",
     "chamfer_relative": "CD / diagonal", "chamfer_relative_framewise": "CD / diagonal, per frame",
+    "chamfer_relative_30k": "CD / diagonal, 30k points", "fscore_1_30k": "F@1 %, 30k points",
     "fscore_1": "F@1 %", "fscore_2": "F@2 %", "fscore_5": "F@5 %",
     "kid_v": "KID-16V", "fvd_f": "FVD-F", "fvd_diag": "FVD-Diag", "kvd_f": "KVD-F", "kvd_diag": "KVD-Diag",
 }  # fmt: skip
-DIGITS = {"dB": 2, "chamfer_relative": 4, "chamfer_relative_framewise": 4, "kid_v": 4, "fvd_f": 1, "fvd_diag": 1}
+DIGITS = {
+    "dB": 2,
+    "chamfer_relative": 4,
+    "chamfer_relative_framewise": 4,
+    "chamfer_relative_30k": 4,
+    "kid_v": 4,
+    "fvd_f": 1,
+    "fvd_diag": 1,
+}
 """Printed after the point, by the score's name or unit; three for all others."""
 LESS_IS_BETTER = ("lpips", "chamfer", "kid", "fvd", "kvd")
 """Beginnings of such scores' names; asked only where no record says it."""
@@ -179,7 +188,23 @@ def columns_of(records: Sequence[RunRecord]) -> tuple[Column, ...]:
 def _frame(records: Sequence[RunRecord], remarks: Sequence[str]) -> Frame:
     protocol = records[0].protocol
     caption = f"`{protocol['name']}`; {coverage_text(records)}"
-    return Frame(protocol["name"], protocol["title"], caption, ("",), tuple(protocol["scores"]), tuple(remarks))
+    scores = tuple(protocol["scores"])
+    return Frame(protocol["name"], protocol["title"], caption, ("",), scores, (*remarks, *_floors(records, scores)))
+
+
+def _floors(records: Sequence[RunRecord], scores: Sequence[str]) -> list[str]:
+    """One sentence on what a perfect shape would get, averaged over the cases; none where no score has a floor."""
+    parts = []
+    for name in scores:
+        floors = {
+            record.case: found.floor
+            for record in records
+            if (found := record.scores.get(name)) is not None and found.floor is not None
+        }
+        if floors:
+            parts.append(f"{TITLES.get(name, name)} {statistics.fmean(floors.values()):.{_digits(name, '1')}f}")
+    words = "A second sampling of the true surface, which is what a perfect shape gets"
+    return [f"{words}: {', '.join(parts)}."] if parts else []
 
 
 def _columns(frame: Frame, records: Sequence[RunRecord]) -> tuple[Column, ...]:

@@ -12,8 +12,10 @@ from rewild4d.types import Truth
 QUANTITIES = ("chamfer", "chamfer_to_truth", "chamfer_to_prediction", "chamfer_relative") + tuple(
     f"fscore_{percent}" for percent in THRESHOLDS
 )
-NAMES = tuple(quantity + suffix for suffix in SUFFIX.values() for quantity in QUANTITIES)
-"""Names of the scores: a quantity, and how predictions were laid on the truth (see `metrics.geometry`)."""
+DENSE = {"": None, "_30k": 30_000}
+"""End of a name -> points of each cloud; None is the protocol's own number."""
+NAMES = tuple(quantity + suffix + dense for dense in DENSE for suffix in SUFFIX.values() for quantity in QUANTITIES)
+"""Names of the scores: a quantity, how predictions were laid on the truth (see `metrics.geometry`), how many points."""
 
 
 def score_geometry(
@@ -29,32 +31,39 @@ def score_geometry(
         points: drawn from each cloud.
 
     Returns:
-        The scores by name, each with its floor in the note, and the alignments that they stand on.
+        The scores by name, each with its sampling floor, and the alignments that they stand on.
     """
     if not names:
         return {}, []
     if truth.sample is None:
         reason = "not computed: the data set has no geometry"
         return {name: Score(None, *_kind(name), 0, [], reason) for name in names}, []
-    predictions = [sample_gaussians(reconstruction.at(time), points, seed=0) for time in times]
-    truths = [truth.sample(time, points, 1) for time in times]
-    seconds = [truth.sample(time, points, 2) for time in times]
     scores: dict[str, Score] = {}
     alignments: list[dict[str, Any]] = []
-    for fit, suffix in SUFFIX.items():
-        wanted = [name for name in names if _suffix(name) == suffix]
-        if not wanted:
+    for dense, count in DENSE.items():
+        asked = [name for name in names if _parts(name)[1] == dense]
+        if not asked:
             continue
-        found = compare_sequence(
-            predictions, truths, fit=fit, diagonal=truth.diagonal, up=truth.up, seconds=seconds, points=points
-        )
-        scores |= {name: _score(found, name) for name in wanted}
-        alignments += _describe(found, fit)
+        drawn = count or points
+        predictions = [sample_gaussians(reconstruction.at(time), drawn, seed=0) for time in times]
+        truths, seconds = ([truth.sample(time, drawn, seed) for time in times] for seed in (1, 2))
+        for fit, suffix in SUFFIX.items():
+            wanted = [name for name in asked if _parts(name)[0] == suffix]
+            if not wanted:
+                continue
+            found = compare_sequence(
+                predictions, truths, fit=fit, diagonal=truth.diagonal, up=truth.up, seconds=seconds, points=drawn
+            )
+            scores |= {name: _score(found, name) for name in wanted}
+            alignments += _describe(found, fit, drawn)
     return {name: scores[name] for name in names}, alignments
 
 
-def _suffix(name: str) -> str:
-    return next((suffix for suffix in SUFFIX.values() if suffix and name.endswith(suffix)), "")
+def _parts(name: str) -> tuple[str, str]:
+    """The ends of a name: how predictions were laid on the truth, and how many points."""
+    dense = next((end for end in DENSE if end and name.endswith(end)), "")
+    short = name.removesuffix(dense)
+    return next((suffix for suffix in SUFFIX.values() if suffix and short.endswith(suffix)), ""), dense
 
 
 def _kind(name: str) -> tuple[str, str]:
@@ -65,19 +74,16 @@ def _kind(name: str) -> tuple[str, str]:
 
 
 def _score(found: Comparison, name: str) -> Score:
-    item = found.scores[name]
-    parts = [item.note] if item.note else []
-    if item.value is not None:
-        parts += [f"floor {item.floor:.4g}"] if item.floor is not None else []
-        parts.append(found.note)
+    item = found.scores[name.removesuffix(_parts(name)[1])]
+    parts = [part for part in (item.note, found.note if item.value is not None else "") if part]
     present = sum(value is not None for value in item.per_frame)
-    return Score(item.value, item.unit, item.better, present, list(item.per_frame), "; ".join(parts))
+    return Score(item.value, item.unit, item.better, present, list(item.per_frame), "; ".join(parts), item.floor)
 
 
-def _describe(found: Comparison, fit: Fit) -> list[dict[str, Any]]:
+def _describe(found: Comparison, fit: Fit, points: int) -> list[dict[str, Any]]:
     return [
         {
-            "fit": fit, "moment": index if fit == "frame" else None, "scale": one.transform.scale,
+            "fit": fit, "points": points, "moment": index if fit == "frame" else None, "scale": one.transform.scale,
             "matrix": one.transform.matrix.tolist(), "start": one.start, "iterations": one.iterations,
             "converged": one.converged, "clamped": one.clamped,
         }

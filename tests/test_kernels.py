@@ -1,5 +1,8 @@
 """The parts that CPU kernels are made of, against NumPy and torch."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -92,6 +95,18 @@ def test_an_error_in_a_thread_reaches_the_caller() -> None:
 
     with pytest.raises(ValueError, match="in the second"):
         run(work, [(0,), (1,)])
+
+
+def test_no_worker_outlives_the_interpreter() -> None:
+    # Callbacks run in the reverse order of their registration: this one comes last.
+    program = """
+import atexit, threading
+atexit.register(lambda: print(threading.active_count()))
+from rewild4d.kernels.threads import run
+run(print, [("a",), ("b",)])
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert sorted(done.stdout.split()) == ["1", "a", "b"]
 
 
 def test_spans_cover_everything_once() -> None:

@@ -87,17 +87,18 @@ def test_a_protocol_that_cannot_be_scored_is_refused(change: dict[str, object], 
 
 
 def test_the_exact_shape_is_at_the_floor_and_carries_its_alignment(case: Case, exact: Reconstruction) -> None:
-    wanted = asking("chamfer_relative", "fscore_5", "chamfer_relative_unaligned")
+    wanted = asking("chamfer_relative", "fscore_5", "chamfer_relative_unaligned", "fscore_5_30k")
     found = evaluate(exact, case.clip, case.truth, wanted, quiet, CPU)
     assert list(found.scores) == list(wanted.scores) and found.items == []
-    distance, agreement, plain = (found.scores[name] for name in wanted.scores)
-    floor = float(distance.note.partition("floor ")[2].partition(";")[0])
+    distance, agreement, plain, dense = (found.scores[name] for name in wanted.scores)
+    floor = distance.floor or 0
     assert floor / 2 < (distance.value or 0) < 2 * floor
     assert (distance.unit, distance.better, distance.count) == ("1", "lower", len(case.clip.frames))
     assert (agreement.value or 0) > 0.9 and agreement.better == "higher"
     assert plain.value == pytest.approx(distance.value, rel=0.2)
-    (alignment,) = found.alignments
-    assert alignment["fit"] == "sequence" and alignment["scale"] == pytest.approx(1, abs=0.01)
+    assert "truth of 1418 points" in dense.note and (dense.value or 0) >= (agreement.value or 0)
+    assert [(one["fit"], one["points"]) for one in found.alignments] == [("sequence", 700), ("sequence", 30_000)]
+    assert [one["scale"] for one in found.alignments] == pytest.approx([1, 1], abs=0.01)
 
 
 def test_without_geometry_the_score_says_so(case: Case, exact: Reconstruction) -> None:

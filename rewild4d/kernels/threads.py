@@ -1,5 +1,6 @@
 """A small thread pool for kernels that release the GIL: survives fork, nests in any thread, follows torch's setting."""
 
+import atexit
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -9,7 +10,8 @@ from typing import Any
 
 import torch
 
-_Job = tuple[Callable[..., Any], tuple[Any, ...], "_Outcome"]
+_Job = tuple[Callable[..., Any], tuple[Any, ...], "_Outcome"] | None
+"""None ends the worker that takes it."""
 
 
 class _Outcome:
@@ -21,22 +23,35 @@ class _Outcome:
 
 
 _jobs: SimpleQueue[_Job] = SimpleQueue()
-_workers = 0
+_workers: list[threading.Thread] = []
 _growing = threading.Lock()
 
 
 def _forget_workers() -> None:
     # A forked child inherits the queue but none of the threads.
     global _jobs, _workers, _growing
-    _jobs, _workers, _growing = SimpleQueue(), 0, threading.Lock()
+    _jobs, _workers, _growing = SimpleQueue(), [], threading.Lock()
+
+
+def _end_workers() -> None:
+    # A worker that wakes while the interpreter is torn down takes the process with it.
+    for _ in _workers:
+        _jobs.put(None)
+    for worker in _workers:
+        worker.join(timeout=5)
+    _workers.clear()
 
 
 os.register_at_fork(after_in_child=_forget_workers)
+atexit.register(_end_workers)
 
 
 def _work(jobs: "SimpleQueue[_Job]") -> None:
     while True:
-        function, args, outcome = jobs.get()
+        job = jobs.get()
+        if job is None:
+            return
+        function, args, outcome = job
         if not outcome.claim.acquire(blocking=False):
             continue
         try:
@@ -78,12 +93,11 @@ def run(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> None:
     The caller's thread takes the first call, then those that no worker has begun: on a busy machine nobody waits for a
     thread to wake. Pass at most `thread_count` calls: each further one takes a thread.
     """
-    global _workers
-    if len(calls) > 1 and _workers < len(calls) - 1:
+    if len(calls) > 1 and len(_workers) < len(calls) - 1:
         with _growing:
-            while _workers < len(calls) - 1:
-                threading.Thread(target=_work, args=(_jobs,), daemon=True, name="rewild4d-raster").start()
-                _workers += 1
+            while len(_workers) < len(calls) - 1:
+                _workers.append(threading.Thread(target=_work, args=(_jobs,), daemon=True, name="rewild4d-raster"))
+                _workers[-1].start()
     outcomes = [_Outcome() for _ in calls[1:]]
     for args, outcome in zip(calls[1:], outcomes, strict=True):
         _jobs.put((function, args, outcome))
