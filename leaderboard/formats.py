@@ -146,7 +146,8 @@ def _tex(text: str) -> str:
         "−": "$-$", "·": r"$\cdot$", "⊕": r"$\oplus$", "<": "$<$", ">": "$>$",
     }  # fmt: skip
     escaped = "".join(signs.get(letter, letter) for letter in text)
-    return re.sub("`([^`]*)`", r"\\texttt{\1}", escaped)
+    coded = re.sub("`([^`]*)`", r"\\texttt{\1}", escaped)
+    return re.sub('"([^"]*)"', r"``\1''", coded)
 
 
 def _html_head(column: Column) -> str:

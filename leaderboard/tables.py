@@ -172,7 +172,7 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
     return Table(
         f"{frame.name}-difference",
         f"{frame.title}: difference to {reference.label}",
-        "mean of the cases' differences; in brackets the 95 % interval of a bootstrap over cases and seeds",
+        "Mean of the cases' differences; in brackets the 95 % interval of a bootstrap over cases and seeds",
         ("method",),
         columns,
         tuple(rows),

@@ -16,7 +16,11 @@ Log = Callable[[int, int, Mapping[str, float]], None]
 
 @runtime_checkable
 class Reconstruction(Protocol):
-    """A function from time to Gaussians."""
+    """A function from time to Gaussians.
+
+    It may have more: ``diagnostics()``, figures for the record; ``marks``, sentences that every table prints below its
+    row, such as "upper bound: ...", and such a row is not ranked; ``canonical()`` and ``weights``, for pictures.
+    """
 
     def at(self, time: float) -> Splats:
         """The Gaussians at a time in seconds, in the world frame."""
@@ -46,7 +50,8 @@ class MethodInfo:
 class Method(Protocol):
     """One competitor.
 
-    `Config` is a frozen msgspec.Struct; its presets are TOML tables in baselines/presets/<name>.toml.
+    `Config` is a frozen msgspec.Struct; its presets are TOML tables in baselines/presets/<name>.toml. A method that
+    reads files beside the clip has ``inputs(config, case)`` too, a digest of them, so that other files are another run.
     """
 
     info: MethodInfo

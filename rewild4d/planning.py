@@ -128,7 +128,8 @@ def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[
         own = tuple(
             tuple(r for r in found if r.method == floor and r.case in cases[index]) for index, found in enumerate(under)
         )
-        rows.append(Entrant(floor, own))
+        if any(own):
+            rows.append(Entrant(floor, own))
     return rows, remarks
 
 

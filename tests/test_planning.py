@@ -185,7 +185,9 @@ def test_a_table_is_run_printed_and_only_completed(
     out = str(tmp_path / "runs")
     wanted = ("run", "--table", "demo", "--out", out, "--jobs", "1")
     planned = command(capsys, *wanted, "--plan").splitlines()
-    assert [line.split()[0] for line in planned] == ["missing"] * 5, "empty once, two rows with two seeds each"
+    assert [line.split()[:2] for line in planned] == [
+        ["missing", label] for label in ("empty", "Coarse", "Coarse", "Fine", "Fine")
+    ], "empty once, two rows with two seeds each"
     shown = command(capsys, *wanted)
     assert len(list(Path(out).rglob(FILE))) == 5
     assert shown == command(capsys, "table", "demo", "--runs", out), "the folder's records give the same table"

@@ -234,6 +234,7 @@ def test_every_format_survives_odd_names() -> None:
     odd = r"a|b_c & 100 % <x> #1 {\y} $z$ ~^"
     made = table(**{odd: runs({"a": [20.0]}), "plain": runs({"a": [10.0]})})
     assert r"| a\|b_c & 100 %" in markdown(made)
+    assert "the ``single'' one" in latex(named_table(replace(FRAME, caption='the "single" one'), []))
     escaped = r"a|b\_c \& 100 \% $<$x$>$ \#1 \{\textbackslash{}y\} \$z\$ \textasciitilde{}\textasciicircum{}"
     assert escaped in latex(made)
     reader = Cells()

@@ -5,6 +5,8 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import msgspec
+
 from rewild4d import planning
 from rewild4d.commands.shared import check_numbers, floor_entry, open_dataset, require_writable
 from rewild4d.config import parse_flags
@@ -19,7 +21,7 @@ from rewild4d.priors.config import PRESETS as PRIOR_PRESETS
 from rewild4d.priors.config import STANDARD
 from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_dataset
-from rewild4d.runner import Plan, choose_cases, execute, pieces
+from rewild4d.runner import Entry, Plan, choose_cases, execute, pieces
 
 DESCRIPTION = """Fit what a table of leaderboard/tables (see `list`) needs and has no record for yet, on every case, and
 print it. Finished runs are skipped and a killed one resumes."""
@@ -67,8 +69,9 @@ def main(arguments: list[str]) -> int:
     spec = planning.with_choice(options.table, found, planning.Choice(options.preset, options.protocol))
     plans = make_plans(options, spec)
     if options.plan:
+        labels = {_key(planning.row_entry(options.table, row, spec, ())): row.label for row in reversed(spec.rows)}
         for plan in plans:
-            _print_plan(plan)
+            _print_plan(plan, labels)
         return 0
     records = [record for plan in plans for record in execute(plan)]
     if options.json:
@@ -117,7 +120,12 @@ def _table(options: Options, spec: Spec, records: list[RunRecord]) -> Table:
     return named_table(frame, rows, planning.reported(spec))
 
 
-def _print_plan(plan: Plan) -> None:
-    """One line a run: whether it has a good record, and its folder."""
+def _print_plan(plan: Plan, labels: dict[str, str]) -> None:
+    """One line a run: whether it has a good record, its row, its folder."""
     for job in pieces(plan):
-        print("done   " if job.finished() else "missing", job.folder)
+        label = labels.get(_key(job.entry), job.entry.method)
+        print("done   " if job.finished() else "missing", f"{label:<20} {job.folder}")
+
+
+def _key(entry: Entry) -> str:
+    return f"{entry.method} {msgspec.json.encode(entry.config, order='deterministic').decode()}"
