@@ -20,7 +20,7 @@ import msgspec
 import torch
 from torch import Tensor
 
-from rewild4d.baselines.external_alignment import Placement, place_by_search, place_fauna
+from rewild4d.baselines.external_alignment import UPS, Placement, place_by_search, place_fauna
 from rewild4d.baselines.external_folder import crop_box, find_outputs, run_program, write_clip
 from rewild4d.baselines.external_profiles import PROFILES, Profile
 from rewild4d.baselines.external_reading import Moment, moved, moved_discs, painted, read_moments
@@ -50,8 +50,8 @@ class ExternalConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     """Where its results are already, instead of a command; {case} stands for <animal>__<motion>."""
     placed: Literal["profile", "yes", "no"] = "profile"
     """Whether results stand in the world of the cameras; "no" rotates them to the best input-view PSNR."""
-    up: Literal["profile", "y", "-y", "z"] = "profile"
-    """Axis of its results that points up, where they are rotated."""
+    up: Literal["profile", "y", "-y", "z", "any"] = "profile"
+    """Axis of its results that points up, where they are rotated; "any" tries all three."""
     points: int = 20_000
     """Gaussians on a mesh."""
     timeout: float = 6 * 3600.0
@@ -212,7 +212,10 @@ def _search(
     plain = [m.splats(torch.as_tensor(mean).expand(len(m.points), 3) if m.colors is None else m.colors)
              if isinstance(m, Discs) else m for m in moments]  # fmt: skip
     at = [plain[min(range(len(times)), key=lambda i: abs(times[i] - frame.time))] for frame in clip.frames]
-    return place_by_search(at, shots, _depth(prior, *shots[0]), profile.up, profile.elevation, log)
+    depth = _depth(prior, *shots[0])
+    axes = UPS if profile.up == "any" else (profile.up,)
+    found = [place_by_search(at, shots, depth, axis, profile.elevation, log) for axis in axes]
+    return max(found, key=lambda placement: placement.psnr)
 
 
 def _placed_by_fauna(path: Path, moment: Moment, shot: tuple[Frame, Camera], prior: Prior) -> Moment:

@@ -11,7 +11,6 @@ from scipy.optimize import minimize
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
-from rewild4d.baselines.external_profiles import Up
 from rewild4d.baselines.external_reading import moved
 from rewild4d.contracts import Log
 from rewild4d.errors import UserError
@@ -20,7 +19,7 @@ from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import look_at, similarity
 from rewild4d.types import Camera, Frame, Splats
 
-UPS: dict[Up, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+UPS: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
     "y": ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     "-y": ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
     "z": ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)),
@@ -65,7 +64,7 @@ class Shot:
 
 
 def place_by_search(
-    moments: Sequence[Splats], frames: Sequence[tuple[Frame, Camera]], depth: float, up: Up, elevation: float, log: Log
+    moments: Sequence[Splats], frames: Sequence[tuple[Frame, Camera]], depth: float, up: str, elevation: float, log: Log
 ) -> Placement:
     """Rotate, scale and shift an object so that the input views show what the video shows: an upper bound (METHOD 7).
 
@@ -77,7 +76,7 @@ def place_by_search(
         moments: Gaussians for each frame, in the object's own frame of reference.
         frames: the input frames with their cameras.
         depth: of the animal's centre before the first camera, world units.
-        up: the object's axis that points up.
+        up: the object's axis that points up, one of `UPS`.
         elevation: one more start, degrees.
         log: progress.
     """
@@ -104,7 +103,7 @@ class _Search:
     """Candidates are vectors: azimuth and elevation in degrees, log of the scale, shift of the centre's pixel in image
     sides, log of the depth relative to the prior's."""
 
-    def __init__(self, moments: Sequence[Splats], shots: Sequence[Shot], depth: float, up: Up, camera: Camera) -> None:
+    def __init__(self, moments: Sequence[Splats], shots: Sequence[Shot], depth: float, up: str, camera: Camera) -> None:
         self.moments, self.shots, self.depth, self.camera = moments, shots, depth, camera
         self.up, self.ahead = (torch.tensor(axis, dtype=torch.float64) for axis in UPS[up])
         first = moments[0]

@@ -4,7 +4,7 @@ from typing import Literal
 
 import msgspec
 
-Up = Literal["y", "-y", "z"]
+Up = Literal["y", "-y", "z", "any"]
 
 
 class Profile(msgspec.Struct, frozen=True, kw_only=True):
@@ -15,7 +15,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True):
         paper: to cite, or "".
         patterns: of its files below the output folder, the first that fits any file counts.
         placed: its results stand where the input cameras see them; else they are rotated to the best input PSNR.
-        up: the axis of its results that points up, where they are to be rotated.
+        up: the axis of its results that points up, where they are to be rotated; "any" tries all.
         elevation: of its own training camera in degrees: a start of that search.
         spread: it writes a number of moments of its own, at (i + 1) / (n + 1) of a clip whose frames lie at
             (k + 1) / (T + 1); else one a frame.
@@ -26,7 +26,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True):
     paper: str = ""
     patterns: tuple[str, ...] = ()
     placed: bool = False
-    up: Up = "y"
+    up: Up = "any"
     elevation: float = 0.0
     spread: bool = False
     crops: bool = False
@@ -39,13 +39,13 @@ PROFILES = {
     ),
     "glb": Profile(
         title="one animated .glb or .gltf (skinned or with morph targets), its clip as long as the video",
-        patterns=("*.glb", "*.gltf"), placed=True,
+        patterns=("*.glb", "*.gltf"), placed=True, up="y",
     ),
-    # Its own script only renders; `save_ply` of its Gaussian model, called once a time step, turns z-up into -y-up.
+    # Its own script only renders; `save_ply` of its Gaussian model, called once a time step, may turn z-up into -y-up.
     "gvfdiffusion": Profile(
         title="GVFDiffusion",
         paper="Zhang et al., Gaussian Variation Field Diffusion for High-fidelity Video-to-4D Synthesis, ICCV 2025",
-        patterns=("gaussians/*.ply", "*.ply"), up="-y", spread=True,
+        patterns=("gaussians/*.ply", "*.ply"), spread=True,
     ),
     # Trains at distance 3.8, field of view 20 degrees, elevation 5 degrees; exports 32 textured meshes.
     "dreammesh4d": Profile(
