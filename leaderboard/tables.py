@@ -11,28 +11,9 @@ from rewild4d.leaderboard.layout import Cell, Column, Row, Table
 from rewild4d.leaderboard.records import RunRecord, Score
 from rewild4d.leaderboard.specs import Reported, ReportedCell
 from rewild4d.leaderboard.statistics import Estimate, estimate, paired, ranks
+from rewild4d.leaderboard.titles import LESS_IS_BETTER, TITLES, digits_of
 from rewild4d.leaderboard.variants import Variant, coverage_text, is_floor, latest, marks, variants
 
-TITLES = {
-    "psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS-alex", "lpips_vgg": "LPIPS-vgg",
-    "psnr_fg": "PSNR foreground", "psnr_union": "PSNR union", "psnr_crop": "PSNR crop", "iou": "mask IoU",
-    "chamfer_relative": "CD / diagonal", "chamfer_relative_framewise": "CD / diagonal, per frame",
-    "chamfer_relative_30k": "CD / diagonal, 30k points", "fscore_1_30k": "F@1 %, 30k points",
-    "fscore_1": "F@1 %", "fscore_2": "F@2 %", "fscore_5": "F@5 %",
-    "kid_v": "KID-16V", "fvd_f": "FVD-F", "fvd_diag": "FVD-Diag", "kvd_f": "KVD-F", "kvd_diag": "KVD-Diag",
-}  # fmt: skip
-DIGITS = {
-    "dB": 2,
-    "chamfer_relative": 4,
-    "chamfer_relative_framewise": 4,
-    "chamfer_relative_30k": 4,
-    "kid_v": 4,
-    "fvd_f": 1,
-    "fvd_diag": 1,
-}
-"""Printed after the point, by the score's name or unit; three for all others."""
-LESS_IS_BETTER = ("lpips", "chamfer", "kid", "fvd", "kvd")
-"""Beginnings of such scores' names; asked only where no record says it."""
 Values = dict[str, dict[int, float]]
 """Case -> seed -> value."""
 
@@ -202,7 +183,7 @@ def _floors(records: Sequence[RunRecord], scores: Sequence[str]) -> list[str]:
             if (found := record.scores.get(name)) is not None and found.floor is not None
         }
         if floors:
-            parts.append(f"{TITLES.get(name, name)} {statistics.fmean(floors.values()):.{_digits(name, '1')}f}")
+            parts.append(f"{TITLES.get(name, name)} {statistics.fmean(floors.values()):.{digits_of(name, '1')}f}")
     words = "A second sampling of the true surface, which is what a perfect shape gets"
     return [f"{words}: {', '.join(parts)}."] if parts else []
 
@@ -290,7 +271,7 @@ def cell(records: Sequence[RunRecord], cases: Sequence[str], name: str) -> Cell:
             return Cell("n/a", note=reason)
     lost = len(wanted) - len(good)
     note = f"{lost} of {len(wanted)} runs failed: {next(r.error for r in wanted if r.status != 'ok')}" if lost else ""
-    return _number(estimate(values), _digits(name, unit), note)
+    return _number(estimate(values), digits_of(name, unit), note)
 
 
 def _values(records: Sequence[RunRecord], name: str) -> tuple[Values, str]:
@@ -310,15 +291,11 @@ def _difference(records: Sequence[RunRecord], reference: Sequence[RunRecord], na
     shared = [case for case in values if case in others]
     if not shared:
         return Cell("n/a", note="no case in common")
-    found, digits = paired(values, others), _digits(name, unit)
+    found, digits = paired(values, others), digits_of(name, unit)
     interval = " [" + ", ".join(_signed(end, digits) for end in found.interval) + "]" if found.interval else ""
     left = sorted(set(values) ^ set(others))
     note = f"over {len(shared)} cases; only one side has {', '.join(left)}" if left else ""
     return Cell(_signed(found.mean, digits) + interval, note=note, value=found.mean, interval=found.interval)
-
-
-def _digits(name: str, unit: str) -> int:
-    return DIGITS.get(name, DIGITS.get(unit, 3))
 
 
 def _number(found: Estimate, digits: int, note: str) -> Cell:
@@ -342,7 +319,7 @@ def _reported_cell(found: ReportedCell | None, name: str) -> Cell:
     if found is None:
         return Cell("")
     if found.value is not None:
-        digits = _digits(name, "dB" if name.startswith("psnr") else "1")
+        digits = digits_of(name, "dB" if name.startswith("psnr") else "1")
         return Cell(f"{found.value:.{digits}f}", value=found.value)
     sign = "+" if (found.difference or 0) > 0 else "−"
     return Cell(f"ours {sign} {abs(found.difference or 0)}")

@@ -1,0 +1,27 @@
+"""How scores are called and printed in tables."""
+
+TITLES = {
+    "psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS-alex", "lpips_vgg": "LPIPS-vgg",
+    "psnr_fg": "PSNR foreground", "psnr_union": "PSNR union", "psnr_crop": "PSNR crop", "iou": "mask IoU",
+    "chamfer_relative": "CD / diagonal", "chamfer_relative_framewise": "CD / diagonal, per frame",
+    "chamfer_relative_30k": "CD / diagonal, 30k points", "fscore_1_30k": "F@1 %, 30k points",
+    "fscore_1": "F@1 %", "fscore_2": "F@2 %", "fscore_5": "F@5 %",
+    "kid_v": "KID-16V", "fvd_f": "FVD-F", "fvd_diag": "FVD-Diag", "kvd_f": "KVD-F", "kvd_diag": "KVD-Diag",
+}  # fmt: skip
+DIGITS = {
+    "dB": 2,
+    "chamfer_relative": 4,
+    "chamfer_relative_framewise": 4,
+    "chamfer_relative_30k": 4,
+    "kid_v": 4,
+    "fvd_f": 1,
+    "fvd_diag": 1,
+}
+"""Printed after the point, by the score's name or unit; three for all others."""
+LESS_IS_BETTER = ("lpips", "chamfer", "kid", "fvd", "kvd")
+"""Beginnings of such scores' names; asked only where no record says it."""
+
+
+def digits_of(name: str, unit: str) -> int:
+    """Printed after the point: what the score's name says, else its unit, else three."""
+    return DIGITS.get(name, DIGITS.get(unit, 3))
