@@ -2,26 +2,26 @@
 
 Paper: Yang et al., Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene Reconstruction, CVPR 2024; the
 authors' code is under the MIT licence on top of 3DGS's non-commercial one. Nothing of it is copied; it is written anew
-from the paper on this package's rasterizer. The network has the original's sizes in the preset `paper` and is narrower in the
-others.
+from the paper on this package's rasterizer. The network has the original's sizes in the preset `paper` and is narrower
+in the others.
 
-`d3dgs` sees the clip alone. It works in the world, scaled so that the volume that all input cameras look
-at is a cube of side 6, and starts from random points in it that all of them see. It has to find the animal's own motion as well as its limbs', as the original
-would. Where nobody knows the cameras in the world, it takes the prior's.
+`d3dgs` sees the clip alone. It works in the world, scaled so that the volume that all input cameras look at is a cube
+of side 6, and starts from random points in it that all of them see. It has to find the animal's own motion as well as
+its limbs', as the original would. Where nobody knows the cameras in the world, it takes the prior's.
 
-`d3dgs-star` is the paper's D-3DGS*: it starts from the prior's surface in its pose of the first frame, coloured from the
-frames, adds the silhouette loss, and sees each frame flipped as well, at time t v with v = -1 and the mirrored camera.
-It works in the animal's frame of reference, with the root motion that `ours` gets: a mirror image means something
-only there, and the root is part of the prior that the star stands for.
+`d3dgs-star` is the paper's D-3DGS*: it starts from the prior's surface in its pose of the first frame, coloured from
+the frames, adds the silhouette loss, and sees each frame flipped as well, at time t v with v = -1 and the mirrored
+camera. It works in the animal's frame of reference, with the root motion that `ours` gets: a mirror image means
+something only there, and the root is part of the prior that the star stands for.
 
-What differs from the original: the time is (frame + 1) / T, so that t and -t are never the same; the heads start at zero;
-a Gaussian's harmonics turn with it; densification looks at the animal's box, its number of Gaussians is
-capped, and every Gaussian has at least half an input pixel of blur, as in `ours`; the schedule is given in fractions.
+What differs from the original: the time is (frame + 1) / T, so that t and -t are never the same; the heads start at
+zero; a Gaussian's harmonics turn with it; densification looks at the animal's box, its number of Gaussians is capped,
+and every Gaussian has at least half an input pixel of blur, as in `ours`; the schedule is given in fractions.
 """
 
 import math
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import msgspec
 import numpy as np

@@ -81,5 +81,5 @@ class DeformationNetwork(nn.Module):
 def _together(layer: nn.Linear, place: Tensor, moment: Tensor) -> Tensor:
     """A layer on [place, moment] where the moment is the same for all rows: its share becomes a bias."""
     columns = place.shape[1]
-    bias = linear(moment, layer.weight[:, columns:], layer.bias)[0]
+    bias = linear(moment, layer.weight[:, columns:], layer.bias)
     return linear(place, layer.weight[:, :columns], bias)

@@ -1,23 +1,23 @@
 """GART: Gaussians on an articulated template, with learned skinning and per-frame poses; and GART*.
 
-Paper: Lei et al., GART: Gaussian Articulated Template Models, CVPR 2024; the authors' code is under the MIT licence. Nothing of
-it is copied; it is written anew from the paper and its dog profile on this package's rasterizer.
+Paper: Lei et al., GART: Gaussian Articulated Template Models, CVPR 2024; the authors' code is under the MIT licence.
+Nothing of it is copied; it is written anew from the paper and its dog profile on this package's rasterizer.
 
-The original drives D-SMAL, a model of dogs that may not be passed on. Here the template is the prior: its 20 bones
-and its surface, posed as it was fitted to this clip. Who owns a D-SMAL file can name it (`template`): a SMAL pickle
-(`v_template`, `f`, `weights`, `J_regressor` or `J`, `kintree_table`; read without running what it holds) or an npz with
-`vertices`, `faces`, `weights`, `joints`, `parents`; it then takes its first poses from the prior (gart_smal.py). A run's
-settings name the path, so the file should not change between runs.
+The original drives D-SMAL, a model of dogs that may not be passed on. Here the template is the prior: its 20 bones and
+its surface, posed as it was fitted to this clip. Who owns a D-SMAL file can name it (`template`): a SMAL pickle
+(`v_template`, `f`, `weights`, `J_regressor` or `J`, `kintree_table`; read without running what it holds) or an npz
+with `vertices`, `faces`, `weights`, `joints`, `parents`; it then takes its first poses from the prior (gart_smal.py).
+A run's settings name the path, so the file should not change between runs.
 
-`gart-star` then fits the pose of each frame once more to that frame, everything else frozen: SGD, 160 steps, at a
-rate of 2e-2 halved every 50. Only the training camera's image at that moment is used, never another view. Every table flags
+`gart-star` then fits the pose of each frame once more to that frame, everything else frozen: SGD, 160 steps, at a rate
+of 2e-2 halved every 50. Only the training camera's image at that moment is used, never another view. Every table flags
 it, because in an input-view score the fitted image is the scored one.
 
 What differs from the original: positions get no gradient through the skinning grid, a Gaussian turns with the blended
 quaternion of its joints instead of the blended matrix (which would shrink it), the grid is a cube, neighbours are
-looked up when the Gaussians change instead of in every step, colours start from the frames, scales are logarithms with a
-cap, the number of Gaussians is capped, every Gaussian has half an input pixel of blur, as in `ours`. A unit of length of
-the original is the template's diagonal. The schedule is given in fractions of the original's 10k steps.
+looked up when the Gaussians change instead of in every step, colours start from the frames, scales are logarithms with
+a cap, the number of Gaussians is capped, every Gaussian has half an input pixel of blur, as in `ours`. A unit of
+length of the original is the template's diagonal. The schedule is given in fractions of the original's 10k steps.
 """
 
 from pathlib import Path

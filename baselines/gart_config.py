@@ -37,7 +37,7 @@ class Regularisers(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     norm: float = 0.1
     """Size of the skinning residual."""
     every: int = 1
-    """Steps between evaluations of these two, weights multiplied accordingly: they cost as much as the grid is large."""
+    """Steps between evaluations of these two, weights multiplied accordingly: their cost grows with the grid."""
     small: float = 0.05
     """Mean square of a Gaussian's largest scale."""
 

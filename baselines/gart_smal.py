@@ -2,16 +2,19 @@
 
 Two kinds of file are read:
 
-    npz     vertices [n, 3], faces [f, 3], weights [n, J], joints [J, 3], parents [J] (-1, or anything outside, for a root)
+    npz     vertices [n, 3], faces [f, 3], weights [n, J], joints [J, 3], parents [J] (-1 for a root)
     pickle  SMAL's: v_template, f, weights, kintree_table, and J or J_regressor; posedirs and shapedirs are ignored
 
-Axes are SMAL's: x towards the head, y to the animal's left, z up. The mean shape is scaled to the object frame's diagonal and laid on
-the prior's rest shape; its proportions are not fitted. It takes its poses from the prior: the template's surface
-is moved along with the nearest prior surface, and the chain of joints that follows it best is its pose.
+Axes are SMAL's: x towards the head, y to the animal's left, z up. The mean shape is scaled to the object frame's
+diagonal and laid on the prior's rest shape; its proportions are not fitted. It takes its poses from the prior: the
+template's surface is moved along with the nearest prior surface, and the chain of joints that follows it best is its
+pose.
 
-A pickle can run any code when it is opened. Only arrays, sparse matrices and the values of chumpy variables are let through.
+A pickle can run any code when it is opened. Only arrays, sparse matrices and the values of chumpy variables are let
+through.
 """
 
+import copyreg
 import io
 import pickle
 from collections.abc import Mapping
@@ -142,34 +145,40 @@ def _child(parents: list[int], joint: int) -> int:
 class _Chumpy:
     """Stands for a chumpy variable: its value is the array `x`."""
 
+    x: Any = None
+
     def __setstate__(self, state: Any) -> None:
         self.x = state.get("x") if isinstance(state, dict) else None
-
-
-class _Careful(pickle.Unpickler):
-    """Builds arrays, sparse matrices and chumpy variables, nothing else."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        root = module.split(".")[0]
-        if root == "numpy" and name in ("_reconstruct", "scalar"):
-            return getattr(np.array([0]).__reduce__()[0], "__globals__", {}).get(name) or _numpy_function(name)
-        if root == "numpy" and name in ("ndarray", "dtype"):
-            return getattr(np, name)
-        if root == "scipy" and name in ("csc_matrix", "csr_matrix", "coo_matrix"):
-            return getattr(sparse, name)
-        if root == "chumpy" and name == "Ch":
-            return _Chumpy
-        if (module, name) == ("_codecs", "encode"):  # how Python 3 writes bytes for Python 2
-            return _encode
-        raise pickle.UnpicklingError(f"it holds a {module}.{name}, which is not let through")
 
 
 def _encode(text: str, encoding: str = "latin1") -> bytes:
     return text.encode(encoding)
 
 
-def _numpy_function(name: str) -> Any:
-    return getattr(np._core.multiarray, name) if hasattr(np, "_core") else getattr(np.core.multiarray, name)
+LET_THROUGH: dict[tuple[str, str], Any] = {
+    # numpy's own makers of arrays and numbers moved between modules; their reduction names the present ones.
+    ("numpy", "_reconstruct"): np.zeros(0).__reduce__()[0],
+    ("numpy", "scalar"): np.float64(0).__reduce__()[0],
+    ("numpy", "ndarray"): np.ndarray,
+    ("numpy", "dtype"): np.dtype,
+    ("scipy", "csc_matrix"): sparse.csc_matrix,
+    ("scipy", "csr_matrix"): sparse.csr_matrix,
+    ("chumpy", "Ch"): _Chumpy,
+    ("_codecs", "encode"): _encode,
+    ("copyreg", "_reconstructor"): copyreg._reconstructor,  # type: ignore[attr-defined]
+    ("builtins", "object"): object,
+}
+"""By the top package's name and the object's."""
+
+
+class _Careful(pickle.Unpickler):
+    """Builds arrays, sparse matrices and chumpy variables, nothing else."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        known = LET_THROUGH.get((module.split(".")[0], name))
+        if known is None:
+            raise pickle.UnpicklingError(f"it holds a {module}.{name}, which is not let through")
+        return known
 
 
 def _read(path: Path) -> Mapping[str, Any]:
@@ -221,8 +230,10 @@ def _checked(path: Path, raw: Mapping[str, Any]) -> dict[str, Tensor]:
         )
     arrays = {name: np.asarray(raw[name]) for name in NEEDED}
     count, joints = len(arrays["vertices"]), len(arrays["parents"])
-    wanted = {"vertices": (count, 3), "faces": (len(arrays["faces"]), 3), "weights": (count, joints), "joints": (joints, 3),
-              "parents": (joints,)}  # fmt: skip
+    wanted = {
+        "vertices": (count, 3), "faces": (len(arrays["faces"]), 3), "weights": (count, joints), "joints": (joints, 3),
+        "parents": (joints,),
+    }  # fmt: skip
     for name, shape in wanted.items():
         if arrays[name].shape != shape or not np.issubdtype(arrays[name].dtype, np.number):
             raise UserError(f"{path}: expected '{name}' of shape {list(shape)}, got {list(arrays[name].shape)}.")

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, TypeVar
 
 import msgspec
@@ -99,7 +100,7 @@ def load_state(folder: Path, method: str, config_type: type[C]) -> tuple[dict[st
     try:
         config = msgspec.json.decode((folder / CONFIG).read_bytes(), type=config_type)
         return torch.load(folder / STATE, map_location="cpu", weights_only=True), config
-    except (msgspec.MsgspecError, RuntimeError, EOFError, ValueError) as error:
+    except (msgspec.MsgspecError, UnpicklingError, RuntimeError, EOFError, ValueError) as error:
         raise UserError(
             f"{folder}: expected a reconstruction by '{method}', but it cannot be read ({error})."
         ) from error

@@ -1,7 +1,7 @@
 """What the Gaussian competitors share: Gaussians under Adam, image losses, density control, resets, a resumable loop.
 
-Where a competitor would do what `ours` does, it reads the same code (canonical Gaussians, density control, image losses,
-checkpoints of rewild4d.ours), so that differences between methods are differences of the methods.
+Where a competitor would do what `ours` does, it reads the same code (canonical Gaussians, density control, image
+losses, checkpoints of rewild4d.ours), so that differences between methods are differences of the methods.
 """
 
 import logging

@@ -11,8 +11,8 @@ from rewild4d.transforms import camera_in_object, mirror_camera, similarity
 from rewild4d.types import Camera, Clip, Prior
 
 SCENE_HALF = 3.0
-"""Half the side of the cube that the volume becomes: an animal that fills the frame is then about as long as in the object
-frame."""
+"""Half the side of the cube that the volume becomes: an animal that fills the frame is then about as long as in the
+object frame."""
 PULL = 1e-3
 """Pull to the world's origin, as a share of a view's: it only decides where the views do not (one fixed camera)."""
 DRAWS = 8
