@@ -17,8 +17,11 @@ class ResidualField(nn.Module):
     """Weights = grid of the template's weights + residual, both sampled trilinearly; the sum is not renormalised.
 
     Attributes:
-        residual: x slowest, [R^3, J].
+        base: the template's weights in every voxel, x slowest, [R^3, J].
+        residual: learned, [R^3, J].
     """
+
+    base: Tensor
 
     def __init__(self, prior: Prior, config: Skinning) -> None:
         super().__init__()
