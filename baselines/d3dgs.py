@@ -86,6 +86,8 @@ class D3dgsDensity(Density, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """Fraction of the last (15k of 40k)."""
     every: float = 0.0025
     """Fraction between rounds (100 of 40k)."""
+    prune_opacity: float = 0.005
+    """Gaussians below this opacity are removed (3DGS); a reset must leave more."""
 
 
 class D3dgsResets(Resets, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -251,7 +251,7 @@ class Gart:
         model = GartModel(gaussians, ResidualField(template, config.skinning), poses).to(device)
         training = GartTraining(model, config, supervision, generator)
         with torch_on_one():
-            run_steps(training, f"{self.name} {fit_digest(config, clip, prior, seed)}", log, workdir)
+            run_steps(training, f"{self.name} {fit_digest(config, clip, template, seed)}", log, workdir)
         weights = model.field.still(model.gaussians.means)
         return GartReconstruction(model.gaussians, weights, model.poses, config, Root.of(clip, prior))
 

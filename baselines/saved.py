@@ -48,7 +48,8 @@ class Root:
 
     def in_world(self, splats: Splats, position: float) -> Splats:
         """Gaussians moved from the method's frame into the world."""
-        return transform_splats(splats, interpolate_similarity(self.object_to_world, position))
+        matrix = interpolate_similarity(self.object_to_world, position)
+        return transform_splats(splats, matrix.to(splats.means.device))
 
     def camera(self, time: float) -> Camera | None:
         """The input camera of the frame nearest to a time."""

@@ -20,7 +20,6 @@ from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.checkpoint import load_checkpoint, save_checkpoint
 from rewild4d.ours.config import Canonical, Density
 from rewild4d.ours.density import DensityControl
-from rewild4d.ours.gradients import clip_gradients
 from rewild4d.ours.losses import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.schedule import exponential
 from rewild4d.ours.symmetry import Supervision, Target
@@ -193,13 +192,11 @@ class SplatTraining(ABC):
         """Called after the set of Gaussians changed."""
 
     def _check_gradients(self, index: int) -> None:
-        norms = [clip_gradients(group, math.inf) for group in self.groups.values()]
-        sums = [parameter.grad.sum() for parameter in self.gaussians.parameters() if parameter.grad is not None]
-        if torch.isfinite(torch.stack([value.cpu() for value in norms + sums])).all():
-            return
-        for name, parameter in self.model.named_parameters():
-            if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
-                raise FloatingPointError(f"iteration {index}: the gradient of '{name}' is not finite")
+        """A gradient that is not finite stops the fit with its name."""
+        sums = {name: each.grad.sum() for name, each in self.model.named_parameters() if each.grad is not None}
+        if not torch.isfinite(torch.stack(list(sums.values()))).all():
+            bad = next(name for name, value in sums.items() if not torch.isfinite(value))
+            raise FloatingPointError(f"iteration {index}: the gradient of '{bad}' is not finite")
 
     def _control(self, index: int) -> None:
         """Densify and prune, then reset opacities, where the schedule says so."""

@@ -109,6 +109,25 @@ def test_every_preset_keeps_what_it_does_not_name(name: str) -> None:
     assert paper.image_size == 512 and paper.canonical.sh_degree == 3
 
 
+@pytest.mark.parametrize("name", TINY)
+def test_a_reset_is_not_a_sentence_to_death(name: str) -> None:
+    """What a reset leaves is above the limit under which Gaussians are pruned, wherever there are resets."""
+    method = load_method(name)
+    configs = [method.Config(), *(load_preset(name, method.Config, preset) for preset in preset_names(name))]
+    assert any(config.resets.every for config in configs)
+    for config in configs:
+        if config.resets.every:
+            assert config.resets.opacity > config.density.prune_opacity
+
+
+def test_losing_every_gaussian_is_said(case: Case) -> None:
+    harsh = msgspec.convert(SHORT | GRID | {"density": SHORT["density"] | {"prune_opacity": 1.0}}, GartConfig)
+    with pytest.raises(
+        FloatingPointError, match="iteration 2: no Gaussian is left; every opacity fell below the limit"
+    ):
+        fitted("gart", case, config=harsh)
+
+
 def test_what_tables_say_of_them() -> None:
     said = {method.info.title: method.info for method in (D3dgs(), D3dgsStar(), Gart(), GartStar())}
     assert [title for title, info in said.items() if info.sees_test_frames] == ["GART* (20 bones)"]
