@@ -11,6 +11,10 @@ from rewild4d.errors import unknown_name
 
 METHODS = {
     "ours": "rewild4d.ours.method:Ours",
+    "d3dgs": "rewild4d.baselines.d3dgs:D3dgs",
+    "d3dgs-star": "rewild4d.baselines.d3dgs:D3dgsStar",
+    "gart": "rewild4d.baselines.gart:Gart",
+    "gart-star": "rewild4d.baselines.gart:GartStar",
     "prior-only": "rewild4d.baselines.prior_only:PriorOnly",
     "empty": "rewild4d.baselines.empty:Empty",
     "external": "rewild4d.baselines.external:External",

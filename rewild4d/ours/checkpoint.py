@@ -8,13 +8,12 @@ import torch
 
 from rewild4d.errors import UserError
 from rewild4d.files import atomic, digest
-from rewild4d.ours.config import Config
 from rewild4d.types import Clip, Prior
 
 NAME = "checkpoint.pt"
 
 
-def fit_digest(config: Config, clip: Clip, prior: Prior, seed: int) -> str:
+def fit_digest(config: msgspec.Struct, clip: Clip, prior: Prior, seed: int) -> str:
     """Identifies a fit: two fits of one digest on one machine give one result."""
     return digest(msgspec.json.encode(config), clip.digest, prior.digest, str(seed), torch.__version__)
 

@@ -1,0 +1,294 @@
+"""D-3DGS: canonical Gaussians and one network that deforms them; and D-3DGS*, which gets what `ours` gets.
+
+Paper: Yang et al., Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene Reconstruction, CVPR 2024; the
+authors' code is under the MIT licence on top of 3DGS's non-commercial one. Nothing of it is copied; it is written anew
+from the paper on this package's rasterizer. The network has the original's sizes in the preset `paper` and is narrower
+in the others.
+
+`d3dgs` sees the clip alone. It works in the world, scaled so that the volume that all input cameras look at is a cube
+of side 6, and starts from random points in it that all of them see. It has to find the animal's own motion as well as
+its limbs', as the original would. Where nobody knows the cameras in the world, it takes the prior's.
+
+`d3dgs-star` is the paper's D-3DGS*: it starts from the prior's surface in its pose of the first frame, coloured from
+the frames, adds the silhouette loss, and sees each frame flipped as well, at time t v with v = -1 and the mirrored
+camera. It works in the animal's frame of reference, with the root motion that `ours` gets: a mirror image means
+something only there, and the root is part of the prior that the star stands for.
+
+What differs from the original: the time is (frame + 1) / T, so that t and -t are never the same; the heads start at
+zero; a Gaussian's harmonics turn with it; densification looks at the animal's box, its number of Gaussians is capped,
+and every Gaussian has at least half an input pixel of blur, as in `ours`; the schedule is given in fractions.
+"""
+
+import math
+from pathlib import Path
+from typing import ClassVar
+
+import msgspec
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from rewild4d.baselines.d3dgs_network import DeformationNetwork, NetworkShape
+from rewild4d.baselines.saved import Root, gaussians_from_state, load_state, save_state, splats_of
+from rewild4d.baselines.splatting import (
+    ImageLoss,
+    Resets,
+    Shape,
+    SplatConfig,
+    SplatTraining,
+    run_steps,
+    surface_gaussians,
+)
+from rewild4d.baselines.volume import random_points, scene_frame
+from rewild4d.contracts import Log, MethodInfo
+from rewild4d.ours.canonical import Gaussians
+from rewild4d.ours.checkpoint import fit_digest
+from rewild4d.ours.config import Canonical, Density
+from rewild4d.ours.schedule import exponential, fade
+from rewild4d.ours.symmetry import Key, Supervision, Target, match_times
+from rewild4d.rasterizer import RasterInfo
+from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Prior, Splats
+
+REACH = OBJECT_DIAGONAL / 2
+"""The network's unit of length, so that an animal fills about [-1, 1] as in the original's scenes."""
+PAPER = "Yang et al., Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene Reconstruction, CVPR 2024"
+
+
+class Motion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """When and how the deformation learns."""
+
+    warm_up: float = 0.075
+    """Fraction with the Gaussians standing still (3k of 40k)."""
+    noise: float = 0.1
+    """Standard deviation of the time's jitter in frames, falling linearly to zero."""
+    noise_until: float = 0.5
+    """Fraction at which the jitter ends (20k of 40k)."""
+    rate: tuple[float, float] = (8e-4, 1.6e-6)
+    """Learning rate of the network, falling exponentially."""
+
+
+class D3dgsCanonical(Canonical, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The canonical Gaussians."""
+
+    opacity: float = 0.1
+    """At the start (3DGS)."""
+    sh_degree: int = 3
+    """Spherical harmonics of colour, 0 to 3."""
+
+
+class D3dgsDensity(Density, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Densification with a cap."""
+
+    start: float = 0.0125
+    """Fraction of the first round (500 of 40k)."""
+    end: float = 0.375
+    """Fraction of the last (15k of 40k)."""
+    every: float = 0.0025
+    """Fraction between rounds (100 of 40k)."""
+    prune_opacity: float = 0.005
+    """Gaussians below this opacity are removed (3DGS); a reset must leave more."""
+
+
+class D3dgsResets(Resets, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Opacity resets: every Gaussian has to earn its opacity again, so that floaters are pruned."""
+
+    every: float = 0.075
+    """Fraction between resets (3k of 40k); 0 for none."""
+    until: float = 0.375
+    """Fraction after which there are none (15k of 40k)."""
+
+
+class D3dgsConfig(SplatConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """`d3dgs`; the defaults are the original's schedule on 20k steps."""
+
+    canonical: D3dgsCanonical = D3dgsCanonical()
+    density: D3dgsDensity = D3dgsDensity()
+    resets: D3dgsResets = D3dgsResets()
+    network: NetworkShape = NetworkShape()
+    motion: Motion = Motion()
+
+
+class StarCanonical(D3dgsCanonical, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The canonical Gaussians, on the prior's surface."""
+
+    opacity: float = 0.9
+    """At the start, as `ours`."""
+
+
+class StarLoss(ImageLoss, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Losses of one rendered view."""
+
+    silhouette: float = 0.1
+    """BCE + Dice of the matte, as `ours`."""
+
+
+class D3dgsStarConfig(D3dgsConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """`d3dgs-star`; the defaults are `d3dgs`'s with the silhouette loss of `ours` and its start."""
+
+    canonical: StarCanonical = StarCanonical()
+    loss: StarLoss = StarLoss()
+
+
+class D3dgsModel(nn.Module):
+    """Canonical Gaussians and the network that moves them."""
+
+    def __init__(self, gaussians: Gaussians, config: NetworkShape, generator: torch.Generator) -> None:
+        super().__init__()
+        self.gaussians, self.network = gaussians, DeformationNetwork(config, generator)
+
+    def still(self) -> Shape:
+        """The Gaussians as they are."""
+        own = self.gaussians
+        return Shape(own.means, nn.functional.normalize(own.quats, dim=-1), own.scales(own.scales_log()))
+
+    def moved(self, time: Tensor) -> Shape:
+        """The Gaussians at a time in [-1, 1]: offsets are added to activated values, as in the original."""
+        own = self.gaussians
+        move, turn, grow = self.network(own.means / REACH, time.to(own.means))
+        quats = nn.functional.normalize(own.quats, dim=-1) + turn
+        scales = own.scales_log().exp() + REACH * grow
+        return Shape(
+            own.means + REACH * move,
+            nn.functional.normalize(quats, dim=-1),
+            (scales.square() + own.blur.square() + 1e-12).sqrt(),
+        )
+
+
+class D3dgsTraining(SplatTraining):
+    """The loop's body; ``flips`` adds the mirrored frames at negative times."""
+
+    model: D3dgsModel
+
+    def __init__(
+        self, model: D3dgsModel, config: D3dgsConfig, supervision: Supervision, flips: bool, generator: torch.Generator
+    ) -> None:
+        super().__init__(model, {"network": list(model.network.parameters())}, config, supervision, generator)
+        self.config, self.flips = config, flips
+
+    def rate(self, name: str, progress: float) -> float:
+        return exponential(*self.config.motion.rate, progress)
+
+    def losses(self, index: int) -> tuple[dict[str, Tensor], RasterInfo, Target]:
+        progress, motion = index / self.config.iterations, self.config.motion
+        frames = self.supervision.frames
+        frame = int(torch.randint(frames, (), generator=self.generator))
+        view = 1 - 2 * int(torch.randint(2, (), generator=self.generator)) if self.flips else 1
+        noise = torch.randn((), generator=self.generator) * motion.noise * fade(progress, motion.noise_until)
+        target = self.supervision.target(Key(1, view, frame))
+        shape = (
+            self.model.still() if progress < motion.warm_up else self.model.moved(view * (frame + 1 + noise) / frames)
+        )
+        rgb, alpha, info = self.render(shape, target, progress)
+        return self.image_losses(rgb, alpha, target), info, target
+
+
+class D3dgsReconstruction:
+    """A fitted model with its frame of reference (contracts.Reconstruction)."""
+
+    def __init__(self, model: D3dgsModel, config: D3dgsConfig, root: Root) -> None:
+        self.model, self.config, self.root = model.eval().requires_grad_(False), config, root
+
+    @torch.no_grad()
+    def at(self, time: float) -> Splats:
+        """The Gaussians at a time in seconds in the world; the network interpolates between frames."""
+        position = self.root.position(time)
+        shape = self.model.moved(torch.tensor((position + 1) / len(self.root.times)))
+        return self.root.in_world(splats_of(self.model.gaussians, *shape), position)
+
+    def camera(self, time: float) -> Camera | None:
+        """The input camera of the frame nearest to a time."""
+        return self.root.camera(time)
+
+    def diagnostics(self) -> dict[str, float]:
+        """How many Gaussians there are and how opaque."""
+        own = self.model.gaussians
+        return {"gaussians": float(len(own)), "opacity_mean": float(own.opacities().mean())}
+
+    def save(self, folder: Path) -> None:
+        """Write the state and the settings into an existing, empty folder."""
+        save_state(folder, {"model": self.model.state_dict(), "root": self.root.state()}, self.config)
+
+
+class D3dgs:
+    """The method from the clip alone (contracts.Method)."""
+
+    name: ClassVar[str] = "d3dgs"
+    info: ClassVar[MethodInfo] = MethodInfo(
+        title="D-3DGS", paper=PAPER, licence="MIT (written anew from the paper)", uses_prior=False
+    )
+    Config: ClassVar[type[D3dgsConfig]] = D3dgsConfig
+
+    def fit(
+        self,
+        clip: Clip,
+        prior: Prior,
+        *,
+        config: D3dgsConfig,
+        seed: int,
+        device: torch.device,
+        log: Log,
+        workdir: Path | None,
+    ) -> D3dgsReconstruction:
+        """Reconstruct from the clip; see contracts.Method."""
+        generator = torch.Generator().manual_seed(seed)
+        frame, values, flips = self._start(clip, prior, config, generator)
+        supervision = Supervision(clip, frame, config.image_size, device)
+        model = D3dgsModel(Gaussians(values, config.canonical.max_scale), config.network, generator).to(device)
+        training = D3dgsTraining(model, config, supervision, flips, generator)
+        run_steps(training, f"{self.name} {fit_digest(config, clip, prior, seed)}", log, workdir)
+        return D3dgsReconstruction(model, config, Root.of(clip, frame))
+
+    def load(self, folder: Path, device: torch.device) -> D3dgsReconstruction:
+        """Read back what `D3dgsReconstruction.save` wrote."""
+        state, config = load_state(folder, self.name, self.Config)
+        gaussians = gaussians_from_state(state["model"], config.canonical.max_scale)
+        model = D3dgsModel(gaussians, config.network, torch.Generator())
+        model.load_state_dict(state["model"])
+        return D3dgsReconstruction(model.to(device), config, Root.from_state(state["root"]))
+
+    def _start(
+        self, clip: Clip, prior: Prior, config: D3dgsConfig, generator: torch.Generator
+    ) -> tuple[Prior, dict[str, Tensor], bool]:
+        """The frame of reference (as a prior that stands still), the first Gaussians, and whether flips are seen."""
+        scene = scene_frame(clip, prior)
+        cameras = [scene.cameras[row] for row in match_times(clip, prior)]
+        return (
+            scene,
+            random_gaussians(random_points(config.canonical.samples, cameras, generator), config.canonical),
+            False,
+        )
+
+
+class D3dgsStar(D3dgs):
+    """The method with the prior's start, silhouettes and flipped frames (contracts.Method)."""
+
+    name: ClassVar[str] = "d3dgs-star"
+    info: ClassVar[MethodInfo] = MethodInfo(
+        title="D-3DGS*",
+        paper=f"{PAPER}; the star as in the paper of `ours`",
+        licence="MIT (written anew from the paper)",
+    )
+    Config: ClassVar[type[D3dgsConfig]] = D3dgsStarConfig
+
+    def _start(
+        self, clip: Clip, prior: Prior, config: D3dgsConfig, generator: torch.Generator
+    ) -> tuple[Prior, dict[str, Tensor], bool]:
+        first = prior.transforms[match_times(clip, prior)[0]]
+        return prior, surface_gaussians(prior, clip, first, config.canonical, generator), True
+
+
+def random_gaussians(points: Tensor, config: Canonical) -> dict[str, Tensor]:
+    """Round grey Gaussians, as large as they are far apart (3DGS), at points [n, 3]; attributes by name."""
+    count = len(points)
+    near = cKDTree(points.numpy()).query(points.numpy(), k=min(4, count))[0][:, 1:]
+    scales = torch.from_numpy(np.sqrt(np.square(near).mean(axis=1))).float().clamp_min(1e-3)
+    colors = torch.zeros(count, (config.sh_degree + 1) ** 2, 3)
+    colors[:, 0] = 0.5
+    return {
+        "means": points,
+        "quats": torch.tensor((1.0, 0.0, 0.0, 0.0)).repeat(count, 1),
+        "log_scales": scales.log()[:, None].expand(-1, 3),
+        "logit_opacities": torch.full((count,), math.log(config.opacity / (1 - config.opacity))),
+        "colors": colors,
+    }

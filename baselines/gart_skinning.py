@@ -1,0 +1,62 @@
+"""Skinning weights of GART: a voxel grid spread from the template's weights, and a learned residual on top of it."""
+
+import torch
+from torch import Tensor, nn
+
+from rewild4d.kernels.arrays import fits
+from rewild4d.ours.config import Skinning
+from rewild4d.ours.fused.field import sample_grid
+from rewild4d.ours.skinning import build_field
+from rewild4d.types import Prior
+
+BEND = 1e-4
+"""Below this difference the total variation is a parabola instead of an absolute value (a Huber function)."""
+
+
+class ResidualField(nn.Module):
+    """Weights = grid of the template's weights + residual, both sampled trilinearly; the sum is not renormalised.
+
+    Attributes:
+        base: the template's weights in every voxel, x slowest, [R^3, J].
+        residual: learned, [R^3, J].
+    """
+
+    base: Tensor
+
+    def __init__(self, prior: Prior, config: Skinning) -> None:
+        super().__init__()
+        self.field = build_field(prior.vertices.float(), prior.weights.float(), prior.mirror.long(), config)
+        self.field.requires_grad_(False)
+        with torch.no_grad():
+            self.register_buffer("base", self.field.probabilities())
+        self.residual = nn.Parameter(torch.zeros_like(self.base))
+
+    def forward(self, points: Tensor, variation: bool) -> tuple[Tensor, Tensor]:
+        """Weights of points [n, 3], no gradient flows to them: [n, J]; and the residual's total variation.
+
+        Args:
+            points: in the object frame.
+            variation: whether the mean over the axes of the mean absolute forward difference is wanted (else zero).
+        """
+        with torch.no_grad():
+            base = self.field.sample(self.base, points)
+        if not fits(points):
+            return base + self.field.sample(self.residual, points), self._variation() if variation else points.sum() * 0
+        place = (points, self.field.origin, self.field.pitch, self.field.resolution)
+        added, total = sample_grid(self.residual, *place, BEND if variation else None)
+        return base + added, total / BEND
+
+    def still(self, points: Tensor) -> Tensor:
+        """Weights without a gradient, [n, 3] -> [n, J]."""
+        with torch.no_grad():
+            return self.field.sample(self.base, points) + self.field.sample(self.residual, points)
+
+    def norm(self) -> Tensor:
+        """Mean over the voxels of the residual's length, scalar."""
+        return (self.residual.square().sum(-1) + 1e-16).sqrt().mean()
+
+    def _variation(self) -> Tensor:
+        size = self.field.resolution
+        grid = self.residual.view(size, size, size, -1)
+        axes = [(grid.narrow(axis, 1, size - 1) - grid.narrow(axis, 0, size - 1)).abs().mean() for axis in range(3)]
+        return torch.stack(axes).mean() * BEND

@@ -1,0 +1,257 @@
+"""A SMAL-like template (D-SMAL) in place of the prior's own surface and bones, for users who have the file.
+
+Two kinds of file are read:
+
+    npz     vertices [n, 3], faces [f, 3], weights [n, J], joints [J, 3], parents [J] (-1 for a root)
+    pickle  SMAL's: v_template, f, weights, kintree_table, and J or J_regressor; posedirs and shapedirs are ignored
+
+Axes are SMAL's: x towards the head, y to the animal's left, z up. The mean shape is scaled to the object frame's
+diagonal and laid on the prior's rest shape; its proportions are not fitted. It takes its poses from the prior: the
+template's surface is moved along with the nearest prior surface, and the chain of joints that follows it best is its
+pose.
+
+A pickle can run any code when it is opened. Only arrays, sparse matrices and the values of chumpy variables are let
+through.
+"""
+
+import copyreg
+import io
+import pickle
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from rewild4d.errors import UserError
+from rewild4d.priors.io import seal
+from rewild4d.priors.kinematics import depth_levels
+from rewild4d.transforms import mirror_points, mirror_transforms, rigid, skin_points
+from rewild4d.types import OBJECT_DIAGONAL, Prior
+
+NEEDED = ("vertices", "faces", "weights", "joints", "parents")
+NAMES_IN_SMAL = {"vertices": "v_template", "faces": "f", "joints": "J"}
+LEAST_MASS = 3.0
+"""A joint with fewer vertices than this (summed weights) turns with its parent."""
+
+
+def template_prior(path: Path, prior: Prior) -> Prior:
+    """The prior with the file's surface, bones and weights, and with poses that follow the prior's.
+
+    Args:
+        path: npz or SMAL pickle.
+        prior: gives place, poses and cameras.
+
+    Returns:
+        A prior whose mirror is the joint nearest to each joint's mirror image.
+
+    Raises:
+        UserError: no such file, or not what the module's text says.
+    """
+    arrays = _checked(path, _read(path))
+    points, joints = _laid_on(prior, arrays["vertices"], arrays["joints"])
+    parents = arrays["parents"].tolist()
+    _, nearest = cKDTree(prior.vertices.double().numpy()).query(points.double().numpy())
+    moved = skin_points(points, prior.weights[torch.from_numpy(nearest)], prior.transforms)
+    transforms = follow(points, moved, arrays["weights"], joints, parents)
+    mirror = _mirror(joints)
+    inner = torch.stack([joints, joints[[_child(parents, joint) for joint in range(len(parents))]]], dim=1)
+    return seal(
+        replace(
+            prior,
+            name=path.stem,
+            provenance=f"The template {path.name} posed by the prior '{prior.name}'.",
+            vertices=points,
+            faces=arrays["faces"],
+            weights=arrays["weights"],
+            bones=inner,
+            parents=arrays["parents"],
+            mirror=mirror,
+            transforms=transforms,
+            transforms_flip=mirror_transforms(transforms, mirror),
+        )
+    )
+
+
+def follow(points: Tensor, moved: Tensor, weights: Tensor, joints: Tensor, parents: list[int]) -> Tensor:
+    """Rest -> posed transforms of a chain that follows moved vertices: each joint turns as its own vertices do.
+
+    Args:
+        points: rest, [n, 3].
+        moved: at each time, [T, n, 3].
+        weights: [n, J].
+        joints: pivots at rest, [J, 3].
+        parents: -1 for a root.
+
+    Returns:
+        Rigid, joints stay attached to their parents, [T, J, 4, 4].
+    """
+    posed: dict[int, Tensor] = {}
+    start, end = points.double(), moved.double()
+    for level in depth_levels(parents):
+        for joint in level:
+            share = weights[:, joint].double()
+            above = posed.get(parents[joint])
+            rotation, center, place = _turn(start, end, share)
+            if share.sum() < LEAST_MASS and above is not None:
+                rotation = above[:, :3, :3]
+            pivot = joints[joint].double()
+            if above is None:  # a root goes where its vertices go
+                target = (rotation @ (pivot - center)) + place
+            else:
+                target = above[:, :3, :3] @ pivot + above[:, :3, 3]
+            posed[joint] = rigid(rotation, target - rotation @ pivot)
+    return torch.stack([posed[joint] for joint in range(len(parents))], dim=1).float()
+
+
+def _turn(start: Tensor, end: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Best rotation [T, 3, 3] of weighted points (Kabsch), their centre before [3] and after [T, 3]."""
+    part = share / share.sum().clamp_min(1e-12)
+    center, place = part @ start, torch.einsum("n,tna->ta", part, end)
+    cross = torch.einsum("n,tna,nb->tab", part, end - place[:, None], start - center)
+    u, _, vh = torch.linalg.svd(cross)
+    sign = torch.ones(len(end), 3, dtype=start.dtype)
+    sign[:, 2] = torch.linalg.det(u @ vh).sign()
+    return (u * sign[:, None]) @ vh, center, place
+
+
+def _laid_on(prior: Prior, vertices: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
+    """Vertices and joints in the object frame: its axes, its diagonal, the box's centre on the prior's (x = 0)."""
+    turned = [points[:, [1, 2, 0]] for points in (vertices, joints)]
+    low, high = turned[0].amin(0), turned[0].amax(0)
+    scale = OBJECT_DIAGONAL / float((high - low).norm())
+    center = 0.5 * (prior.vertices.amin(0) + prior.vertices.amax(0)) * torch.tensor((0.0, 1.0, 1.0))
+    placed = [((points - 0.5 * (low + high)) * scale + center).float() for points in turned]
+    return placed[0], placed[1]
+
+
+def _mirror(joints: Tensor) -> Tensor:
+    """The joint nearest to each one's mirror image where that is mutual, itself otherwise, [J]."""
+    nearest = torch.cdist(mirror_points(joints), joints).argmin(-1)
+    own = torch.arange(len(joints))
+    return torch.where(nearest[nearest] == own, nearest, own)
+
+
+def _child(parents: list[int], joint: int) -> int:
+    return next((other for other, parent in enumerate(parents) if parent == joint), joint)
+
+
+class _Chumpy:
+    """Stands for a chumpy variable: its value is the array `x`."""
+
+    x: Any = None
+
+    def __setstate__(self, state: Any) -> None:
+        self.x = state.get("x") if isinstance(state, dict) else None
+
+
+def _encode(text: str, encoding: str = "latin1") -> bytes:
+    return text.encode(encoding)
+
+
+LET_THROUGH: dict[tuple[str, str], Any] = {
+    # numpy's own makers of arrays and numbers moved between modules; their reduction names the present ones.
+    ("numpy", "_reconstruct"): np.zeros(0).__reduce__()[0],
+    ("numpy", "scalar"): np.float64(0).__reduce__()[0],
+    ("numpy", "ndarray"): np.ndarray,
+    ("numpy", "dtype"): np.dtype,
+    ("scipy", "csc_matrix"): sparse.csc_matrix,
+    ("scipy", "csr_matrix"): sparse.csr_matrix,
+    ("chumpy", "Ch"): _Chumpy,
+    ("_codecs", "encode"): _encode,
+    ("copyreg", "_reconstructor"): copyreg._reconstructor,  # type: ignore[attr-defined]
+    ("builtins", "object"): object,
+}
+"""By the top package's name and the object's."""
+
+
+class _Careful(pickle.Unpickler):
+    """Builds arrays, sparse matrices and chumpy variables, nothing else."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        known = LET_THROUGH.get((module.split(".")[0], name))
+        if known is None:
+            raise pickle.UnpicklingError(f"it holds a {module}.{name}, which is not let through")
+        return known
+
+
+def _read(path: Path) -> Mapping[str, Any]:
+    """The arrays of a file under the npz's names.
+
+    Raises:
+        UserError: no such file, or neither kind.
+    """
+    try:
+        content = path.read_bytes()
+        if content[:2] == b"PK":
+            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+                return {name: archive[name] for name in archive.files}
+        raw = _Careful(io.BytesIO(content), encoding="latin1").load()
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: expected a D-SMAL file (npz or SMAL pickle), but there is no such file.") from error
+    except (OSError, ValueError, BadZipFile, EOFError, pickle.UnpicklingError, AttributeError, TypeError,
+            IndexError, KeyError, ImportError) as error:  # fmt: skip
+        raise UserError(
+            f"{path}: expected a D-SMAL file (npz or SMAL pickle), but it cannot be read: {error}."
+        ) from error
+    if not isinstance(raw, dict):
+        raise UserError(f"{path}: expected a SMAL pickle that holds a dictionary, got a {type(raw).__name__}.")
+    found = {key: _array(raw[name]) for key in NEEDED if (name := NAMES_IN_SMAL.get(key, key)) in raw}
+    if "J_regressor" in raw and "vertices" in found:
+        found["joints"] = _array(raw["J_regressor"]) @ found["vertices"]
+    if "kintree_table" in raw:
+        found["parents"] = np.asarray(_array(raw["kintree_table"]))[0]
+    return found
+
+
+def _array(value: Any) -> np.ndarray:
+    if isinstance(value, _Chumpy):
+        value = value.x
+    return np.asarray(value.todense() if sparse.issparse(value) else value)
+
+
+def _checked(path: Path, raw: Mapping[str, Any]) -> dict[str, Tensor]:
+    """The five arrays with the shapes that the module's text gives.
+
+    Raises:
+        UserError: naming the first array that is not as it should be.
+    """
+    missing = [name for name in NEEDED if name not in raw]
+    if missing:
+        held = ", ".join(sorted(raw)) or "nothing"
+        raise UserError(
+            f"{path}: expected {', '.join(NEEDED)} of a D-SMAL template, but {missing[0]} is not in it ({held})."
+        )
+    arrays = {name: np.asarray(raw[name]) for name in NEEDED}
+    count, joints = len(arrays["vertices"]), len(arrays["parents"])
+    wanted = {
+        "vertices": (count, 3), "faces": (len(arrays["faces"]), 3), "weights": (count, joints), "joints": (joints, 3),
+        "parents": (joints,),
+    }  # fmt: skip
+    for name, shape in wanted.items():
+        if arrays[name].shape != shape or not np.issubdtype(arrays[name].dtype, np.number):
+            raise UserError(f"{path}: expected '{name}' of shape {list(shape)}, got {list(arrays[name].shape)}.")
+        if not np.isfinite(arrays[name].astype(np.float64)).all():
+            raise UserError(f"{path}: expected finite numbers in '{name}'.")
+    parents, faces = arrays["parents"].astype(np.int64), arrays["faces"].astype(np.int64)
+    parents = np.where((parents >= 0) & (parents < joints), parents, -1)
+    if faces.min() < 0 or faces.max() >= count:
+        raise UserError(f"{path}: expected 'faces' between 0 and {count - 1}, got {faces.min()} to {faces.max()}.")
+    try:
+        depth_levels(parents.tolist())
+    except ValueError as error:
+        raise UserError(f"{path}: expected 'parents' to form a tree, got {parents.tolist()}.") from error
+    weights = torch.from_numpy(arrays["weights"].astype(np.float32)).clamp_min(0)
+    return {
+        "vertices": torch.from_numpy(arrays["vertices"].astype(np.float64)),
+        "joints": torch.from_numpy(arrays["joints"].astype(np.float64)),
+        "weights": weights / weights.sum(-1, keepdim=True).clamp_min(1e-8),
+        "faces": torch.from_numpy(faces),
+        "parents": torch.from_numpy(parents),
+    }

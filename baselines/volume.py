@@ -1,0 +1,103 @@
+"""The volume that all input cameras look at: a frame of reference for a method that has no prior."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from rewild4d.ours.symmetry import match_times
+from rewild4d.transforms import camera_in_object, mirror_camera, similarity
+from rewild4d.types import Camera, Clip, Prior
+
+SCENE_HALF = 3.0
+"""Half the side of the cube that the volume becomes: an animal that fills the frame is then about as long as in the
+object frame."""
+PULL = 1e-3
+"""Pull to the world's origin, as a share of a view's: it only decides where the views do not (one fixed camera)."""
+DRAWS = 8
+"""Points drawn for each that is kept."""
+
+
+def scene_frame(clip: Clip, prior: Prior) -> Prior:
+    """A "prior" whose root stands still: the shared volume's frame, with the clip's cameras in it.
+
+    Args:
+        clip: its cameras decide; the prior's are taken for frames without one.
+        prior: gives nothing else.
+
+    Returns:
+        The prior with other cameras and one similarity for all its times; its shape and poses mean nothing there.
+    """
+    rows = match_times(clip, prior)
+    cameras = {}
+    for frame, row in zip(clip.frames, rows, strict=True):
+        known = frame.camera or camera_in_object(
+            prior.cameras[row], torch.linalg.inv(prior.object_to_world[row].double())
+        )
+        cameras[row] = known
+    center, half = common_volume(list(cameras.values()))
+    scene_to_world = similarity(half / SCENE_HALF, torch.eye(3, dtype=torch.float64), center)
+    # Rows that the clip does not use keep any camera: nothing asks for them.
+    inside = tuple(
+        camera_in_object(cameras[row], scene_to_world) if row in cameras else camera
+        for row, camera in enumerate(prior.cameras)
+    )
+    return replace(
+        prior,
+        object_to_world=scene_to_world.repeat(len(prior.times), 1, 1),
+        cameras=inside,
+        cameras_flip=tuple(map(mirror_camera, inside)),
+    )
+
+
+def common_volume(cameras: Sequence[Camera]) -> tuple[Tensor, float]:
+    """The point nearest to all lines of sight through the image centres, and half the side of a cube around it.
+
+    The cube is as wide as the longer side of the narrowest view there.
+
+    Args:
+        cameras: in the world.
+
+    Returns:
+        Centre, float64, [3]; half side, world units.
+    """
+    matrix, right = torch.zeros(3, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    for camera in cameras:
+        line = _sight(camera)
+        across = torch.eye(3, dtype=torch.float64) - line[:, None] * line
+        matrix, right = matrix + across, right + across @ camera.center.double()
+    center = torch.linalg.solve(matrix + PULL * len(cameras) * torch.eye(3, dtype=torch.float64), right)
+    halves = []
+    for camera in cameras:
+        focal = torch.stack((camera.intrinsics[0, 0], camera.intrinsics[1, 1]))
+        size = torch.tensor((camera.width, camera.height), dtype=torch.float64)
+        halves.append(float((size / (2 * focal)).max() * (center - camera.center).norm()))
+    return center, min(halves)
+
+
+def random_points(count: int, cameras: Sequence[Camera], generator: torch.Generator) -> Tensor:
+    """Uniform points of the scene's cube that lie in every image; where there are too few, those in most images.
+
+    Args:
+        count: how many.
+        cameras: in the scene's frame.
+        generator: the only source of chance.
+
+    Returns:
+        [count, 3].
+    """
+    points = SCENE_HALF * (2 * torch.rand(DRAWS * count, 3, generator=generator) - 1)
+    seen = torch.zeros(len(points))
+    for camera in cameras:
+        pixels, depth = camera.project(points)
+        inside = (pixels >= 0) & (pixels <= pixels.new_tensor((camera.width, camera.height)))
+        seen += inside.all(-1) & (depth > 0)
+    return points[seen.argsort(descending=True, stable=True)[:count]]
+
+
+def _sight(camera: Camera) -> Tensor:
+    """Unit direction through the middle of the image, in the world, [3]."""
+    middle = torch.tensor((camera.width / 2, camera.height / 2, 1.0), dtype=torch.float64)
+    local = torch.linalg.solve(camera.intrinsics.double(), middle)
+    return torch.nn.functional.normalize(camera.world_to_camera[:3, :3].double().T @ local, dim=0)
