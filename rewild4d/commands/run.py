@@ -34,7 +34,12 @@ class Options:
         method: which method (see `list`).
         dataset: which data set's layout (see `list`).
         data: one animal's folder or a folder of animals; the built-in animals where it is left out.
-        case: names or patterns of cases ("wolf/Run", "wolf/*"); all where it is left out.
+        video: the same as --data, for a video file or a folder of frames (--dataset online).
+        masks: of the animal: a folder or, for online, a video; in place of the data set's own where it has some.
+        start: seconds from where on frames of the video are used.
+        end: seconds up to which they are used.
+        fps: how many of them a second; of a folder of frames the rate at which it was taken.
+        case: names or patterns of cases ("wolf/Run", "wolf/*"); all (of real videos: quadrupeds) where it is left out.
         protocol: what is held out and measured (see `list`); the data set's default where it is left out.
         preset: size of the effort: quick, standard or paper.
         seeds: one run for each.
@@ -50,6 +55,11 @@ class Options:
     method: str = "ours"
     dataset: str = "artemis"
     data: Path | None = None
+    video: Path | None = None
+    masks: Path | None = None
+    start: float | None = None
+    end: float | None = None
+    fps: float | None = None
     case: tuple[str, ...] = ()
     protocol: str | None = None
     preset: str = "quick"
@@ -95,8 +105,10 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
     if not options.seeds:
         raise UserError("--seeds: expected at least one number, got none.")
     require_writable(options.out)
-    root, reader = open_dataset(options.dataset, options.data)
-    cases = choose_cases(reader.cases(protocol.selection), options.case)
+    root, reader = open_dataset(options.dataset, options.data, options)
+    names = reader.cases(protocol.selection)
+    preferred = getattr(reader, "default_cases", None)
+    cases = choose_cases(names, options.case or (preferred(protocol.selection) if preferred else ()))
     floors = [_floor(name) for name in protocol.floors if name != options.method]
     entry = Entry(options.method, options.preset, config, tuple(dict.fromkeys(options.seeds)))
     prior = PriorChoice(options.prior, PRIOR_PRESETS.get(options.preset, STANDARD))
@@ -117,14 +129,38 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
     )
 
 
-def open_dataset(dataset: str, data: Path | None) -> tuple[Path, DatasetReader]:
-    """The folder and a reader on it; without a folder the built-in data, made where it is not there yet."""
+SOURCE_FLAGS = ("masks", "start", "end", "fps")
+"""Flags that a reader takes if its `options` name them."""
+
+
+def open_dataset(dataset: str, data: Path | None, options: Any = None) -> tuple[Path, DatasetReader]:
+    """The folder or file and a reader on it; without one the built-in data, made where it is not there yet.
+
+    Args:
+        dataset: whose reader.
+        data: its folder.
+        options: of a command, with `video` and the `SOURCE_FLAGS`.
+
+    Raises:
+        UserError: no folder, two of them, or a flag that the data set's reader does not take.
+    """
     reader = load_dataset(dataset)
+    given = {name: value for name in SOURCE_FLAGS if (value := getattr(options, name, None)) is not None}
+    for name in given:
+        if name not in getattr(reader, "options", ()):
+            raise UserError(f"--{name}: the data set '{dataset}' does not take it.")
+    video = getattr(options, "video", None)
+    if video is not None and data is not None:
+        raise UserError("--video: expected either this or --data, got both.")
+    if video is not None and dataset != "online":
+        raise UserError(f"--video: expected --dataset online with it, got {dataset}.")
+    data = data or video
     if data is not None:
-        return data.absolute(), reader(data.absolute())
+        return data.absolute(), reader(data.absolute(), **given)
     make_builtin = load_builtin(dataset)
     if make_builtin is None:
-        raise UserError(f"--data: the data set '{dataset}' has no built-in data; name its folder.")
+        named = "--video" if dataset == "online" else "--data"
+        raise UserError(f"{named}: the data set '{dataset}' has no built-in data; name its file or folder.")
     progress = Progress("built-in animals")
     root = make_builtin(progress)
     progress.close()
