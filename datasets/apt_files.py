@@ -95,10 +95,10 @@ def _add(path: Path, table: dict[str, Any], subjects: dict[str, Subject], seen: 
             if image is None:
                 counts["name an image that is not listed"] += 1
                 continue
-            key = (str(image["file_name"]), str(entry.get("track_id", 0)))
-            if key in seen:
+            pair = (str(image["file_name"]), str(entry.get("track_id", 0)))
+            if pair in seen:
                 continue
-            seen.add(key)
+            seen.add(pair)
             if not _sight(entry, image, kinds.get(entry.get("category_id"), "animal"), subjects):
                 counts["have no box inside their image"] += 1
     except (KeyError, TypeError, AttributeError, ValueError) as error:

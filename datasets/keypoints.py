@@ -78,7 +78,12 @@ def coco_keypoints(values: Sequence[float], names: Sequence[str], size: tuple[in
 
     Returns:
         The keypoints and how many lay outside the image.
+
+    Raises:
+        ValueError: another count of numbers.
     """
+    if len(values) != 3 * len(names):
+        raise ValueError(f"expected {3 * len(names)} numbers for {len(names)} keypoints, got {len(values)}")
     table = torch.tensor(values, dtype=torch.float32).reshape(len(names), 3)
     points, marked = table[:, :2] + 0.5, table[:, 2] > 0
     inside = ((points >= 0) & (points <= torch.tensor(size))).all(dim=1) & torch.isfinite(points).all(dim=1)

@@ -212,28 +212,23 @@ def match_masks(masks: Sequence[Path], stems: Sequence[str], folder: Path) -> tu
     if not masks:
         raise UserError(f"{folder}: expected masks ({', '.join(SUFFIXES)}), got none.")
     by_name = {mask.stem: mask for mask in masks}
+    by_number = {number: mask for mask in masks if (number := _number(mask.stem)) is not None}
+    numbers = [number for stem in stems if (number := _number(stem)) is not None]
+    counted = len(by_number) == len(masks) and len({*numbers}) == len(stems)
+    shift = min(by_number) - min(numbers) if counted else 0
+    if abs(shift) == 1 and len(masks) == len(stems) and {number + shift for number in numbers} == {*by_number}:
+        note = f"masks are numbered from {min(by_number)}, frames from {min(numbers)}"
+        return [by_number[number + shift] for number in numbers], note
     if any(stem in by_name for stem in stems):
         return [by_name.get(stem) for stem in stems], ""
-    by_number = {number: mask for mask in masks if (number := _number(mask.stem)) is not None}
-    numbers = [_number(stem) for stem in stems]
-    if len(by_number) == len(masks) and len({*numbers}) == len(stems) and None not in numbers:
-        offset = _offset(sorted(by_number), [number for number in numbers if number is not None])
-        found = [by_number.get(number + offset) if number is not None else None for number in numbers]
-        if any(found):
-            note = f"masks are numbered from {min(by_number)}, frames from {min(map(int, stems))}" if offset else ""
-            return found, note
+    if counted and any(number in by_number for number in numbers):
+        return [by_number.get(number) for number in numbers], ""
     if len(masks) == len(stems):
         return list(masks), f"masks and frames share no names: matched in order, {masks[0].name} first"
     raise UserError(
         f"{folder}: expected masks named like the frames ({stems[0]}, ...) or one for each of the {len(stems)} frames, "
         f"got {len(masks)} ({masks[0].name}, ...)."
     )
-
-
-def _offset(masks: list[int], frames: list[int]) -> int:
-    """One where masks count from 1 and the frames from 0, or the reverse, and they are as many; else 0."""
-    shift = masks[0] - min(frames)
-    return shift if abs(shift) == 1 and len(masks) == len(frames) else 0
 
 
 def _number(stem: str) -> int | None:
