@@ -36,6 +36,32 @@ class Reconstruction(Protocol):
         ...
 
 
+@runtime_checkable
+class Articulated(Reconstruction, Protocol):
+    """A reconstruction that is a skinned shape at rest: what an animated file of it needs.
+
+    Attributes:
+        weights: skinning weights of the canonical Gaussians, rows sum to one, [n, J].
+        pivots: inner end of each bone at rest, object frame, [J, 3].
+        parents: parent of each bone, -1 for a root, [J].
+    """
+
+    @property
+    def weights(self) -> torch.Tensor: ...
+    @property
+    def pivots(self) -> torch.Tensor: ...
+    @property
+    def parents(self) -> torch.Tensor: ...
+
+    def canonical(self) -> Splats:
+        """The Gaussians at rest, in the object frame."""
+        ...
+
+    def articulation(self, time: float) -> tuple[torch.Tensor, torch.Tensor]:
+        """Rest -> posed transform of each bone in the object frame, rigid, [J, 4, 4]; object_to_world, [4, 4]."""
+        ...
+
+
 @dataclass(frozen=True)
 class MethodInfo:
     """What a table prints about a method: pure data."""
