@@ -14,6 +14,7 @@ from rewild4d.contracts import Finding, Selection
 from rewild4d.datasets.apt_files import Annotations, Sighting, Subject, image_places, read_annotations
 from rewild4d.datasets.frame_files import image_size, read_images, read_masks
 from rewild4d.datasets.mask_check import check_videos
+from rewild4d.datasets.mask_makers import Unmasked
 from rewild4d.datasets.masks import open_masks
 from rewild4d.datasets.wild import LEAST_FRAMES, Moment, Video, files_identity, split_video
 from rewild4d.errors import UserError, unknown_name
@@ -127,15 +128,19 @@ class AptV2:
         faults = [Finding("warning", str(self.root), fault) for fault in self._annotations.faults]
         return faults + check_videos(self, cases, sheets)
 
-    def boxes(self, case: str) -> list[tuple[float, float, float, float]]:
-        """The annotated box of each frame, left, top, width, height: a start for programs that make masks."""
-        return [sighting.box for sighting in self._annotations.subjects[case].sightings]
+    def unmasked(self, case: str) -> Unmasked:
+        """The frames of a case and the annotated box in each, for programs that make masks.
 
-    def frames(self, case: str) -> list[Path]:
-        """The image files of a case."""
+        Raises:
+            UserError: as `load`.
+        """
         if case not in self._annotations.subjects:
             raise unknown_name("case", case, self._annotations.subjects)
-        return [self._image(sighting) for sighting in self._annotations.subjects[case].sightings]
+        sightings = self._annotations.subjects[case].sightings
+        files = [self._image(sighting) for sighting in sightings]
+        size, stems = image_size(files[0]), tuple(file.stem for file in files)
+        boxes = {index: sighting.box for index, sighting in enumerate(sightings)}
+        return Unmasked(str(files[0].parent), stems, size, partial(read_images, files, size), boxes)
 
     @cached_property
     def _annotations(self) -> Annotations:

@@ -144,7 +144,7 @@ def _jumps(facts: Sequence[MaskFacts | None]) -> list[int]:
 
 _TESTS: dict[str, Callable[[Sequence[MaskFacts | None]], list[int]]] = {
     "no mask or an empty one": _empty,
-    f"holes above {HOLES:.0%} of the animal": _holed,
+    f"holes (or gaps between legs) above {HOLES:.0%} of the animal": _holed,
     "a second part beside the animal": _split,
     "two parts of like size (two animals?)": _twins,
     "a jump from the frame before": _jumps,

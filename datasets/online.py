@@ -16,6 +16,7 @@ from rewild4d.contracts import Finding, Selection
 from rewild4d.datasets.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
 from rewild4d.datasets.images import read_picture
 from rewild4d.datasets.mask_check import check_videos
+from rewild4d.datasets.mask_makers import Unmasked
 from rewild4d.datasets.masks import MaskFiles, fit_size, list_images, match_masks, open_masks
 from rewild4d.datasets.video_file import SUFFIXES, read_video, video_facts
 from rewild4d.datasets.wild import Masks, Moment, Video, files_identity, split_video
@@ -131,6 +132,21 @@ class Online:
             images=self._images, masks=masks, notes=(*material.notes, *(text for text in (thinned, note) if text)),
         )  # fmt: skip
 
+    def unmasked(self, case: str) -> Unmasked:
+        """The chosen frames without their masks, for programs that make some; masks are named by frame number.
+
+        Raises:
+            UserError: as `load`.
+        """
+        indices = self._chosen[0]
+        stems = tuple(self._material.files[i].stem if self._material.files else f"{i:05d}" for i in indices)
+        return Unmasked(str(self.root), stems, self._material.size, self._images, {})
+
+    @property
+    def name(self) -> str:
+        """Of the video: its file's or folder's name."""
+        return self.root.stem if self.root.is_file() else self.root.resolve().name
+
     def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
         """Verify the video and its masks; a contact sheet goes to ``sheets``."""
         return check_videos(self, cases, sheets)
@@ -180,7 +196,7 @@ class Online:
     @cached_property
     def _table(self) -> dict[str, int | None]:
         """Case -> object id (None: all that the masks hold)."""
-        name = self.root.stem if self.root.is_file() else self.root.resolve().name
+        name = self.name
         ids = self._mask_files.ids if self._mask_files else ()
         return {name: None} if len(ids) < 2 else {f"{name}@{number}": number for number in ids}
 

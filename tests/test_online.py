@@ -182,7 +182,7 @@ def test_check_tells_what_a_person_should_look_at(walk: Path, tmp_path: Path) ->
         moving.save(walk / "masks" / f"{i:05d}.png", values)
     findings = check_videos(Online(walk), sheets=tmp_path / "sheets")
     said = "\n".join(finding.message for finding in findings)
-    assert "holes above 1% of the animal in 1 of 12 frames: 00002.png" in said
+    assert "holes (or gaps between legs) above 1% of the animal in 1 of 12 frames: 00002.png" in said
     assert "two parts of like size (two animals?) in 1 of 12 frames: 00004.png" in said
     assert "no mask or an empty one in 1 of 12 frames: 00006.png" in said
     assert "a second part beside the animal in 1 of 12 frames: 00008.png" in said
