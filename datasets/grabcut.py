@@ -18,6 +18,8 @@ GROWN = 0.06
 """Around the carried mask, this share of its size is unsure in both directions."""
 LOST = 0.3
 """The animal is lost where its mask falls below this share of its median size so far."""
+STRANGE = 0.7
+"""It is lost, too, where the colours in its mask are further than this (Bhattacharyya) from those in its box."""
 LEAST_FILL = 0.2
 """Share of a box that its animal fills at least."""
 FIRST_ROUNDS, ROUNDS = 5, 2
@@ -36,17 +38,20 @@ def rough_masks(source: Unmasked) -> Iterator[np.ndarray]:
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     before: np.ndarray | None = None
     mask: np.ndarray | None = None
+    looks: np.ndarray | None = None
     areas: list[int] = []
     for index, image in enumerate(source.images()):
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
         if index in source.boxes:
             mask, areas = from_box(small, source.boxes[index], scale), []
+            looks = colors(small, mask)
         elif mask is not None and before is not None:
             mask = from_mask(small, _carried(mask, flow.calc(grey, before, None)))
         if mask is not None:
             areas.append(int(mask.sum()))
-            if areas[-1] < LOST * np.median(areas):
+            strange = looks is not None and cv2.compareHist(looks, colors(small, mask), cv2.HISTCMP_BHATTACHARYYA)
+            if areas[-1] < LOST * np.median(areas) or strange > STRANGE:
                 mask = None
         before = grey
         found = np.zeros(size[::-1], np.uint8) if mask is None else mask * np.uint8(255)
@@ -75,6 +80,12 @@ def from_box(image: np.ndarray, box: Box, scale: float) -> np.ndarray:
         cv2.ellipse(labels, (x + w // 2, y + h // 2), (max(1, w // 4), max(1, h // 5)), 0, 0, 360, cv2.GC_FGD, -1)
         mask = _largest(_cut(image, labels, FIRST_ROUNDS))
     return mask
+
+
+def colors(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Histogram of the colours in a mask, [8, 8, 8], sums to one."""
+    counts = cv2.calcHist([image], [0, 1, 2], mask, [8, 8, 8], [0, 256] * 3)
+    return counts / max(1.0, float(counts.sum()))
 
 
 def from_mask(image: np.ndarray, carried: np.ndarray) -> np.ndarray | None:
