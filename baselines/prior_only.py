@@ -64,6 +64,21 @@ class PriorOnlyReconstruction:
         """Skinning weights of the canonical Gaussians, [n, J]."""
         return self.sample.weights
 
+    @property
+    def pivots(self) -> Tensor:
+        """Inner end of each bone at rest, [J, 3]."""
+        return self.prior.bones[:, 0]
+
+    @property
+    def parents(self) -> Tensor:
+        """Parent of each bone, -1 for a root, [J]."""
+        return self.prior.parents
+
+    def articulation(self, time: float) -> tuple[Tensor, Tensor]:
+        """Rest -> posed transforms, [J, 4, 4], and object_to_world, [4, 4]."""
+        object_to_world, transforms = pose_at(self.prior, time)
+        return transforms, object_to_world
+
     def save(self, folder: Path) -> None:
         save_prior(self.prior, folder / "prior.npz")
         state = {

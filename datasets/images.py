@@ -60,13 +60,17 @@ class Decoded:
     source: tuple[int, int]
 
 
-def read_rgb(path: Path) -> np.ndarray:
+def read_rgb(path: Path, upright: bool = False) -> np.ndarray:
     """Colour image, uint8 [h, w, 3]; an alpha channel inside the file is ignored.
+
+    Args:
+        path: PNG or JPEG.
+        upright: turn the image as its EXIF tag says; not where a camera was calibrated on the stored pixels.
 
     Raises:
         UserError: the file cannot be read, or is cut off or damaged.
     """
-    return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR, upright), cv2.COLOR_BGR2RGB)
 
 
 def read_alpha(path: Path) -> np.ndarray:
@@ -237,14 +241,15 @@ def _expect_size(path: Path, image: np.ndarray, size: tuple[int, int] | None, ot
         )
 
 
-def _decode(path: Path, mode: int) -> np.ndarray:
+def _decode(path: Path, mode: int, upright: bool = False) -> np.ndarray:
     try:
         data = path.read_bytes()
     except OSError as error:
         raise UserError(f"{path}: expected an image that can be read, but: {error.strerror}.") from error
     fault = _png_fault(data) if data.startswith(_PNG) else _jpeg_fault(data)
     # Cameras know nothing of EXIF, so an orientation tag must not turn the image.
-    image = None if fault else cv2.imdecode(np.frombuffer(data, dtype=np.uint8), mode | cv2.IMREAD_IGNORE_ORIENTATION)
+    mode = mode if upright else mode | cv2.IMREAD_IGNORE_ORIENTATION
+    image = None if fault else cv2.imdecode(np.frombuffer(data, dtype=np.uint8), mode)
     if image is None:
         raise UserError(f"{path}: expected a whole image, got {fault or 'a damaged one'}.")
     return image

@@ -189,7 +189,7 @@ def _attached_surfaces(document: Document, skeleton: _Skeleton, node: int) -> li
 
 def _influences(document: Document, primitive: pygltflib.Primitive) -> tuple[NDArray[np.int64], Floats]:
     """Joint numbers within the skin and weights that sum to one, both [n, 4 k]."""
-    sets = range(4)
+    sets = range(8)
     indices = [getattr(primitive.attributes, f"JOINTS_{k}", None) for k in sets]
     weights = [getattr(primitive.attributes, f"WEIGHTS_{k}", None) for k in sets]
     if indices[0] is None or weights[0] is None:

@@ -5,12 +5,27 @@ import sys
 from collections.abc import Callable
 
 from rewild4d import __version__
-from rewild4d.commands import bench, check, evaluate, leaderboard, make, overview, run, score, table, weights
+from rewild4d.commands import (
+    bench,
+    check,
+    evaluate,
+    export,
+    leaderboard,
+    make,
+    masks,
+    overview,
+    run,
+    score,
+    table,
+    weights,
+)
 from rewild4d.errors import UserError, unknown_name
 
 COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {
     "run": (run.main, "fit a method on a data set and score it on views it never saw"),
     "evaluate": (evaluate.main, "score a saved reconstruction again"),
+    "masks": (masks.main, "make masks of the animal for a video that has none"),
+    "export": (export.main, "write a reconstruction as .ply, .glb, cameras and films"),
     "score": (score.main, "score two folders of images or clips, or two .ply files, without our methods"),
     "table": (table.main, "print a table of what was found"),
     "leaderboard": (leaderboard.main, "make a static page of what was found"),

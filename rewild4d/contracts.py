@@ -27,11 +27,42 @@ class Reconstruction(Protocol):
         ...
 
     def camera(self, time: float) -> Camera | None:
-        """The input camera at a time, in the world frame, or None where the method does not know it."""
+        """The input camera at a time, in the world frame, or None where the method does not know it.
+
+        Where the data set has no cameras (`Frame.camera` is None) the evaluation renders held-out frames of the input
+        view with it. It must then answer between the clip's frames too, for the image that the clip would hold at that
+        time: crops of held-out moments lie on the straight line between those of the neighbouring frames.
+        """
         ...
 
     def save(self, folder: Path) -> None:
         """Write everything `Method.load` needs into an existing, empty folder."""
+        ...
+
+
+@runtime_checkable
+class Articulated(Reconstruction, Protocol):
+    """A reconstruction that is a skinned shape at rest: what an animated file of it needs.
+
+    Attributes:
+        weights: skinning weights of the canonical Gaussians, rows sum to one, [n, J].
+        pivots: inner end of each bone at rest, object frame, [J, 3].
+        parents: parent of each bone, -1 for a root, [J].
+    """
+
+    @property
+    def weights(self) -> torch.Tensor: ...
+    @property
+    def pivots(self) -> torch.Tensor: ...
+    @property
+    def parents(self) -> torch.Tensor: ...
+
+    def canonical(self) -> Splats:
+        """The Gaussians at rest, in the object frame."""
+        ...
+
+    def articulation(self, time: float) -> tuple[torch.Tensor, torch.Tensor]:
+        """Rest -> posed transform of each bone in the object frame, rigid, [J, 4, 4]; object_to_world, [4, 4]."""
         ...
 
 
@@ -90,23 +121,26 @@ class Selection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Which frames a method gets and which are held out, and at what size: the data part of a protocol.
 
     Attributes:
-        cameras: "fixed" (one camera), "sweep" (the camera index advances per frame) or "random" (a seeded one a frame).
+        cameras: "fixed" (one camera), "sweep" (the camera index advances per frame), "random" (a seeded one a frame) or
+            "unknown" (a video, of whose camera nothing is known).
         size: longest image side in pixels.
         framing: "full" keeps the frame's aspect, "letterbox" pads it to a square, "crop" takes one square window that
-            holds the animal in every selected image of a view.
+            holds the animal in every selected image of a view; of a video, a smoothly moving square around the animal.
         placements: for "fixed": where the camera stands relative to the animal; each is a case of its own.
         step: for "sweep": camera indices advanced per frame.
         stride: keep every stride-th frame of the motion.
         seed: of "random".
+        split: for "unknown": every split-th usable frame is held out.
     """
 
-    cameras: Literal["fixed", "sweep", "random"]
+    cameras: Literal["fixed", "sweep", "random", "unknown"]
     size: int
     framing: Literal["full", "letterbox", "crop"] = "full"
     placements: tuple[Literal["side", "oblique", "frontal"], ...] = ()
     step: int = 1
     stride: int = 1
     seed: int = 0
+    split: int | None = None
 
 
 @dataclass(frozen=True)

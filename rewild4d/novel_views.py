@@ -74,7 +74,7 @@ def novel_view_distances(
         log: progress.
 
     Raises:
-        UserError: the clip has no camera.
+        UserError: neither the clip nor the reconstruction has a camera.
     """
     orbit = _Orbit(reconstruction, clip, background, render)
     reference = [frame.over(background).clamp(0, 1) for frame in clip.frames]
@@ -124,7 +124,10 @@ class _Orbit:
     def __init__(self, reconstruction: Reconstruction, clip: Clip, background: float, render: Render) -> None:
         self.times, self.background, self.render = clip.times, background, render
         self.at = lru_cache(maxsize=24)(reconstruction.at)
-        self.cameras = _cameras(clip.frames, self._middle())
+        known = [input_camera(reconstruction, frame) for frame in clip.frames]
+        if not any(known) and not len(self.at(self.times[0])):
+            known = [_any_camera(clip.frames[0])]
+        self.cameras = _cameras(known, self._middle())
 
     def _middle(self) -> Tensor:
         """Median over all Gaussians of some moments, [3]; the origin where there are none."""
@@ -160,11 +163,29 @@ class _Lazy:
         return self.make(index)
 
 
-def _cameras(frames: Sequence[Frame], middle: Tensor) -> list[Camera]:
+def input_camera(reconstruction: Reconstruction, frame: Frame) -> Camera | None:
+    """The world camera of a frame, from the data set or else from the reconstruction, at the frame's size."""
+    camera = frame.camera or reconstruction.camera(frame.time)
+    height, width = frame.mask.shape[1:]
+    if camera is None or (camera.width, camera.height) == (width, height):
+        return camera
+    return camera.resized(width, height)
+
+
+def _any_camera(frame: Frame) -> Camera:
+    """A camera of the frame's size: nothing looks alike from everywhere."""
+    height, width = frame.mask.shape[1:]
+    intrinsics = torch.tensor(((width, 0, width / 2), (0, width, height / 2), (0, 0, 1)), dtype=torch.float64)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[2, 3] = 1.0
+    return Camera(pose, intrinsics, width, height)
+
+
+def _cameras(cameras: Sequence[Camera | None], middle: Tensor) -> list[Camera]:
     """The sixteen views of a clip."""
-    known = [frame.camera for frame in frames if frame.camera is not None]
+    known = [camera for camera in cameras if camera is not None]
     if not known:
-        raise UserError("novel views need a camera of the input video, but the clip has none.")
+        raise UserError("novel views need a camera of the input video, but neither the data nor the method has one.")
     up = torch.nn.functional.normalize(-torch.stack([c.world_to_camera[1, :3] for c in known]).mean(0), dim=0)
     offsets = torch.stack([camera.center - middle for camera in known])
     radii = offsets.norm(dim=1)

@@ -15,7 +15,7 @@ from rewild4d.files import digest
 from rewild4d.harmonics import seen_colors
 from rewild4d.leaderboard.records import Score
 from rewild4d.metrics.samples import Distance
-from rewild4d.novel_views import NovelViews
+from rewild4d.novel_views import NovelViews, input_camera
 from rewild4d.rasterizer import rasterize
 from rewild4d.scoring import Networks, load_networks
 from rewild4d.types import Camera, Clip, Frame, Splats, Truth
@@ -70,6 +70,8 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for name, value in later.items():
             if value is None:
                 del given[name]
+        if self.selection.split is None:
+            del given["selection"]["split"]
         return digest(msgspec.json.encode(given))
 
 
@@ -211,12 +213,19 @@ def _render_frames(reconstruction: Reconstruction, frames: Iterable[Frame]) -> I
     """Render each frame's camera at its time; the Gaussians of one time are asked for once."""
     time, splats = None, None
     for frame in frames:
-        if frame.camera is None:
-            raise UserError("held-out frames need a camera in the world, but the data set gives none.")
         if splats is None or frame.time != time:
             time, splats = frame.time, reconstruction.at(frame.time)
             _require_finite(splats, frame.time)
-        yield render(splats, frame.camera)
+        camera = input_camera(reconstruction, frame)
+        if camera is not None:
+            yield render(splats, camera)
+        elif not len(splats):
+            yield torch.zeros_like(frame.rgb), torch.zeros_like(frame.mask)
+        else:
+            raise UserError(
+                f"the held-out frame at {frame.time:.4f} s needs a camera, but neither the data set nor the "
+                "reconstruction knows it."
+            )
 
 
 def _require_finite(splats: Splats, time: float) -> None:

@@ -19,7 +19,12 @@ METHODS = {
     "empty": "rewild4d.baselines.empty:Empty",
     "external": "rewild4d.baselines.external:External",
 }
-DATASETS = {"artemis": "rewild4d.datasets.artemis:Artemis"}
+DATASETS = {
+    "artemis": "rewild4d.datasets.artemis:Artemis",
+    "davis": "rewild4d.datasets.davis:Davis",
+    "aptv2": "rewild4d.datasets.aptv2:AptV2",
+    "online": "rewild4d.datasets.online:Online",
+}
 BUILTIN = {"artemis": "rewild4d.datasets.synthetic:ensure"}
 """Data sets that make themselves on first use: a function that returns their folder."""
 

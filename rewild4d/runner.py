@@ -116,7 +116,8 @@ def execute(plan: Plan) -> list[RunRecord]:
     plan = replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device))
     plan.out.mkdir(parents=True, exist_ok=True)
     for name in plan.cases:
-        plan.reader.load(name, plan.protocol.selection)
+        for note in plan.reader.load(name, plan.protocol.selection)[0].notes:
+            print(f"{name}: {note}", file=sys.stderr)
     parts = [(name, entry, seed) for name in plan.cases for entry in plan.entries for seed in entry.seeds]
     fits = sum(entry.method not in plan.protocol.floors for _, entry, _ in parts)
     jobs = min(plan.jobs, max(len(plan.cases), fits))
@@ -267,13 +268,20 @@ class Job:
             "scores": {}, "coverage": {}, "items": [], "pictures": [], "diagnostics": {},
             "config": msgspec.to_builtins(self.entry.config),
             "data": {"root": str(plan.root), "licence": self.clip.licence, "clip": self.clip.digest,
-                     "truth": self.truth.digest},
+                     "truth": self.truth.digest, **_said(plan.reader, self.clip)},
             "prior": {"choice": plan.prior.name, "config": msgspec.to_builtins(plan.prior.config), 
                       **_describe(case.prior if case else None)},
             "protocol": {"digest": plan.protocol.digest, **msgspec.to_builtins(plan.protocol)},
             "code": code_version(), "machine": machine(plan.device, plan.rasterizer),
         }  # fmt: skip
         return RunRecord(**{**fields, **found})
+
+
+def _said(reader: DatasetReader, clip: Clip) -> dict[str, str]:
+    """How the data was read, for the record: the reader's settings and what it left out; nothing where nothing was."""
+    settings = getattr(reader, "settings", {})
+    found = {"settings": json.dumps(settings) if settings else "", "notes": "; ".join(clip.notes)}
+    return {name: text for name, text in found.items() if text}
 
 
 def save_reconstruction(reconstruction: Reconstruction, folder: Path) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rewild4d.contracts import Reconstruction
 from rewild4d.files import atomic
+from rewild4d.novel_views import input_camera
 from rewild4d.protocol import render
 from rewild4d.transforms import axis_angle_to_matrix, look_at
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Splats, Truth
@@ -59,7 +60,7 @@ def comparison(reconstruction: Reconstruction, clip: Clip, truth: Truth) -> Tens
 
 def orbit(reconstruction: Reconstruction, clip: Clip) -> list[Tensor]:
     """Images [3, h, w] of one turn around the animal while time runs; empty where no camera is known."""
-    cameras = [frame.camera for frame in clip.frames if frame.camera is not None]
+    cameras = [camera for frame in clip.frames if (camera := input_camera(reconstruction, frame)) is not None]
     if not cameras or len(reconstruction.at(clip.times[0])) == 0:
         return [torch.ones(3, 16, 16)]
     up = torch.nn.functional.normalize(-torch.stack([c.world_to_camera[1, :3] for c in cameras]).mean(0), dim=0)
@@ -108,7 +109,7 @@ def save_mp4(images: list[Tensor], path: Path, fps: float) -> None:
 
 def _shot(reconstruction: Reconstruction, frame: Frame) -> Tensor:
     """The reconstruction as the frame's camera sees it, on white."""
-    camera = frame.camera or reconstruction.camera(frame.time)
+    camera = input_camera(reconstruction, frame)
     if camera is None:
         return torch.ones_like(frame.rgb)
     return _over_white(reconstruction.at(frame.time), camera)

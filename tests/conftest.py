@@ -24,3 +24,12 @@ def rigs() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real rigs are not here ({folder}); set REWILD4D_SHARED to the folder that holds data/rigs")
     return folder
+
+
+@pytest.fixture
+def davis() -> Path:
+    """A real DAVIS folder, outside the repository; tests that need it skip where it is absent."""
+    folder = SHARED / "data" / "davis"
+    if not folder.is_dir():
+        pytest.skip(f"DAVIS is not here ({folder}); set REWILD4D_SHARED to the folder that holds data/davis")
+    return folder

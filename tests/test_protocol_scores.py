@@ -159,7 +159,7 @@ class Ball:
 
 
 def test_the_orbit_closes_around_the_animal_at_the_input_distance(case: Case) -> None:
-    cameras = novel_views._cameras(case.clip.frames, torch.zeros(3, dtype=torch.float64))
+    cameras = novel_views._cameras([frame.camera for frame in case.clip.frames], torch.zeros(3, dtype=torch.float64))
     given = torch.stack([frame.camera.center for frame in case.clip.frames if frame.camera is not None])
     centers = torch.stack([camera.center for camera in cameras])
     assert len(cameras) == 16

@@ -2,12 +2,15 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rewild4d.commands.shared import open_dataset
 from rewild4d.config import parse_flags
 from rewild4d.conformance import check_method
 from rewild4d.contracts import Finding
+from rewild4d.datasets.mask_check import SPLIT
 from rewild4d.errors import UserError
+from rewild4d.runner import choose_cases
 
 DESCRIPTION = """Verify a data set's folder (every fault named, not only the first), or that a method keeps its
 contract: same seed same result, save and load same pixels, resume, a clear error on an empty mask."""
@@ -21,12 +24,26 @@ class Options:
     Attributes:
         dataset: whose layout to verify.
         data: the folder; the built-in data where it is left out.
+        video: the same as --data, for a video file or a folder of frames (--dataset online).
+        masks: as for `run`.
+        start: as for `run`.
+        end: as for `run`.
+        fps: as for `run`.
+        case: which videos to look at, names or patterns; the first few where it is left out.
+        sheets: folder for contact sheets: pictures of the masks over their frames.
         method: verify this method instead.
         preset: settings to verify the method with.
     """
 
     dataset: str | None = None
     data: Path | None = None
+    video: Path | None = None
+    masks: Path | None = None
+    start: float | None = None
+    end: float | None = None
+    fps: float | None = None
+    case: tuple[str, ...] = ()
+    sheets: Path = Path("check")
     method: str | None = None
     preset: str = "quick"
 
@@ -36,10 +53,18 @@ def main(arguments: list[str]) -> int:
     if (options.dataset is None) == (options.method is None):
         raise UserError("check: expected either --dataset (with --data) or --method.")
     if options.dataset is not None:
-        findings = open_dataset(options.dataset, options.data)[1].check()
+        findings = _check_data(options.dataset, options)
     else:
         findings = check_method(str(options.method), options.preset)
     return report(findings)
+
+
+def _check_data(dataset: str, options: Options) -> list[Finding]:
+    reader: Any = open_dataset(dataset, options.data, options)[1]
+    if not hasattr(reader, "video"):
+        return reader.check()
+    cases = choose_cases(reader.cases(SPLIT), options.case) if options.case else ()
+    return reader.check(cases, options.sheets)
 
 
 def report(findings: list[Finding]) -> int:

@@ -1,5 +1,6 @@
 """`evaluate`: score a saved reconstruction again, by the protocol it was fitted for."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,7 +64,8 @@ def score_again(folder: Path, options: Options) -> RunRecord:
         raise UserError(f"{saved}: expected a saved reconstruction, but there is no such folder.")
     protocol = find_protocol(record.dataset, record.protocol["name"])
     root = options.data or Path(record.data["root"])
-    clip, truth = load_dataset(record.dataset)(root).load(record.case, protocol.selection)
+    settings = json.loads(record.data.get("settings", "{}"))
+    clip, truth = load_dataset(record.dataset)(root, **settings).load(record.case, protocol.selection)
     for name, now in (("clip", clip.digest), ("truth", truth.digest)):
         if now != record.data[name]:
             raise UserError(f"{root}: the {name} of {record.case} is not the one that {folder} was fitted to.")
@@ -73,9 +75,9 @@ def score_again(folder: Path, options: Options) -> RunRecord:
     found = evaluate(reconstruction, clip, truth, protocol, progress, device)
     progress.close()
     pictures = save_pictures(reconstruction, clip, truth, folder)
-    settings = {"digest": protocol.digest, **msgspec.to_builtins(protocol)}
+    described = {"digest": protocol.digest, **msgspec.to_builtins(protocol)}
     renewed = msgspec.structs.replace(
-        record, status="ok", error="", **found._asdict(), pictures=pictures, protocol=settings,
+        record, status="ok", error="", **found._asdict(), pictures=pictures, protocol=described,
         code=code_version(), machine=machine(device, rasterizer),
     )  # fmt: skip
     return read_record(write_record(renewed, folder))

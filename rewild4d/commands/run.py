@@ -36,7 +36,12 @@ class Options:
         method: which method (see `list`).
         dataset: which data set's layout (see `list`).
         data: one animal's folder or a folder of animals; the built-in animals where it is left out.
-        case: names or patterns of cases ("wolf/Run", "wolf/*"); all where it is left out.
+        video: the same as --data, for a video file or a folder of frames (--dataset online).
+        masks: of the animal: a folder or, for online, a video; in place of the data set's own where it has some.
+        start: seconds from where on frames of the video are used.
+        end: seconds up to which they are used.
+        fps: how many of them a second; of a folder of frames the rate at which it was taken.
+        case: names or patterns of cases ("wolf/Run", "wolf/*"); all (of real videos: quadrupeds) where it is left out.
         protocol: what is held out and measured (see `list`); the data set's default where it is left out.
         preset: size of the effort: quick, standard or paper.
         seeds: one run for each.
@@ -52,6 +57,11 @@ class Options:
     method: str = "ours"
     dataset: str = "artemis"
     data: Path | None = None
+    video: Path | None = None
+    masks: Path | None = None
+    start: float | None = None
+    end: float | None = None
+    fps: float | None = None
     case: tuple[str, ...] = ()
     protocol: str | None = None
     preset: str = "quick"
@@ -97,8 +107,10 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
     if not options.seeds:
         raise UserError("--seeds: expected at least one number, got none.")
     require_writable(options.out)
-    root, reader = open_dataset(options.dataset, options.data)
-    cases = choose_cases(reader.cases(protocol.selection), options.case)
+    root, reader = open_dataset(options.dataset, options.data, options)
+    names = reader.cases(protocol.selection)
+    preferred = getattr(reader, "default_cases", None)
+    cases = choose_cases(names, options.case or (preferred(protocol.selection) if preferred else ()))
     floors = [floor_entry(name) for name in protocol.floors if name != options.method]
     entry = Entry(options.method, options.preset, config, tuple(dict.fromkeys(options.seeds)))
     prior = PriorChoice(options.prior, PRIOR_PRESETS.get(options.preset, STANDARD))

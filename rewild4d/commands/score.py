@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from rewild4d.cloud_scoring import score_clouds
-from rewild4d.commands.run import require_writable
+from rewild4d.commands.shared import require_writable
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import write_text

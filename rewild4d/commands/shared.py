@@ -1,6 +1,7 @@
 """What several commands ask of folders, numbers and floors."""
 
 from pathlib import Path
+from typing import Any
 
 from rewild4d.config import load_preset, preset_names
 from rewild4d.contracts import DatasetReader
@@ -8,15 +9,38 @@ from rewild4d.errors import UserError
 from rewild4d.registry import load_builtin, load_dataset, load_method
 from rewild4d.runner import Entry, Progress
 
+SOURCE_FLAGS = ("masks", "start", "end", "fps")
+"""Flags that a reader takes if its `options` name them."""
 
-def open_dataset(dataset: str, data: Path | None) -> tuple[Path, DatasetReader]:
-    """The folder and a reader on it; without a folder the built-in data, made where it is not there yet."""
+
+def open_dataset(dataset: str, data: Path | None, options: Any = None) -> tuple[Path, DatasetReader]:
+    """The folder or file and a reader on it; without one the built-in data, made where it is not there yet.
+
+    Args:
+        dataset: whose reader.
+        data: its folder.
+        options: of a command, with `video` and the `SOURCE_FLAGS`.
+
+    Raises:
+        UserError: no folder, two of them, or a flag that the data set's reader does not take.
+    """
     reader = load_dataset(dataset)
+    given = {name: value for name in SOURCE_FLAGS if (value := getattr(options, name, None)) is not None}
+    for name in given:
+        if name not in getattr(reader, "options", ()):
+            raise UserError(f"--{name}: the data set '{dataset}' does not take it.")
+    video = getattr(options, "video", None)
+    if video is not None and data is not None:
+        raise UserError("--video: expected either this or --data, got both.")
+    if video is not None and dataset != "online":
+        raise UserError(f"--video: expected --dataset online with it, got {dataset}.")
+    data = data or video
     if data is not None:
-        return data.absolute(), reader(data.absolute())
+        return data.absolute(), reader(data.absolute(), **given)
     make_builtin = load_builtin(dataset)
     if make_builtin is None:
-        raise UserError(f"--data: the data set '{dataset}' has no built-in data; name its folder.")
+        named = "--video" if dataset == "online" else "--data"
+        raise UserError(f"{named}: the data set '{dataset}' has no built-in data; name its file or folder.")
     progress = Progress("built-in animals")
     root = make_builtin(progress)
     progress.close()

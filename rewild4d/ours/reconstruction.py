@@ -63,6 +63,23 @@ class OursReconstruction:
         """The Gaussians at rest, in the object frame; `weights` [n, J] belong to the same rows."""
         return self.model.gaussians.splats()
 
+    @property
+    def pivots(self) -> Tensor:
+        """Inner end of each bone at rest, [J, 3]."""
+        return self.model.pivots
+
+    @property
+    def parents(self) -> Tensor:
+        """Parent of each bone, -1 for a root, [J]."""
+        return self.model.parents
+
+    @torch.no_grad()
+    def articulation(self, time: float) -> tuple[Tensor, Tensor]:
+        """Rest -> posed transforms, [J, 4, 4], and object_to_world, [4, 4]; the deformation network is not in them."""
+        position = frame_position(self.times, time)
+        pose = self._pose(torch.tensor([position]))
+        return self.model.transforms(pose)[0], interpolate_similarity(self.object_to_world, position)
+
     @torch.no_grad()
     def diagnostics(self) -> dict[str, float | list[float]]:
         """Figures that show silent failures: per joint, how far it turns and moves and whether that changes over time.

@@ -1,0 +1,181 @@
+"""Reads DAVIS 2016 and 2017 (Perazzi et al. 2016; Pont-Tuset et al. 2017).
+
+    JPEGImages/<480p | ...>/<sequence>/00000.jpg
+    Annotations/<480p | ...>/<sequence>/00000.png
+    badja/<sequence>.json
+
+Masks of 2016 are grey (0 and 255) and hold one foreground; those of 2017 are indexed, hold object ids and 255 for void.
+A sequence with several objects gives a case for each: "dogs-jump@2". BADJA's joints are read where they lie beside it.
+"""
+
+import tomllib
+from collections.abc import Iterator, Sequence
+from functools import cached_property, partial
+from importlib import resources
+from pathlib import Path
+
+from rewild4d.contracts import Finding, Selection
+from rewild4d.datasets.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
+from rewild4d.datasets.keypoints import read_badja
+from rewild4d.datasets.mask_check import check_videos
+from rewild4d.datasets.masks import MaskFiles, list_images, match_masks, open_masks
+from rewild4d.datasets.wild import Moment, Video, files_identity, split_video
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.types import Clip, Keypoints, Truth
+
+FPS = 24.0
+RESOLUTIONS = ("480p", "1080p", "Full-Resolution")
+"""Of which the first that is there is read."""
+LICENCE = "CC BY-NC 4.0 (DAVIS, Perazzi et al. 2016, Pont-Tuset et al. 2017): attribute, non-commercial"
+
+
+def known_sequences() -> dict[str, dict[str, str | int | bool]]:
+    """What is known of the animals in DAVIS, by sequence (davis.toml)."""
+    return tomllib.loads((resources.files("rewild4d.datasets") / "davis.toml").read_text(encoding="utf-8"))
+
+
+class Davis:
+    """A DAVIS folder.
+
+    Keeps contracts.DatasetReader.
+
+    Args:
+        root: the folder that holds JPEGImages (or a folder DAVIS that does).
+        masks: other masks for the frames that methods see, <sequence>/00000.png; held-out frames are judged by DAVIS's
+            own where they are there.
+
+    Raises:
+        UserError: no such folder, or no frames in it.
+    """
+
+    options = ("masks",)
+
+    def __init__(self, root: Path, masks: Path | None = None) -> None:
+        self.root = root / "DAVIS" if (root / "DAVIS" / "JPEGImages").is_dir() else root
+        self.masks = Path(masks) if masks else None
+        images = self.root / "JPEGImages"
+        self.resolution = next((name for name in RESOLUTIONS if (images / name).is_dir()), None)
+        if self.resolution is None:
+            raise UserError(f"{images}: expected frames in one of {', '.join(RESOLUTIONS)}, got none.")
+        if self.masks is not None and not self.masks.is_dir():
+            raise UserError(f"{self.masks}: expected a folder of masks, got no such folder.")
+
+    @property
+    def licence(self) -> str:
+        return LICENCE
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The options that differ from their defaults, for the record."""
+        return {"masks": str(self.masks.resolve())} if self.masks else {}
+
+    def cases(self, selection: Selection) -> list[str]:
+        """Every sequence with masks, "<sequence>@<id>" where it has several objects."""
+        return list(self._table)
+
+    def default_cases(self, selection: Selection) -> list[str]:
+        """The quadrupeds among the known sequences; all sequences where there is none of them."""
+        known, stems = known_sequences(), self._stems
+        chosen = [case for case in self._table if known.get(stems[case], {}).get("quadruped", stems[case] in known)]
+        return chosen or list(self._table)
+
+    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
+        """Decode one case.
+
+        Raises:
+            UserError: no such case, or files of it that cannot be used.
+        """
+        return split_video(self.video(case), selection)
+
+    def video(self, case: str) -> Video:
+        """The frames and masks of a case.
+
+        Raises:
+            UserError: as `load`.
+        """
+        if case not in self._table:
+            raise unknown_name("case", case, self._table)
+        sequence, object_id = self._table[case]
+        files = self._frames(sequence)
+        size = image_size(files[0])
+        own = self._own_masks(sequence, files)
+        given, note = self._given_masks(sequence, files)
+        used, every = given or own, range(len(files))
+        joints = self._joints(sequence, size)
+        facts = known_sequences().get(sequence, {})
+        notes = (note, str(facts.get("note", "")), _odd_animal(facts))
+        return Video(
+            title=str(files[0].parent), name=case, species=str(facts.get("species", sequence)), fps=FPS,
+            licence=LICENCE, identity=files_identity(*files, *own.files, *used.files) + f" {object_id}", size=size,
+            moments=tuple(Moment(file.name, i / FPS, joints.get(file.stem)) for i, file in enumerate(files)),
+            images=partial(read_images, files, size),
+            masks=partial(read_masks, used, object_id if object_id in used.ids else None, every, size),
+            true_masks=partial(read_masks, own, object_id, every, size) if given else None,
+            notes=tuple(text for text in notes if text),
+        )  # fmt: skip
+
+    def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
+        """Verify some sequences, each file decoded; contact sheets go to ``sheets``."""
+        return check_videos(self, cases, sheets)
+
+    @cached_property
+    def _table(self) -> dict[str, tuple[str, int | None]]:
+        """Case -> sequence and object id (None: the whole foreground)."""
+        table: dict[str, tuple[str, int | None]] = {}
+        for folder in sorted((self.root / "JPEGImages" / str(self.resolution)).iterdir()):
+            masks = self._mask_folder(folder.name)
+            if not folder.is_dir() or masks is None:
+                continue
+            ids = open_masks(list_images(masks)[:1]).ids  # the first frame names all objects
+            cases = [(folder.name, None)] if len(ids) < 2 else [(f"{folder.name}@{number}", number) for number in ids]
+            table |= {name: (folder.name, number) for name, number in cases}
+        if not table:
+            raise UserError(f"{self.root / 'Annotations'}: expected masks of the sequences in JPEGImages, got none.")
+        return table
+
+    @property
+    def _stems(self) -> dict[str, str]:
+        return {case: sequence for case, (sequence, _) in self._table.items()}
+
+    def _mask_folder(self, sequence: str) -> Path | None:
+        folders = [self.root / name / str(self.resolution) / sequence for name in _ANNOTATIONS]
+        given = [self.masks / sequence] if self.masks else []
+        return next((folder for folder in (*folders, *given) if folder.is_dir() and list_images(folder)), None)
+
+    def _frames(self, sequence: str) -> list[Path]:
+        folder = self.root / "JPEGImages" / str(self.resolution) / sequence
+        files = [file for file in list_images(folder) if file.suffix.lower() in FRAME_SUFFIXES]
+        if not files:
+            raise UserError(f"{folder}: expected frames ({', '.join(FRAME_SUFFIXES)}), got none.")
+        return files
+
+    def _own_masks(self, sequence: str, files: list[Path]) -> MaskFiles:
+        """DAVIS's masks; none where it has none."""
+        for name in _ANNOTATIONS:
+            folder = self.root / name / str(self.resolution) / sequence
+            if folder.is_dir() and (found := list_images(folder)):
+                return open_masks(match_masks(found, [file.stem for file in files], folder)[0])
+        return MaskFiles((None,) * len(files), ())
+
+    def _given_masks(self, sequence: str, files: list[Path]) -> tuple[MaskFiles | None, str]:
+        if self.masks is None:
+            return None, ""
+        folder = self.masks / sequence
+        found, note = match_masks(list_images(folder), [file.stem for file in files], folder)
+        return open_masks(found), f"masks of the input from {folder}" + (f"; {note}" if note else "")
+
+    def _joints(self, sequence: str, size: tuple[int, int]) -> dict[str, Keypoints]:
+        file = next((f for f in _badja_files(self.root, sequence) if f.is_file()), None)
+        return read_badja(file, size) if file else {}
+
+
+_ANNOTATIONS = ("Annotations", "Annotations_unsupervised")
+
+
+def _badja_files(root: Path, sequence: str) -> Iterator[Path]:
+    for folder in ("badja", "joint_annotations", "BADJA/joint_annotations"):
+        yield root / folder / f"{sequence}.json"
+
+
+def _odd_animal(facts: dict[str, str | int | bool]) -> str:
+    return "" if facts.get("quadruped", True) else f"a {facts['species']} is no quadruped: no four-legged template fits"

@@ -1,0 +1,236 @@
+"""Masks from files of any kind: which values mean the animal, and which mask belongs to which frame.
+
+The same value means different things: 255 is the foreground of DAVIS 2016 (grey images of 0 and 255) and "void" in
+DAVIS 2017 (indexed images whose values are object ids). So a folder is read as a whole before its values are told.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from rewild4d.errors import UserError
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+VOID = 255
+MOST_OBJECTS = 32
+"""Grey images whose values all lie below this are ids, not shades."""
+NOISE = 0.04
+"""Parts smaller than this share of the largest one do not widen the animal's box."""
+CUT_SHARE = 0.1
+"""The animal is cut where it touches the image's border along more than this share of its shorter side."""
+
+
+@dataclass(frozen=True)
+class MaskFacts:
+    """What a mask says about the animal in it.
+
+    Attributes:
+        box: left, top, right, bottom of all parts that count, in pixels; None where there is no animal.
+        is_cut: it reaches over the image's border.
+        parts: the area of each connected part in pixels, largest first.
+        holes: area enclosed by the animal over the animal's area.
+    """
+
+    box: tuple[int, int, int, int] | None
+    is_cut: bool
+    parts: tuple[int, ...]
+    holes: float
+
+    @property
+    def area(self) -> int:
+        return sum(self.parts)
+
+
+@dataclass(frozen=True)
+class MaskFiles:
+    """The masks of one video: a file for each frame that has one, and how to read their values.
+
+    Attributes:
+        files: of each frame; None where it has no mask.
+        ids: the objects that indexed files name, ascending; empty where a file holds a foreground or a soft matte.
+    """
+
+    files: tuple[Path | None, ...]
+    ids: tuple[int, ...]
+
+    def read(self, index: int, object_id: int | None, size: tuple[int, int]) -> np.ndarray | None:
+        """The mask of a frame, uint8 [h, w], 255 inside; None where it has none.
+
+        Args:
+            index: of the frame.
+            object_id: which of `ids`; None: all of them together.
+            size: width and height of the frame; a mask of the same shape in another size is scaled.
+
+        Raises:
+            UserError: a file that cannot be read, or of another shape than the frame.
+        """
+        file = self.files[index]
+        if file is None:
+            return None
+        values = read_values(file)
+        if self.ids:
+            wanted = values == object_id if object_id is not None else np.isin(values, self.ids)
+            values = np.where(wanted, 255, 0).astype(np.uint8)
+        return fit_size(values, size, str(file))
+
+
+def open_masks(files: Sequence[Path | None]) -> MaskFiles:
+    """Look at all masks of a video and tell what their values mean.
+
+    Raises:
+        UserError: a file that cannot be read.
+    """
+    seen: set[int] = set()
+    indexed = False
+    for file in files:
+        if file is not None:
+            indexed |= _is_indexed(file)
+            seen |= set(np.flatnonzero(np.bincount(read_values(file).ravel(), minlength=256)).tolist())
+    named = sorted(seen - {0})
+    if named in ([], [VOID]):
+        ids: tuple[int, ...] = ()
+    elif indexed:
+        ids = tuple(value for value in named if value != VOID)
+    else:
+        ids = tuple(named) if max(named) < MOST_OBJECTS else ()
+    return MaskFiles(tuple(files), ids)
+
+
+def read_values(file: Path) -> np.ndarray:
+    """The values of a mask file as they are stored, uint8 [h, w]: indices, not colours, of an indexed image.
+
+    An alpha channel that varies is the mask; colours are taken as foreground unless black; 16 bits become 8 where they
+    are shades.
+
+    Raises:
+        UserError: the file cannot be read.
+    """
+    try:
+        with Image.open(file) as opened:
+            image = ImageOps.exif_transpose(opened)
+            values = np.asarray(image)
+            mode = image.mode
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise UserError(f"{file}: expected a mask image that can be read, got a damaged or another file.") from error
+    if values.dtype == bool:
+        return values.astype(np.uint8) * 255
+    if values.ndim == 3:
+        return _from_channels(values, mode)
+    if values.dtype != np.uint8:
+        shades = values.max(initial=0) > 255
+        return (values / 65535 * 255 if shades else values).clip(0, 255).astype(np.uint8)
+    return values
+
+
+def _from_channels(values: np.ndarray, mode: str) -> np.ndarray:
+    if mode in ("LA", "RGBA", "PA") and values[..., -1].min() < values[..., -1].max():
+        return values[..., -1]
+    colors = values[..., :3] if mode in ("RGB", "RGBA") else values[..., :1]
+    if (colors == colors[..., :1]).all():
+        return np.ascontiguousarray(colors[..., 0])
+    return np.where(colors.any(axis=2), 255, 0).astype(np.uint8)
+
+
+def _is_indexed(file: Path) -> bool:
+    with Image.open(file) as opened:
+        return opened.mode == "P"
+
+
+def fit_size(mask: np.ndarray, size: tuple[int, int], title: str) -> np.ndarray:
+    """The mask at the size of its frame; one of the same shape in another size is scaled.
+
+    Raises:
+        UserError: another shape.
+    """
+    height, width = mask.shape
+    if (width, height) == size:
+        return mask
+    if abs(width * size[1] - height * size[0]) > max(size) + max(width, height):  # beyond rounding of either
+        raise UserError(
+            f"{title}: expected a mask of {size[0]}x{size[1]} pixels like its frame (or of that shape), "
+            f"got {width}x{height}."
+        )
+    return cv2.resize(mask, size, interpolation=cv2.INTER_AREA if width > size[0] else cv2.INTER_LINEAR)
+
+
+def mask_facts(mask: np.ndarray) -> MaskFacts:
+    """Look at one mask, uint8 [h, w]."""
+    solid = (mask > 127).astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(solid)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    if count < 2:
+        return MaskFacts(None, False, (), 0.0)
+    large = 1 + np.flatnonzero(areas >= NOISE * areas.max())
+    lower = stats[large, :2].min(axis=0)
+    upper = (stats[large, :2] + stats[large, 2:4]).max(axis=0)
+    edges = (labels[0], labels[-1], labels[:, 0], labels[:, -1])
+    contact = max(int(np.isin(edge, large).sum()) for edge in edges)
+    is_cut = contact > CUT_SHARE * int((upper - lower).min())
+    box = (int(lower[0]), int(lower[1]), int(upper[0]), int(upper[1]))
+    return MaskFacts(box, is_cut, tuple(sorted(map(int, areas), reverse=True)), _holes(solid) / int(areas.sum()))
+
+
+def _holes(solid: np.ndarray) -> int:
+    """Pixels of background that no path joins to the border."""
+    padded = cv2.copyMakeBorder(1 - solid, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
+    _, labels = cv2.connectedComponents(padded, connectivity=4)
+    return int(((padded > 0) & (labels != labels[0, 0])).sum())
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The image files of a folder in natural order (2 before 10).
+
+    Raises:
+        UserError: no such folder.
+    """
+    try:
+        found = [entry for entry in folder.iterdir() if entry.suffix.lower() in SUFFIXES and entry.name[0] != "."]
+    except OSError as error:
+        raise UserError(f"{folder}: expected a folder of images, but: {error.strerror}.") from error
+    return sorted(found, key=lambda entry: [int(w) if w.isdigit() else w for w in re.split(r"([0-9]+)", entry.name)])
+
+
+def match_masks(masks: Sequence[Path], stems: Sequence[str], folder: Path) -> tuple[list[Path | None], str]:
+    """Which mask belongs to which frame: by equal names, else by the number in the name, else by order.
+
+    Args:
+        masks: files in natural order.
+        stems: names of the frames without suffix; of a video the frame numbers, from 0.
+        folder: of the masks, for messages.
+
+    Returns:
+        A file or None for each frame, and a sentence where names did not settle it ("" where they did).
+
+    Raises:
+        UserError: no mask, or masks that fit no frame.
+    """
+    if not masks:
+        raise UserError(f"{folder}: expected masks ({', '.join(SUFFIXES)}), got none.")
+    by_name = {mask.stem: mask for mask in masks}
+    by_number = {number: mask for mask in masks if (number := _number(mask.stem)) is not None}
+    numbers = [number for stem in stems if (number := _number(stem)) is not None]
+    counted = len(by_number) == len(masks) and len({*numbers}) == len(stems)
+    shift = min(by_number) - min(numbers) if counted else 0
+    if abs(shift) == 1 and len(masks) == len(stems) and {number + shift for number in numbers} == {*by_number}:
+        note = f"masks are numbered from {min(by_number)}, frames from {min(numbers)}"
+        return [by_number[number + shift] for number in numbers], note
+    if any(stem in by_name for stem in stems):
+        return [by_name.get(stem) for stem in stems], ""
+    if counted and any(number in by_number for number in numbers):
+        return [by_number.get(number) for number in numbers], ""
+    if len(masks) == len(stems):
+        return list(masks), f"masks and frames share no names: matched in order, {masks[0].name} first"
+    raise UserError(
+        f"{folder}: expected masks named like the frames ({stems[0]}, ...) or one for each of the {len(stems)} frames, "
+        f"got {len(masks)} ({masks[0].name}, ...)."
+    )
+
+
+def _number(stem: str) -> int | None:
+    found = re.findall(r"[0-9]+", stem)
+    return int(found[-1]) if found else None

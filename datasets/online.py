@@ -1,0 +1,307 @@
+"""Reads a person's own video: a file or a folder of frames, and masks of the animal in it.
+
+Masks are a folder (named or numbered like the frames, or as many), a second video, or the alpha channel of the frames
+themselves; root/masks is looked at where nothing is named. Images are turned as their EXIF says and videos as their
+header says; frames keep their own time stamps, so any frame rate will do, a variable one too.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+
+from rewild4d.contracts import Finding, Selection
+from rewild4d.datasets.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
+from rewild4d.datasets.images import read_picture
+from rewild4d.datasets.mask_check import check_videos
+from rewild4d.datasets.mask_makers import Unmasked
+from rewild4d.datasets.masks import MaskFiles, fit_size, list_images, match_masks, open_masks
+from rewild4d.datasets.video_file import SUFFIXES, read_video, video_facts
+from rewild4d.datasets.wild import Masks, Moment, Video, files_identity, split_video
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.types import Clip, Truth
+
+FOLDER_FPS = 25.0
+"""Of a folder of frames where --fps is left out."""
+MOST_FRAMES = 300
+"""A longer video is thinned evenly where --fps is left out: more frames fill the memory and hardly help."""
+LICENCE = "a person's own video; its terms are not known"
+
+
+@dataclass(frozen=True)
+class Material:
+    """The frames of a video in order: image files, or one video file.
+
+    Attributes:
+        files: empty for a video file.
+        times: seconds of every frame, ascending.
+        size: width and height.
+        has_alpha: whether the frames carry a mask of their own.
+        notes: what was found wrong, a sentence each.
+    """
+
+    files: tuple[Path, ...]
+    times: tuple[float, ...]
+    size: tuple[int, int]
+    has_alpha: bool
+    notes: tuple[str, ...]
+
+
+class Online:
+    """One video of a person's own.
+
+    Keeps contracts.DatasetReader. The case is called like the file or the folder; where masks hold several objects,
+    each is a case: "clip@2".
+
+    Args:
+        root: a video file, a folder of frames, or a folder that holds one called frames (and one called masks).
+        masks: folder of masks or a video of them.
+        start: seconds from where on frames are used.
+        end: seconds up to which frames are used.
+        fps: frames per second that are kept; of a folder also the rate at which it was taken.
+
+    Raises:
+        UserError: no such file, or numbers that make no sense.
+    """
+
+    options = ("masks", "start", "end", "fps")
+    licence = LICENCE
+
+    def __init__(
+        self,
+        root: Path,
+        masks: Path | str | None = None,
+        start: float | str | None = None,
+        end: float | str | None = None,
+        fps: float | str | None = None,
+    ) -> None:
+        self.root = root
+        self.masks = Path(masks) if masks else None
+        self.start, self.end, self.fps = (None if value is None else float(value) for value in (start, end, fps))
+        for path in (self.root, *([self.masks] if self.masks else [])):
+            if not path.exists():
+                raise UserError(f"{path}: expected a video file or a folder of images, but there is no such thing.")
+        if self.fps is not None and not 0 < self.fps <= 1000:
+            raise UserError(f"--fps: expected a number above 0, got {self.fps:g}.")
+        if (self.start or 0) < 0 or (self.end is not None and self.end <= (self.start or 0)):
+            raise UserError(f"--start and --end: expected 0 <= start < end, got {self.start or 0:g} and {self.end:g}.")
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The options that differ from their defaults, for the record."""
+        given = {"masks": self.masks and self.masks.resolve(), "start": self.start, "end": self.end, "fps": self.fps}
+        return {name: str(value) for name, value in given.items() if value is not None}
+
+    def cases(self, selection: Selection) -> list[str]:
+        """The video's name; one for each object where its masks hold several."""
+        return list(self._table)
+
+    def default_cases(self, selection: Selection) -> list[str]:
+        """All of `cases`."""
+        return self.cases(selection)
+
+    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
+        """Decode one case.
+
+        Raises:
+            UserError: no such case, no masks, or files that cannot be used.
+        """
+        return split_video(self.video(case), selection)
+
+    def video(self, case: str) -> Video:
+        """The frames and masks of a case.
+
+        Raises:
+            UserError: as `load`.
+        """
+        if case not in self._table:
+            raise unknown_name("case", case, self._table)
+        material, (indices, thinned) = self._material, self._chosen
+        times = [material.times[i] for i in indices]
+        span = times[-1] - times[0]
+        masks, note = self._masks(self._table[case])
+        settings = f"{indices} {self._table[case]} {self.fps}"
+        sources = self._mask_sources
+        return Video(
+            title=str(self.root), name=case, species="animal", fps=(len(times) - 1) / span if span else FOLDER_FPS,
+            licence=LICENCE, identity=files_identity(*(material.files or (self.root,)), *sources) + settings,
+            size=material.size,
+            moments=tuple(Moment(self._label(i), material.times[i]) for i in indices),
+            images=self._images, masks=masks, notes=(*material.notes, *(text for text in (thinned, note) if text)),
+        )  # fmt: skip
+
+    def unmasked(self, case: str) -> Unmasked:
+        """The chosen frames without their masks, for programs that make some; masks are named by frame number.
+
+        Raises:
+            UserError: as `load`.
+        """
+        indices = self._chosen[0]
+        stems = tuple(self._material.files[i].stem if self._material.files else f"{i:05d}" for i in indices)
+        return Unmasked(str(self.root), stems, self._material.size, self._images, {})
+
+    @property
+    def name(self) -> str:
+        """Of the video: its file's or folder's name."""
+        return self.root.stem if self.root.is_file() else self.root.resolve().name
+
+    def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
+        """Verify the video and its masks; a contact sheet goes to ``sheets``."""
+        return check_videos(self, cases, sheets)
+
+    @cached_property
+    def _frames_root(self) -> Path:
+        inner = [self.root / name for name in ("frames", "images") if (self.root / name).is_dir()]
+        return inner[0] if inner else self.root
+
+    @cached_property
+    def _material(self) -> Material:
+        if self.root.is_file():
+            if self.root.suffix.lower() in FRAME_SUFFIXES:
+                raise UserError(f"{self.root}: expected a video or a folder of frames, got one image.")
+            facts = video_facts(self.root)
+            fault = f"ffmpeg complains of the video, {len(facts.times)} frames were read: {facts.faults}"
+            notes = (fault,) if facts.faults else ()
+            return Material((), facts.times, (facts.width, facts.height), facts.has_alpha, notes)
+        files = tuple(f for f in list_images(self._frames_root) if f.suffix.lower() in FRAME_SUFFIXES)
+        if not files:
+            expected = f"frames ({', '.join(FRAME_SUFFIXES)})"
+            videos = [entry.name for entry in self._frames_root.iterdir() if entry.suffix.lower() in SUFFIXES]
+            hint = f", but there is {videos[0]}: name that file" if videos else ", got none"
+            raise UserError(f"{self._frames_root}: expected {expected}{hint}.")
+        rate = self.fps or FOLDER_FPS
+        has_alpha = files[0].suffix.lower() == ".png" and _file_alpha(files[0]) is not None
+        notes = () if self.fps else (f"a folder of frames has no frame rate: {FOLDER_FPS:g} a second assumed (--fps)",)
+        return Material(files, tuple(i / rate for i in range(len(files))), image_size(files[0]), has_alpha, notes)
+
+    @cached_property
+    def _chosen(self) -> tuple[list[int], str]:
+        """Indices of the frames between --start and --end at --fps, and a sentence where they were thinned unasked."""
+        times = self._material.times
+        low, high = self.start or 0.0, self.end if self.end is not None else float("inf")
+        inside = [i for i, time in enumerate(times) if low <= time <= high]
+        if not inside:
+            raise UserError(
+                f"{self.root}: expected frames between {low:g} and {high:g} s, but the last is at {times[-1]:.2f} s."
+            )
+        if self.fps and not self._material.files:
+            return _thinned([times[i] for i in inside], inside, self.fps), ""
+        if len(inside) > MOST_FRAMES and not self.fps:
+            step = -(-len(inside) // MOST_FRAMES)
+            return inside[::step], f"{len(inside)} frames thinned to every {step}th (--fps and --end choose otherwise)"
+        return inside, ""
+
+    @cached_property
+    def _table(self) -> dict[str, int | None]:
+        """Case -> object id (None: all that the masks hold)."""
+        name = self.name
+        ids = self._mask_files.ids if self._mask_files else ()
+        return {name: None} if len(ids) < 2 else {f"{name}@{number}": number for number in ids}
+
+    @cached_property
+    def _mask_place(self) -> Path | None:
+        """The folder or video of masks, or None where they are the frames' alpha."""
+        beside = self.root / "masks" if self.root.is_dir() else None
+        place = self.masks or (beside if beside and beside.is_dir() else None)
+        if place is None and not self._material.has_alpha:
+            raise UserError(
+                f"{self.root}: expected masks of the animal, but the frames have no alpha channel and no --masks was "
+                "given; `rewild4d-bench masks` makes some."
+            )
+        return place
+
+    @cached_property
+    def _mask_match(self) -> tuple[MaskFiles, str] | None:
+        """The mask of each chosen frame where masks lie in a folder."""
+        if self._mask_place is None or not self._mask_place.is_dir():
+            return None
+        found, (indices, _) = list_images(self._mask_place), self._chosen
+        stems = [file.stem for file in self._material.files] or [str(i) for i in range(len(self._material.times))]
+        if len(found) == len(indices) < len(stems):  # made from the chosen frames alone
+            matched, note = match_masks(found, [stems[i] for i in indices], self._mask_place)
+        else:
+            every, note = match_masks(found, stems, self._mask_place)
+            matched = [every[i] for i in indices]
+        return open_masks(matched), note
+
+    @property
+    def _mask_files(self) -> MaskFiles | None:
+        return self._mask_match[0] if self._mask_match else None
+
+    @property
+    def _mask_sources(self) -> Sequence[Path | None]:
+        if self._mask_files:
+            return self._mask_files.files
+        return (self._mask_place,) if self._mask_place else ()
+
+    def _masks(self, object_id: int | None) -> tuple[Masks, str]:
+        size, (indices, _) = self._material.size, self._chosen
+        if self._mask_match:
+            masks, note = self._mask_match
+            return partial(read_masks, masks, object_id, range(len(indices)), size), note
+        if self._mask_place is None:
+            return self._alphas, "masks are the frames' alpha channel"
+        return self._video_masks(self._mask_place)
+
+    def _video_masks(self, path: Path) -> tuple[Masks, str]:
+        """Masks out of a video: of all frames, or of the chosen ones only."""
+        facts, (indices, _) = video_facts(path), self._chosen
+        total = len(self._material.times)
+        if len(facts.times) == total:
+            chosen, note = indices, ""
+        elif len(facts.times) == len(indices):
+            chosen, note = list(range(len(indices))), "the video of masks is matched to the chosen frames in order"
+        else:
+            raise UserError(
+                f"{path}: expected a mask for each of the {total} frames of {self.root.name}, got {len(facts.times)}."
+            )
+        return partial(_mask_stream, path, chosen, self._material.size, facts.has_alpha), note
+
+    def _images(self) -> Iterator[np.ndarray]:
+        indices = self._chosen[0]
+        if self._material.files:
+            return read_images([self._material.files[i] for i in indices], self._material.size)
+        return (frame[..., :3] for frame in _picked(read_video(self.root), indices))
+
+    def _alphas(self) -> Iterator[np.ndarray | None]:
+        indices = self._chosen[0]
+        if self._material.files:
+            return (_file_alpha(self._material.files[i]) for i in indices)
+        return (frame[..., 3] for frame in _picked(read_video(self.root), indices))
+
+    def _label(self, index: int) -> str:
+        return self._material.files[index].name if self._material.files else f"frame {index}"
+
+
+def _thinned(times: list[float], indices: list[int], fps: float) -> list[int]:
+    """The frames nearest to an even grid, each once."""
+    grid = np.arange(times[0], times[-1] + 0.5 / fps, 1 / fps)
+    after = np.searchsorted(times, grid).clip(1, max(1, len(times) - 1))
+    before = after - 1
+    known = np.asarray([*times, times[-1]]) if len(times) == 1 else np.asarray(times)
+    nearest = np.where(grid - known[before] <= known[after] - grid, before, after)
+    return [indices[i] for i in sorted(set(nearest.tolist())) if i < len(indices)]
+
+
+def _picked(frames: Iterator[np.ndarray], indices: Sequence[int]) -> Iterator[np.ndarray]:
+    """Some frames of a stream; it is not read beyond the last of them."""
+    wanted, last = set(indices), max(indices)
+    for index, frame in enumerate(frames):
+        if index in wanted:
+            yield frame
+        if index == last:
+            return
+
+
+def _mask_stream(path: Path, indices: Sequence[int], size: tuple[int, int], alpha: bool) -> Iterator[np.ndarray | None]:
+    for frame in _picked(read_video(path), indices):
+        values = frame[..., 3] if alpha else frame[..., :3].max(axis=2)
+        yield fit_size(np.ascontiguousarray(values), size, str(path))
+
+
+def _file_alpha(file: Path) -> np.ndarray | None:
+    """The alpha channel of an image that has one, uint8 [h, w]."""
+    alpha = read_picture(file)[1]
+    return None if alpha is None else np.rint(alpha * 255).astype(np.uint8)

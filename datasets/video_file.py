@@ -1,0 +1,133 @@
+"""Video files, frame by frame with their own time stamps: any codec that ffmpeg knows, turned upright, with alpha.
+
+Frames come through a pipe as PAM images, which say their own size; the time stamps come from ffmpeg's `showinfo`, so a
+variable frame rate keeps its times.
+"""
+
+import re
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import IO
+
+import imageio_ffmpeg
+import numpy as np
+
+from rewild4d.errors import UserError
+
+SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".gif", ".mpg", ".mpeg", ".wmv", ".ts", ".3gp")
+_TIME = re.compile(r"showinfo.*\bn: *\d+ .*\bpts_time:(\S+)")
+_FAULT = re.compile(r"\[(?:error|fatal)\] (.+)")
+
+
+@dataclass(frozen=True)
+class VideoFacts:
+    """What one pass over a video tells.
+
+    Attributes:
+        times: of the frames in seconds, the first one 0, ascending.
+        width: of the upright frames in pixels.
+        height: of the upright frames in pixels.
+        has_alpha: whether any frame is transparent anywhere.
+        faults: what ffmpeg complained of ("" where of nothing).
+    """
+
+    times: tuple[float, ...]
+    width: int
+    height: int
+    has_alpha: bool
+    faults: str
+
+
+def read_video(path: Path) -> Iterator[np.ndarray]:
+    """Every frame of a video, upright, uint8 [h, w, 4] (alpha is 255 where the video has none).
+
+    Raises:
+        UserError: ffmpeg cannot read the file.
+    """
+    with tempfile.TemporaryFile("w+") as log:
+        yield from _frames(path, log)
+
+
+def video_facts(path: Path) -> VideoFacts:
+    """Times and size of a video, by decoding all of it; kept until the file changes.
+
+    Raises:
+        UserError: ffmpeg cannot read the file, or it holds no frame.
+    """
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise UserError(f"{path}: expected a video, but: {error.strerror}.") from error
+    return _facts(path, state.st_size, state.st_mtime_ns)
+
+
+@lru_cache(maxsize=8)
+def _facts(path: Path, size: int, changed: int) -> VideoFacts:
+    count, width, height, has_alpha = 0, 0, 0, False
+    with tempfile.TemporaryFile("w+") as log:
+        for frame in _frames(path, log):
+            count, (height, width) = count + 1, frame.shape[:2]
+            has_alpha = has_alpha or bool((frame[..., 3] < 255).any())
+        log.seek(0)
+        said = log.read()
+    if not count:
+        raise UserError(f"{path}: expected a video that ffmpeg can read, got {_complaint(said) or 'no frame'}.")
+    return VideoFacts(_ascending(re.findall(_TIME, said), count), width, height, has_alpha, _complaint(said))
+
+
+def _ascending(stamps: list[str], count: int) -> tuple[float, ...]:
+    """Times from the first frame on; where stamps are missing or do not ascend, frames at 25 a second."""
+    try:
+        times = [float(stamp) for stamp in stamps[:count]]
+    except ValueError:
+        times = []
+    if len(times) < count or any(after <= before for before, after in zip(times, times[1:], strict=False)):
+        return tuple(i / 25 for i in range(count))
+    return tuple(time - times[0] for time in times)
+
+
+def _complaint(said: str) -> str:
+    found = re.search(_FAULT, said)
+    return found.group(1).strip().rstrip(".") if found else ""
+
+
+def _frames(path: Path, log: IO[str]) -> Iterator[np.ndarray]:
+    """Decode; ffmpeg's words go to ``log``."""
+    command = [
+        imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-nostats", "-loglevel", "level+info",
+        *_decoder(path), "-i", f"file:{path}", "-map", "0:v:0", "-fps_mode", "passthrough",
+        "-vf", "showinfo=checksum=0", "-pix_fmt", "rgba", "-c:v", "pam", "-f", "image2pipe", "-",
+    ]  # fmt: skip
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log) as process:
+        assert process.stdout is not None
+        while (frame := _pam(process.stdout)) is not None:
+            yield frame
+
+
+def _pam(pipe: IO[bytes]) -> np.ndarray | None:
+    """The next image of a stream, or None at its end."""
+    header: dict[bytes, bytes] = {}
+    while (line := pipe.readline()) and line != b"ENDHDR\n":
+        key, _, value = line.strip().partition(b" ")
+        header[key] = value
+    if not line:
+        return None
+    shape = tuple(int(header[key]) for key in (b"HEIGHT", b"WIDTH", b"DEPTH"))
+    data = pipe.read(shape[0] * shape[1] * shape[2])
+    if len(data) < shape[0] * shape[1] * shape[2]:
+        return None
+    return np.frombuffer(data, np.uint8).reshape(shape)
+
+
+@lru_cache(maxsize=8)
+def _decoder(path: Path) -> tuple[str, ...]:
+    """ffmpeg's own VP8 and VP9 decoders drop the alpha channel; libvpx keeps it."""
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-i", f"file:{path}"]
+    said = subprocess.run(command, capture_output=True, text=True, errors="replace").stderr
+    if re.search(r"alpha_mode\s*: 1", said, re.IGNORECASE):
+        return "-c:v", "libvpx-vp9" if "Video: vp9" in said else "libvpx"
+    return ()

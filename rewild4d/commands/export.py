@@ -1,0 +1,79 @@
+"""`export`: a saved reconstruction in files that other programs open."""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from rewild4d.commands.shared import require_writable
+from rewild4d.config import parse_flags
+from rewild4d.errors import UserError
+from rewild4d.export import KINDS, export, parse_kinds, why_not
+from rewild4d.leaderboard.records import FILE, RunRecord, read_record
+from rewild4d.machine import pick_device
+from rewild4d.protocol import find_protocol
+from rewild4d.rasterizer import pick_rasterizer, set_default
+from rewild4d.registry import load_dataset, load_method
+from rewild4d.types import Clip
+
+DESCRIPTION = """Write a run's reconstruction as files for other programs: Gaussians of every frame (ply), an animated
+skinned mesh (glb), cameras (OpenCV axes, JSON) and films (mp4)."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Flags of `export`.
+
+    Attributes:
+        run: folder of one run, with a record.json and a reconstruction.
+        out: folder for the files.
+        what: some of ply, glb, cameras and mp4, with commas.
+        data: where the data is now, if it was moved since.
+        device: auto, cpu or cuda.
+        rasterizer: what renders the films: auto, numba (CPU), triton or gsplat (CUDA), or reference.
+    """
+
+    run: tyro.conf.Positional[Path]
+    out: Path
+    what: str = ",".join(KINDS)
+    data: Path | None = None
+    device: str = "auto"
+    rasterizer: str = "auto"
+
+
+def main(arguments: list[str]) -> int:
+    options = parse_flags(Options, arguments, prog="rewild4d-bench export", description=DESCRIPTION)
+    kinds = parse_kinds(options.what)
+    device = pick_device(options.device)
+    set_default(pick_rasterizer(options.rasterizer, device))
+    record = read_record(options.run / FILE)
+    saved = options.run / "reconstruction"
+    if not saved.is_dir():
+        raise UserError(f"{saved}: expected a saved reconstruction, but there is no such folder.")
+    clip = load_clip(record, options.data)
+    reconstruction = load_method(record.method).load(saved, device)
+    reasons = {kind: why_not(reconstruction, kind, clip) for kind in kinds}
+    if all(reasons.values()):
+        raise UserError(f"{options.run}: nothing can be written: {'; '.join(f'{k}: {r}' for k, r in reasons.items())}.")
+    require_writable(options.out)
+    for path in export(reconstruction, clip, kinds, options.out):
+        print(path)
+    for kind, reason in reasons.items():
+        if reason:
+            print(f"{kind}: not written: {reason}", file=sys.stderr)
+    return 0
+
+
+def load_clip(record: RunRecord, data: Path | None) -> Clip:
+    """The clip that a run was fitted to.
+
+    Raises:
+        UserError: the data is not there any more.
+    """
+    protocol = find_protocol(record.dataset, record.protocol["name"])
+    settings = json.loads(record.data.get("settings", "{}"))
+    return load_dataset(record.dataset)(data or Path(record.data["root"]), **settings).load(
+        record.case, protocol.selection
+    )[0]

@@ -1,0 +1,100 @@
+"""`masks`: masks of the animal for a video that has none."""
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from rewild4d.commands.shared import open_dataset, require_writable
+from rewild4d.config import parse_flags
+from rewild4d.datasets.grabcut import rough_masks
+from rewild4d.datasets.grounded_sam import DETECTOR, SEGMENTER, grounded_masks
+from rewild4d.datasets.mask_check import SPLIT
+from rewild4d.datasets.mask_makers import MaskMaker, parse_boxes, run_program, write_masks
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.machine import pick_device
+from rewild4d.runner import choose_cases
+
+DESCRIPTION = """Make masks of the animal. --tool program runs any command that reads a folder of frames and writes a
+folder of masks; --tool grounded-sam2 uses Grounding DINO and SAM 2 (pip install rewild4d[masks]; their weights are on
+Hugging Face); --tool rough is GrabCut from a box: it works offline and is rough, as its name says."""
+TOOLS = ("rough", "program", "grounded-sam2")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Flags of `masks`.
+
+    Attributes:
+        out: folder for the masks; of a data set with several cases one folder for each in it.
+        tool: rough, program or grounded-sam2.
+        video: a video file or a folder of frames.
+        dataset: online, or aptv2, whose boxes are used.
+        data: the data set's folder.
+        case: names or patterns of cases; all where it is left out.
+        start: seconds from where on frames are used.
+        end: seconds up to which they are used.
+        fps: how many of them a second.
+        box: around the animal, in pixels: left,top,width,height in the first frame; more of them as frame:left,...
+        command: for program: a command line with {frames} and {masks} (and {boxes}) in it.
+        text: for grounded-sam2: what the animal is called.
+        detector: for grounded-sam2: name or folder of a Grounding DINO model.
+        segmenter: for grounded-sam2: name or folder of a SAM 2 model.
+        device: auto, cpu or cuda.
+    """
+
+    out: Path
+    tool: str = "rough"
+    video: Path | None = None
+    dataset: str = "online"
+    data: Path | None = None
+    case: tuple[str, ...] = ()
+    start: float | None = None
+    end: float | None = None
+    fps: float | None = None
+    box: tuple[str, ...] = ()
+    command: str | None = None
+    text: str = "animal"
+    detector: str = DETECTOR
+    segmenter: str = SEGMENTER
+    device: str = "auto"
+
+
+def main(arguments: list[str]) -> int:
+    options = parse_flags(Options, arguments, prog="rewild4d-bench masks", description=DESCRIPTION)
+    device = pick_device(options.device)
+    maker = make_maker(options, device)
+    reader: Any = open_dataset(options.dataset, options.data, options)[1]
+    if not hasattr(reader, "unmasked"):
+        raise UserError(f"--dataset: expected online or aptv2, got '{options.dataset}'.")
+    is_one = options.dataset == "online"
+    cases = (reader.name,) if is_one else choose_cases(reader.cases(SPLIT), options.case)
+    require_writable(options.out)
+    for case in cases:
+        source = reader.unmasked(case)
+        if options.box:
+            source = replace(source, boxes=parse_boxes(options.box, len(source.stems)))
+        folder = options.out if is_one else options.out / case
+        paths, empty = write_masks(source, maker, folder)
+        print(f"{folder}: {len(paths)} masks by '{options.tool}', {empty} of them without the animal")
+    print("look at them before you use them: rewild4d-bench check with --masks draws a contact sheet", file=sys.stderr)
+    return 0
+
+
+def make_maker(options: Options, device: torch.device) -> MaskMaker:
+    """The maker that `--tool` names.
+
+    Raises:
+        UserError: an unknown one, or one that lacks a command or a package.
+    """
+    if options.tool not in TOOLS:
+        raise unknown_name("tool", options.tool, TOOLS)
+    if options.tool == "program":
+        if not options.command:
+            raise UserError("--command: expected a command line with {frames} and {masks} in it, got none.")
+        return run_program(options.command)
+    if options.tool == "grounded-sam2":
+        return grounded_masks(options.text, options.detector, options.segmenter, device)
+    return rough_masks
