@@ -28,7 +28,7 @@ PRIMATES = ("chimpanzee", "gorilla", "howling monkey", "monkey", "noisy night mo
 
 
 class AptV2:
-    """An APTv2 or APT-36K folder.
+    """APTv2 and APT-36K: short real clips with keypoints.
 
     Keeps contracts.DatasetReader.
 

@@ -5,7 +5,8 @@
     badja/<sequence>.json
 
 Masks of 2016 are grey (0 and 255) and hold one foreground; those of 2017 are indexed, hold object ids and 255 for void.
-A sequence with several objects gives a case for each: "dogs-jump@2". BADJA's joints are read where they lie beside it.
+A sequence with several objects gives a case for each, "dogs-jump@2", beside the one of all together, "dogs-jump".
+BADJA's joints are read where they lie beside it.
 """
 
 import tomllib
@@ -35,7 +36,7 @@ def known_sequences() -> dict[str, dict[str, str | int | bool]]:
 
 
 class Davis:
-    """A DAVIS folder.
+    """DAVIS 2016 and 2017: real videos with true masks.
 
     Keeps contracts.DatasetReader.
 
@@ -70,14 +71,18 @@ class Davis:
         return {"masks": str(self.masks.resolve())} if self.masks else {}
 
     def cases(self, selection: Selection) -> list[str]:
-        """Every sequence with masks, "<sequence>@<id>" where it has several objects."""
+        """Every sequence with masks; where it has several objects, "<sequence>@<id>" for each of them too."""
         return list(self._table)
 
     def default_cases(self, selection: Selection) -> list[str]:
-        """The quadrupeds among the known sequences; all sequences where there is none of them."""
-        known, stems = known_sequences(), self._stems
-        chosen = [case for case in self._table if known.get(stems[case], {}).get("quadruped", stems[case] in known)]
-        return chosen or list(self._table)
+        """The quadrupeds among the known sequences (all sequences where there is none), one object at a time."""
+        known = known_sequences()
+        several = {sequence for sequence, number in self._table.values() if number is not None}
+        single = {
+            case: sequence for case, (sequence, number) in self._table.items() if number or sequence not in several
+        }
+        chosen = [case for case, name in single.items() if known.get(name, {}).get("quadruped", name in known)]
+        return chosen or list(single)
 
     def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
         """Decode one case.
@@ -127,15 +132,12 @@ class Davis:
             if not folder.is_dir() or masks is None:
                 continue
             ids = open_masks(list_images(masks)[:1]).ids  # the first frame names all objects
-            cases = [(folder.name, None)] if len(ids) < 2 else [(f"{folder.name}@{number}", number) for number in ids]
-            table |= {name: (folder.name, number) for name, number in cases}
+            table[folder.name] = (folder.name, None)
+            if len(ids) > 1:
+                table |= {f"{folder.name}@{number}": (folder.name, number) for number in ids}
         if not table:
             raise UserError(f"{self.root / 'Annotations'}: expected masks of the sequences in JPEGImages, got none.")
         return table
-
-    @property
-    def _stems(self) -> dict[str, str]:
-        return {case: sequence for case, (sequence, _) in self._table.items()}
 
     def _mask_folder(self, sequence: str) -> Path | None:
         folders = [self.root / name / str(self.resolution) / sequence for name in _ANNOTATIONS]

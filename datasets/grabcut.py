@@ -47,7 +47,7 @@ def rough_masks(source: Unmasked) -> Iterator[np.ndarray]:
             mask, areas = from_box(small, source.boxes[index], scale), []
             looks = colors(small, mask)
         elif mask is not None and before is not None:
-            mask = from_mask(small, _carried(mask, flow.calc(grey, before, None)))
+            mask = from_mask(small, _carried(mask, flow.calc(grey, before, np.zeros((*grey.shape, 2), np.float32))))
         if mask is not None:
             areas.append(int(mask.sum()))
             strange = looks is not None and cv2.compareHist(looks, colors(small, mask), cv2.HISTCMP_BHATTACHARYYA)
@@ -112,7 +112,7 @@ def _cut(image: np.ndarray, labels: np.ndarray, rounds: int) -> np.ndarray:
     window = np.ascontiguousarray(labels[part])
     cv2.setRNGSeed(0)  # its colour models start at random
     cv2.grabCut(
-        np.ascontiguousarray(image[part]), window, (0, 0, 1, 1), np.zeros((1, 65)), np.zeros((1, 65)), rounds,
+        np.ascontiguousarray(image[part]), window, (0, 0, 0, 0), np.zeros((1, 65)), np.zeros((1, 65)), rounds,
         cv2.GC_INIT_WITH_MASK,
     )  # fmt: skip
     mask = np.zeros_like(labels)

@@ -50,10 +50,10 @@ class Material:
 
 
 class Online:
-    """One video of a person's own.
+    """A person's own video, with masks.
 
     Keeps contracts.DatasetReader. The case is called like the file or the folder; where masks hold several objects,
-    each is a case: "clip@2".
+    each is a case of its own too: "clip@2".
 
     Args:
         root: a video file, a folder of frames, or a folder that holds one called frames (and one called masks).
@@ -95,12 +95,12 @@ class Online:
         return {name: str(value) for name, value in given.items() if value is not None}
 
     def cases(self, selection: Selection) -> list[str]:
-        """The video's name; one for each object where its masks hold several."""
+        """The video's name, and one for each object where its masks hold several."""
         return list(self._table)
 
     def default_cases(self, selection: Selection) -> list[str]:
-        """All of `cases`."""
-        return self.cases(selection)
+        """The whole mask, or each object on its own where there are several."""
+        return [case for case, number in self._table.items() if number is not None] or list(self._table)
 
     def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
         """Decode one case.
@@ -198,7 +198,7 @@ class Online:
         """Case -> object id (None: all that the masks hold)."""
         name = self.name
         ids = self._mask_files.ids if self._mask_files else ()
-        return {name: None} if len(ids) < 2 else {f"{name}@{number}": number for number in ids}
+        return {name: None} | {f"{name}@{number}": number for number in ids if len(ids) > 1}
 
     @cached_property
     def _mask_place(self) -> Path | None:

@@ -167,7 +167,10 @@ def test_two_animals_by_id_are_two_cases(walk: Path) -> None:
         both = moving.mask(i, left=20) // 255 + 2 * (moving.mask(i, left=60) // 255)
         moving.save(walk / "masks" / f"{i:05d}.png", both.astype(np.uint8), "P")
     reader = Online(walk)
-    assert reader.cases(SELECTION) == ["clip@1", "clip@2"]
+    assert reader.cases(SELECTION) == ["clip", "clip@1", "clip@2"]
+    assert reader.default_cases(SELECTION) == ["clip@1", "clip@2"]
+    both = next(iter(reader.video("clip").masks()))
+    assert both is not None and ((both > 0) == ((moving.mask(0, left=20) | moving.mask(0, left=60)) > 0)).all()
     frame = reader.load("clip@2", SELECTION)[0].frames[0]
     assert iou(restored(frame, moving.SIZE), moving.mask(0, left=60) > 0) > 0.93
 

@@ -267,7 +267,7 @@ def test_parts_of_a_case_are_run_side_by_side(demo: Spec, tmp_path: Path, monkey
     ("words", "sentence"),
     [
         (["run", "--table", "ablatoin"], "unknown table 'ablatoin'. Did you mean 'ablation'?"),
-        (["run", "--table", "input-view"], "unknown dataset 'davis'"),
+        (["run", "--table", "input-view"], "the data set 'davis' has no built-in data"),
         (["run", "--table", "ablation", "--preset", "quik"], "unknown preset of 'ours' 'quik'. Did you mean 'quick'?"),
         (["run", "--table", "ablation", "--gaussians", "3"], "unknown option '--gaussians'"),
         (["run", "--table", "ablation", "--jobs", "-1"], "--jobs: expected a number of at least 0, got -1"),

@@ -78,12 +78,12 @@ def test_reading_twice_gives_the_same_digests(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "mode", "cases"),
     [((0, 255), "L", ["camel"]), ((0, 1), "P", ["camel"]), ((0, 1), "L", ["camel"]), ((0, 255), "P", ["camel"]),
-     ((2, 1), "P", ["camel@1", "camel@2"])],
+     ((2, 1), "P", ["camel", "camel@1", "camel@2"])],
 )  # fmt: skip
 def test_what_a_mask_means(tmp_path: Path, values: tuple[int, int], mode: str, cases: list[str]) -> None:
     reader = Davis(moving.davis(tmp_path, values=values, mode=mode))
     assert reader.cases(SELECTION) == cases
-    found = next(iter(reader.video(cases[0]).masks()))
+    found = next(iter(reader.video(cases[len(cases) // 2]).masks()))
     assert found is not None and (found == moving.mask(0)).all()
 
 
