@@ -62,15 +62,65 @@ class Camera:
 
 
 @dataclass(frozen=True)
+class Crop:
+    """The square of an original frame that an image shows; it may reach over the border, where the image is empty.
+
+    Attributes:
+        left: of the square, in the original's pixels.
+        top: of the square, in the original's pixels.
+        side: of the square, in the original's pixels.
+        width: of the original in pixels.
+        height: of the original in pixels.
+    """
+
+    left: float
+    top: float
+    side: float
+    width: int
+    height: int
+
+    def to_original(self, points: Tensor, size: int) -> Tensor:
+        """Pixels of the image (``size`` wide and high) to pixels of the original frame, [..., 2] -> [..., 2]."""
+        return points * (self.side / size) + points.new_tensor((self.left, self.top))
+
+    def from_original(self, points: Tensor, size: int) -> Tensor:
+        """Pixels of the original frame to pixels of the image (``size`` wide and high), [..., 2] -> [..., 2]."""
+        return (points - points.new_tensor((self.left, self.top))) * (size / self.side)
+
+    def original_camera(self, camera: Camera) -> Camera:
+        """The camera of the whole original frame, from the camera of the image."""
+        scale = self.side / camera.width
+        placed = torch.tensor(((scale, 0, self.left), (0, scale, self.top), (0, 0, 1)), dtype=camera.intrinsics.dtype)
+        return replace(camera, intrinsics=placed @ camera.intrinsics, width=self.width, height=self.height)
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """Named points of the animal in one image.
+
+    Attributes:
+        names: of the points.
+        points: (column, row) in the image's pixels, pixel centres at +0.5; meaningless where not visible, [n, 2].
+        visible: which of them were annotated, bool, [n].
+    """
+
+    names: tuple[str, ...]
+    points: Tensor
+    visible: Tensor
+
+
+@dataclass(frozen=True)
 class Frame:
     """One image of the animal.
 
     Attributes:
         time: seconds from the start of the clip.
-        camera: world camera, or None where nobody knows it.
+        camera: world camera, or None where nobody knows it: `Reconstruction.camera` tells it then.
         rgb: colour already multiplied by the mask (black outside the animal), float32 in [0, 1], [3, h, w].
         mask: soft matte, float32 in [0, 1], [1, h, w].
         view: index of the camera in the dataset, or -1.
+        crop: which square of the original frame this is; None: all of it.
+        keypoints: annotated points in this image, where the data set has some.
     """
 
     time: float
@@ -78,6 +128,8 @@ class Frame:
     rgb: Tensor
     mask: Tensor
     view: int = -1
+    crop: Crop | None = None
+    keypoints: Keypoints | None = None
 
     def over(self, background: float | Tensor) -> Tensor:
         """The frame composited on a background colour (a number or a tensor that broadcasts), [3, h, w]."""
@@ -95,6 +147,7 @@ class Clip:
         fps: frames per second.
         licence: of the data.
         digest: SHA-256 over the pixels, mattes and cameras that the method gets.
+        notes: what was left out or assumed when the clip was read, a sentence each.
     """
 
     name: str
@@ -103,6 +156,7 @@ class Clip:
     fps: float
     licence: str
     digest: str
+    notes: tuple[str, ...] = ()
 
     @property
     def times(self) -> tuple[float, ...]:
