@@ -44,7 +44,8 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         gait_weight: of feet that bear weight and move forwards, when guesses are compared: outlines alone hardly tell
             the head of a bushy-tailed animal.
         travel_weight: of heads that point against the way the animal goes, when guesses are compared.
-        keypoint_weight: of the squared distance of joints to keypoints, over the window's side and robust.
+        carriage_weight: of heads folded into the body and tails carried like necks, under unknown cameras.
+        keypoint_weight: of the robust distance of joints to keypoints.
     """
 
     stages: tuple[Stage, ...]
@@ -58,7 +59,8 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     view_weight: float = 0.01
     gait_weight: float = 0.015
     travel_weight: float = 0.05
-    keypoint_weight: float = 1.0
+    carriage_weight: float = 1.0
+    keypoint_weight: float = 0.1
 
 
 STANDARD = PriorConfig(

@@ -5,6 +5,7 @@ groups of the method). No world is known, so the object frame is the world: `obj
 motion of camera and animal lies in the per-frame cameras.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,14 +15,14 @@ from rewild4d.contracts import Log
 from rewild4d.errors import UserError
 from rewild4d.priors.config import PriorConfig, Stage
 from rewild4d.priors.io import seal
-from rewild4d.priors.keypoints import Keypoints
 from rewild4d.priors.kinematics import pose
+from rewild4d.priors.landmarks import Marks
 from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.race import Race
 from rewild4d.priors.search import facings
 from rewild4d.priors.silhouettes import overlap
 from rewild4d.priors.template import MIRROR, PARENTS, diagonal, quadruped
-from rewild4d.priors.views import Views, fauna_camera, windows
+from rewild4d.priors.views import FIELD_OF_VIEW, Views, fauna_camera, windows
 from rewild4d.transforms import rigid, skin_points
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Prior
 
@@ -31,33 +32,36 @@ class Evidence:
     """What a person or the images say besides the masks; all optional.
 
     Attributes:
-        keypoints: joints in pixels of the clip's frames.
+        marks: keypoints in pixels of the clip's frames.
         travel: motion of the animal against the background between neighbouring frames, pixels, [T - 1, 2].
     """
 
-    keypoints: Keypoints | None = None
+    marks: Marks | None = None
     travel: Tensor | None = None
 
     def mirrored(self, width: int) -> "Evidence":
         """The same for the horizontally flipped frames."""
         travel = None if self.travel is None else self.travel * self.travel.new_tensor((-1.0, 1.0))
-        return Evidence(None if self.keypoints is None else self.keypoints.mirrored(width), travel)
+        return Evidence(None if self.marks is None else self.marks.mirrored(width), travel)
 
 
 NOTHING = Evidence()
+NEAR = 0.04
+"""Distance of a joint to its keypoint up to which the cost is quadratic and from which it is linear, window sides."""
 
 
 class StandingCamera(Race):
     """Guesses before Fauna's camera.
 
     Attributes:
-        said: keypoints and travel.
+        said: marks and travel.
         boxes: windows of the frames, [T, 3].
         given: proportions are known and stay as they are.
     """
 
     said: Evidence
     boxes: Tensor
+    guesses: Views
     given: bool = False
 
     def free(self, stage: Stage) -> list[str]:
@@ -67,9 +71,18 @@ class StandingCamera(Race):
     def evidence(self) -> Tensor | float:
         # towards or away from the camera a turned animal looks like a shorter one, as under known cameras
         cost = self.config.view_weight * self.guesses.roots()[..., 2, 2].mean(1).square()
-        if self.said.keypoints is not None:
-            cost = cost + self.config.keypoint_weight * self.said.keypoints.distance(self.guesses, self.boxes)
+        cost = cost + self.config.carriage_weight * self.guesses.carriage()
+        if self.said.marks is not None and len(self.said.marks):
+            cost = cost + self.config.keypoint_weight * self._off_marks(self.said.marks)
         return cost
+
+    def _off_marks(self, found: Marks) -> Tensor:
+        """Robust mean distance of joints to their keypoints, [B]."""
+        boxes = self.boxes[found.moments]
+        side = 2 * math.tan(FIELD_OF_VIEW / 2)
+        wanted = (found.pixels - boxes[:, :2]) / boxes[:, 2:]
+        distance = (self.guesses.projected(found) / side - wanted).square().sum(-1)
+        return ((1 + distance / NEAR**2).sqrt() - 1).mean(-1)
 
     def verdict(self, stage: Stage) -> Tensor | float:
         return super().verdict(stage) + self.config.travel_weight * self._against_travel()

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from rewild4d.priors.hypotheses import ANGLE_SPREADS, Hypotheses, cosine_series
 from rewild4d.priors.kinematics import pose
+from rewild4d.priors.landmarks import Marks
 from rewild4d.priors.proportions import PROPORTIONS, SECTIONS, Proportions
 from rewild4d.priors.template import PARENTS, quadruped
 from rewild4d.transforms import rigid
@@ -31,6 +32,8 @@ AZIMUTH_SPREAD, ELEVATION_SPREAD, ELEVATION = 0.35, math.radians(8.0), math.radi
 """Radians: natural spread of the turn over time, of the camera's elevation, and its mean."""
 SHIFT_SPREADS = (0.10, 0.10, 0.6)
 """Natural spread of the animal's position in its window in x, y and depth, working units."""
+HEAD_FORWARD, NOSE_BEFORE_WITHERS = 0.5, 0.2
+"""How far noses reach forwards: from the poll, in head lengths, and from the withers, in body lengths."""
 STEADY = 24
 """Frames of a clip whose motion is penalised as `Hypotheses` does; longer ones by the same periods in frames."""
 
@@ -97,6 +100,18 @@ class Views(Hypotheses):
         # facing is a turn about y, which commutes with azimuth and must come before the elevation
         return rigid(turn @ self.facing[:, None], self.path + self.shift * torch.tensor(SHIFT_SPREADS))
 
+    def projected(self, found: Marks) -> Tensor:
+        """Where each guess puts the marks: x and y over depth in the camera's axes, [B, m, 2]."""
+        bones = quadruped(Proportions(self.shape, self.relief), unit=False).bones
+        moments, rows = found.moments.unique(return_inverse=True)
+        transforms = pose(self.joint_angles()[:, moments], bones[:, None, :, 0], PARENTS)[:, rows, found.bones]
+        start, end = bones[:, found.bones].unbind(2)
+        rest = start + found.along[:, None] * (end - start)
+        posed = (transforms[..., :3, :3] @ rest[..., None])[..., 0] + transforms[..., :3, 3]
+        roots = self.roots()[:, found.moments]
+        seen = (roots[..., :3, :3] @ (self.scales()[:, None, None] * posed)[..., None])[..., 0] + roots[..., :3, 3]
+        return torch.stack((seen[..., 0], -seen[..., 1]), -1) / (DISTANCE - seen[..., 2:]).clamp_min(1.0)
+
     def penalties(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """How unusual proportions, relief, joint angles and root motion are, each [B]; see `Hypotheses.penalties`."""
         per_frame = min(1.0, STEADY / len(self.path))
@@ -108,15 +123,34 @@ class Views(Hypotheses):
         root = root + 0.1 * self.shift.square().mean((1, 2))
         if len(self.path) > 2:
             root = root + self.shift.diff(n=2, dim=1).square().mean((1, 2))
-        return self.shape.square().mean(1), self.relief.square().mean((1, 2)), swing.sum(1).mean((1, 2)), root + self._tail()
+        return (
+            self.shape.square().mean(1),
+            self.relief.square().mean((1, 2)),
+            swing.sum(1).mean((1, 2)),
+            root,
+        )
 
-    def _tail(self) -> Tensor:
-        """How far tails are carried above the hips, over the body's length: necks are, and outlines confuse them, [B]."""
+    def carriage(self) -> Tensor:
+        """How unlike an animal head and tail are carried, squared shares of the body's length, [B].
+
+        A nose points forwards and lies before the withers, a tail hangs behind the hips. Outlines alone would fold the
+        head into the body and take a raised tail for a neck.
+        """
         bones = quadruped(Proportions(self.shape, self.relief), unit=False).bones
-        tip = pose(self.joint_angles(), bones[:, None, :, 0], PARENTS)[:, :, 4]
-        height = (tip[..., 1, :3] * bones[:, None, 4, 1]).sum(-1) + tip[..., 1, 3] - bones[:, None, 6, 0, 1]
-        length = bones[:, 3, 1, 2] - bones[:, 6, 0, 2]
-        return (height.clamp_min(0).mean(1) / length).square()
+        chain = pose(self.joint_angles()[:, :, :8], bones[:, None, :8, 0], PARENTS[:8])
+        ends = torch.einsum("btjac,bjkc->btjka", chain[..., :3, :3], bones[:, :8]) + chain[..., None, :3, 3]
+        nose, poll, withers, tip, hips = (
+            ends[:, :, bone, end] for bone, end in ((0, 1), (0, 0), (3, 1), (4, 1), (6, 0))
+        )
+        length = (bones[:, 3, 1, 2] - bones[:, 6, 0, 2])[:, None]
+        head = (bones[:, 0, 1] - bones[:, 0, 0]).norm(dim=-1)[:, None]
+        faults = (
+            HEAD_FORWARD * head - (nose - poll)[..., 2],
+            NOSE_BEFORE_WITHERS * length - (nose - withers)[..., 2],
+            (tip - hips)[..., 1],
+            (tip - hips)[..., 2],
+        )
+        return sum((fault.clamp_min(0) / length).square().mean(1) for fault in faults)
 
 
 def _about_x(angle: Tensor) -> Tensor:
