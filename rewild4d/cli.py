@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable
 
 from rewild4d import __version__
-from rewild4d.commands import bench, check, evaluate, make, overview, run, score, table, weights
+from rewild4d.commands import bench, check, evaluate, make, overview, prior, run, score, table, weights
 from rewild4d.errors import UserError, unknown_name
 
 COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {
@@ -16,6 +16,7 @@ COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {
     "list": (overview.main, "methods, data sets, protocols and presets"),
     "check": (check.main, "verify a data set's folder, or that a method keeps the contract"),
     "make": (make.main, "render a rigged, animated glTF as a data set with exact truth"),
+    "prior": (prior.main, "fit the template to masked frames, or import 3D-Fauna's files"),
     "weights": (weights.main, "list, fetch, import and verify the networks behind LPIPS, KID and FVD"),
     "bench": (bench.main, "time the rasterizer or a training step on this machine"),
 }

@@ -1,7 +1,7 @@
 """Keypoint files that people have: BADJA, COCO-like (APTv2, APT-36K, AP-10K), DeepLabCut's and SLEAP's CSV.
 
-Every reader gives, for each frame of a folder, the named points in its pixels or None. What a name means on the template
-is said by a mapping file (`landmarks.load_mapping`), never here.
+Every reader gives, for each frame of a folder, the named points in its pixels or None. What a name means on the
+template is said by a mapping file (`landmarks.load_mapping`), never here.
 """
 
 import csv
@@ -48,7 +48,7 @@ def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int]) -> l
         raise UserError(f"{path}: expected a keypoint file, but: {error.strerror}.") from error
     except (KeyError, TypeError, IndexError, ValueError, AttributeError, StopIteration) as error:
         raise UserError(
-            f"{path}: expected keypoints as BADJA, COCO, DeepLabCut or SLEAP write them, got something else ({error!r})."
+            f"{path}: expected keypoints as BADJA, COCO, DeepLabCut or SLEAP write them, got others ({error!r})."
         ) from error
     result = [_checked(found[stem], size) if stem in found else None for stem in stems]
     if not any(result):

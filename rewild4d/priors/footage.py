@@ -103,8 +103,7 @@ class StandingCamera(Race):
         best = {}
         for row, quadrant in zip(order, quadrants, strict=True):
             best.setdefault(quadrant, row)
-        opposite = super().rivals(order)
-        return opposite + [row for row in best.values() if row not in opposite]
+        return list(best.values())
 
 
 def fit_footage(
@@ -220,6 +219,55 @@ def _orthonormal(matrix: Tensor) -> Tensor:
     """The nearest rotation: single precision leaves errors of 1e-7."""
     u, _, v = torch.linalg.svd(matrix)
     return u @ v
+
+
+def resized(prior: Prior, width: int, height: int) -> Prior:
+    """The same prior for frames of another size."""
+    cameras, flipped = (
+        tuple(camera.resized(width, height) for camera in each) for each in (prior.cameras, prior.cameras_flip)
+    )
+    return seal(replace(prior, cameras=cameras, cameras_flip=flipped))
+
+
+def in_crops(prior: Prior, clip: Clip) -> Prior:
+    """A prior of whole frames for a clip of square crops of them; rows are those of the clip's frames.
+
+    Raises:
+        UserError: a frame is no crop, or the prior is for frames of another size.
+    """
+    rows, cameras, flipped = [], [], []
+    for frame in clip.frames:
+        row = int((prior.times - frame.time).abs().argmin())
+        plain, crop, size = prior.cameras[row], frame.crop, frame.mask.shape[2]
+        if crop is None or (plain.width, plain.height) != (crop.width, crop.height):
+            held = "a whole frame" if crop is None else f"a crop of {crop.width}x{crop.height} pixels"
+            raise UserError(
+                f"{clip.name}: expected crops of {plain.width}x{plain.height} frames as prior '{prior.name}' knows, "
+                f"got {held}."
+            )
+        rows.append(row)
+        cameras.append(_cropped(plain, crop.left, crop.top, crop.side, size))
+        # in the flipped frame the crop starts as far from the left as it ends from the right
+        flipped.append(_cropped(prior.cameras_flip[row], crop.width - crop.left - crop.side, crop.top, crop.side, size))
+    return seal(
+        replace(
+            prior,
+            times=prior.times[rows],
+            object_to_world=prior.object_to_world[rows],
+            cameras=tuple(cameras),
+            transforms=prior.transforms[rows],
+            cameras_flip=tuple(flipped),
+            transforms_flip=prior.transforms_flip[rows],
+        )  # fmt: skip
+    )
+
+
+def _cropped(camera: Camera, left: float, top: float, side: float, size: int) -> Camera:
+    moved = camera.intrinsics.clone()
+    moved[0, 2] -= left
+    moved[1, 2] -= top
+    moved[:2] *= size / side
+    return replace(camera, intrinsics=moved, width=size, height=size)
 
 
 def with_cameras(clip: Clip, prior: Prior) -> Clip:

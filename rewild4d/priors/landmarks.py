@@ -4,6 +4,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -56,6 +57,10 @@ class Marks:
         flipped = torch.stack((width - self.pixels[:, 0], self.pixels[:, 1]), dim=1)
         return Marks(self.moments, torch.tensor(MIRROR)[self.bones], self.along, flipped)
 
+    def chosen(self, rows: Tensor) -> "Marks":
+        """Some of the marks, by index or bool, [m]."""
+        return Marks(self.moments[rows], self.bones[rows], self.along[rows], self.pixels[rows])
+
     def __len__(self) -> int:
         return len(self.moments)
 
@@ -74,8 +79,6 @@ def load_mapping(name: str) -> dict[str, str]:
     """
     file = resources.files("rewild4d.priors") / "mappings" / f"{name}.toml"
     if not file.is_file():
-        from pathlib import Path
-
         file = Path(name)
         if file.suffix != ".toml" or not file.is_file():
             raise unknown_name("keypoint mapping", name, [*mapping_names(), "<your own>.toml"])

@@ -32,8 +32,9 @@ AZIMUTH_SPREAD, ELEVATION_SPREAD, ELEVATION = 0.35, math.radians(8.0), math.radi
 """Radians: natural spread of the turn over time, of the camera's elevation, and its mean."""
 SHIFT_SPREADS = (0.10, 0.10, 0.6)
 """Natural spread of the animal's position in its window in x, y and depth, working units."""
-HEAD_FORWARD, NOSE_BEFORE_WITHERS = 0.5, 0.2
-"""How far noses reach forwards: from the poll, in head lengths, and from the withers, in body lengths."""
+HEAD_FORWARD, NOSE_FORWARD, POLL_FORWARD = 0.4, 0.35, 0.1
+"""How far heads reach forwards at least: the nose from the poll, in head lengths; nose and poll from the withers, in
+body lengths."""
 STEADY = 24
 """Frames of a clip whose motion is penalised as `Hypotheses` does; longer ones by the same periods in frames."""
 
@@ -119,7 +120,7 @@ class Views(Hypotheses):
         swing = self.angles.square() * (ANGLE_SPREADS > 0) * (0.3 + (pace / 4).square())[:, None, None]
         haste = (per_frame * torch.arange(self.turn.shape[1])).square()
         azimuth, elevation = self.turn.square().unbind(-1)
-        root = 0.01 * (azimuth * haste).sum(1) + 0.5 * elevation[:, 0] + (elevation * (1 + haste))[:, 1:].sum(1)
+        root = 0.01 * (azimuth * haste).sum(1) + 0.1 * elevation[:, 0] + (elevation * (1 + haste))[:, 1:].sum(1)
         root = root + 0.1 * self.shift.square().mean((1, 2))
         if len(self.path) > 2:
             root = root + self.shift.diff(n=2, dim=1).square().mean((1, 2))
@@ -133,8 +134,8 @@ class Views(Hypotheses):
     def carriage(self) -> Tensor:
         """How unlike an animal head and tail are carried, squared shares of the body's length, [B].
 
-        A nose points forwards and lies before the withers, a tail hangs behind the hips. Outlines alone would fold the
-        head into the body and take a raised tail for a neck.
+        A head points forwards and reaches beyond the withers, a tail hangs behind the hips. Outlines alone would fold
+        the head into the body and take a raised tail for a neck.
         """
         bones = quadruped(Proportions(self.shape, self.relief), unit=False).bones
         chain = pose(self.joint_angles()[:, :, :8], bones[:, None, :8, 0], PARENTS[:8])
@@ -146,7 +147,8 @@ class Views(Hypotheses):
         head = (bones[:, 0, 1] - bones[:, 0, 0]).norm(dim=-1)[:, None]
         faults = (
             HEAD_FORWARD * head - (nose - poll)[..., 2],
-            NOSE_BEFORE_WITHERS * length - (nose - withers)[..., 2],
+            NOSE_FORWARD * length - (nose - withers)[..., 2],
+            POLL_FORWARD * length - (poll - withers)[..., 2],
             (tip - hips)[..., 1],
             (tip - hips)[..., 2],
         )
