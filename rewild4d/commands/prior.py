@@ -23,7 +23,7 @@ from rewild4d.types import Prior
 
 USAGE = """usage: rewild4d-bench prior fit --frames DIR --masks DIR --out prior.npz [--keypoints FILE --mapping NAME]
        rewild4d-bench prior import --files DIR --out prior.npz"""
-DESCRIPTION = """Fit the quadruped template to masked frames whose cameras nobody knows, and write the prior and an overlay
+DESCRIPTION = """Fit the quadruped template to masked frames whose cameras nobody knows; write the prior and an overlay
 (<out>.png and <out>.mp4): mask green, template magenta, agreement grey, left legs orange, right legs blue, head red."""
 IMPORT = """Read what 3D-Fauna's test run wrote (<step>_<frame>_mesh.obj, _pose.txt, _arti_params.txt) as a prior."""
 POOR = 0.6

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import imageio.v2 as imageio
@@ -70,9 +71,10 @@ def save_overlay(clip: Clip, prior: Prior, beside: Path, side: int = 320) -> lis
     rows = [np.concatenate(shown[i : i + 4], axis=1) for i in range(0, len(shown), 4)]
     picture, video = beside.with_suffix(".png"), beside.with_suffix(".mp4")
     with atomic(picture) as temporary:
-        imageio.imwrite(temporary, np.concatenate(rows))
+        imageio.imwrite(temporary, np.concatenate(rows), format="png")
     with atomic(video) as temporary:
-        imageio.mimwrite(temporary, tiles, fps=clip.fps, macro_block_size=2, quality=8)
+        settings: Any = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+        imageio.mimwrite(temporary, tiles, fps=clip.fps, **settings)
     return [picture, video]
 
 
