@@ -37,7 +37,8 @@ def one_thread() -> Iterator[None]:
 
 def shortened(steps: tuple[int, ...]) -> PriorConfig:
     stages = tuple(
-        msgspec.structs.replace(stage, steps=count, frames=6) for stage, count in zip(FOOTAGE.stages, steps, strict=True)
+        msgspec.structs.replace(stage, steps=count, frames=6)
+        for stage, count in zip(FOOTAGE.stages, steps, strict=True)
     )
     return msgspec.structs.replace(FOOTAGE, stages=stages, yaw_starts=8)
 
@@ -77,7 +78,7 @@ def walk() -> tuple[Clip, list[Camera], Marks]:
 def fitted(walk: tuple[Clip, list[Camera], Marks]) -> Prior:
     # the animal heads to the left of the image
     travel = torch.tensor((-6.0, 0.0)).expand(5, 2)
-    return fit_footage(walk[0], config=shortened((20, 30, 30, 20)), seed=0, log=silent, said=Evidence(None, travel))
+    return fit_footage(walk[0], config=shortened((15, 20, 15, 6)), seed=0, log=silent, said=Evidence(None, travel))
 
 
 def silent(*_: object) -> None:
@@ -130,7 +131,9 @@ def test_a_prior_of_whole_frames_serves_crops_and_other_sizes(walk, fitted) -> N
     flipped, part = fitted.cameras_flip[1].project(point)[0], cropped.cameras_flip[1].project(point)[0]
     # in the flipped image the crop is at 120 - 10 - 96 and shows the flipped crop
     assert torch.allclose(part, (flipped - torch.tensor((14.0, -4.0))) * (64 / 96))
-    assert torch.allclose(resized(fitted, 240, 176).cameras[0].project(point)[0], 2 * fitted.cameras[0].project(point)[0])
+    assert torch.allclose(
+        resized(fitted, 240, 176).cameras[0].project(point)[0], 2 * fitted.cameras[0].project(point)[0]
+    )
     with pytest.raises(UserError, match="expected crops of 120x88 frames .* got a whole frame"):
         in_crops(fitted, clip)
 

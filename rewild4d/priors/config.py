@@ -86,7 +86,7 @@ FOOTAGE = PriorConfig(
         Stage(size=64, steps=150, blur=(0.04, 0.015), keep=2),
         Stage(size=80, steps=250, blur=(0.02, 0.006), keep=1, rasterized=True, relief=True),
     ),
-    shape_weight=0.06,
-    view_weight=0.03,
+    shape_weight=0.035,
+    view_weight=0.06,
 )
 PRESETS = {"quick": QUICK, "standard": STANDARD}
