@@ -14,6 +14,7 @@ from rewild4d.commands import (
     make,
     masks,
     overview,
+    prior,
     run,
     score,
     table,
@@ -32,6 +33,7 @@ COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {
     "list": (overview.main, "methods, data sets, protocols, presets and tables"),
     "check": (check.main, "verify a data set's folder, or that a method keeps the contract"),
     "make": (make.main, "render a rigged, animated glTF as a data set with exact truth"),
+    "prior": (prior.main, "fit the template to masked frames, or import 3D-Fauna's files"),
     "weights": (weights.main, "list, fetch, import and verify the networks behind LPIPS, KID and FVD"),
     "bench": (bench.main, "time the rasterizer or a training step on this machine"),
 }

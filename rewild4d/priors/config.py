@@ -43,6 +43,9 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             turned animal looks like a shorter one, and its outline hardly changes near the broadside.
         gait_weight: of feet that bear weight and move forwards, when guesses are compared: outlines alone hardly tell
             the head of a bushy-tailed animal.
+        travel_weight: of heads that point against the way the animal goes, when guesses are compared.
+        carriage_weight: of heads folded into the body and tails carried like necks, under unknown cameras.
+        keypoint_weight: of the robust distance of joints to keypoints.
     """
 
     stages: tuple[Stage, ...]
@@ -55,6 +58,9 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     root_weight: float = 0.2
     view_weight: float = 0.01
     gait_weight: float = 0.015
+    travel_weight: float = 0.05
+    carriage_weight: float = 1.0
+    keypoint_weight: float = 0.1
 
 
 STANDARD = PriorConfig(
@@ -72,5 +78,15 @@ QUICK = PriorConfig(
         Stage(size=48, steps=60, blur=(0.04, 0.02), keep=1),
         Stage(size=64, steps=80, blur=(0.02, 0.008), keep=1, rasterized=True, relief=True),
     )
+)
+FOOTAGE = PriorConfig(
+    stages=(
+        Stage(size=32, steps=60, blur=(0.08, 0.04), keep=8, joints=False, frames=16),
+        Stage(size=48, steps=100, blur=(0.05, 0.03), keep=4),
+        Stage(size=64, steps=150, blur=(0.04, 0.015), keep=2),
+        Stage(size=80, steps=250, blur=(0.02, 0.006), keep=1, rasterized=True, relief=True),
+    ),
+    shape_weight=0.035,
+    view_weight=0.06,
 )
 PRESETS = {"quick": QUICK, "standard": STANDARD}

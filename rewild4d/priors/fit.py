@@ -12,21 +12,21 @@ from torch import Tensor
 
 from rewild4d.contracts import Log
 from rewild4d.errors import UserError
-from rewild4d.priors.config import PriorConfig, Stage
+from rewild4d.priors.config import PriorConfig
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.io import seal
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.proportions import Proportions
+from rewild4d.priors.race import Race
 from rewild4d.priors.search import (
     facings,
     mask_rays,
-    match_areas,
     single_view,
     trajectory,
     up_directions,
     working_frame,
 )
-from rewild4d.priors.silhouettes import Targets, crop_targets, mismatch, overlap
+from rewild4d.priors.silhouettes import overlap
 from rewild4d.priors.template import MIRROR, PARENTS, diagonal, quadruped
 from rewild4d.transforms import (
     camera_in_object,
@@ -36,8 +36,6 @@ from rewild4d.transforms import (
     skin_points,
 )
 from rewild4d.types import OBJECT_DIAGONAL, Clip, Frame, Prior
-
-STILL_PARAMETERS = ("scale", "turn", "shift", "shape")
 
 
 @dataclass(frozen=True)
@@ -88,12 +86,14 @@ def fit_animal(
     ups = up_directions(rays, config.elevations)
     total = len(ups) * config.stages[0].steps + sum(stage.steps for stage in config.stages[1:])
     generator = torch.Generator().manual_seed(seed)
-    best: list[_Race] = []
+    best: list[KnownCameras] = []
     for index, up in enumerate(ups):
         working = working_frame(rays, path, up)
-        race = _Race(frames, moments, name, working, single_view(rays, working), config, generator, log, total)
+        race = KnownCameras(frames, moments, name, working, config, generator, log, total)
+        race.gaze = single_view(rays, working)
         race.done = index * config.stages[0].steps
-        race.begin(path)
+        local = torch.linalg.solve(working[:3, :3], (path - working[:3, 3]).T).T
+        race.begin(Hypotheses.start(facings(config.yaw_starts), local.float()))
         race.run(config.stages[0])
         best.append(race)
     starts = torch.cat([race.start_costs for race in best]).tolist()
@@ -105,98 +105,19 @@ def fit_animal(
     return leader.winner()
 
 
-def _spaced(targets: Targets, count: int) -> Targets:
-    """At most ``count`` evenly spaced observations."""
-    count = min(len(targets.masks), count)
-    return targets.select(torch.linspace(0, len(targets.masks) - 1, count).round().long())
+class KnownCameras(Race):
+    """Hypotheses under one choice of the up direction.
 
+    Attributes:
+        gaze: the one direction in which all cameras look, in the working frame, [3]; None where there are several.
+    """
 
-class _Race:
-    """Hypotheses under one choice of the up direction."""
+    gaze: Tensor | None = None
 
-    def __init__(
-        self,
-        frames: Sequence[Frame],
-        moments: Sequence[int],
-        name: str,
-        working: Tensor,
-        gaze: Tensor | None,
-        config: PriorConfig,
-        generator: torch.Generator,
-        log: Log,
-        total: int,
-    ) -> None:
-        self.frames, self.moments, self.name = frames, moments, name
-        self.working, self.gaze, self.config, self.generator = working, gaze, config, generator
-        self.log, self.total, self.done = log, total, 0
-        self.costs = self.start_costs = torch.zeros(0)
-        self.figures: dict[str, float] = {}
-
-    def begin(self, path: Tensor) -> None:
-        """Line up all facings on the path, at the size that covers the masks' area."""
-        local = torch.linalg.solve(self.working[:3, :3], (path - self.working[:3, 3]).T).T
-        self.guesses = Hypotheses.start(facings(self.config.yaw_starts), local.float())
-        match_areas(self.guesses, self._targets(self.config.stages[0].size), self.config.stages[0])
-
-    def _targets(self, size: int) -> Targets:
-        return crop_targets(self.frames, self.moments, self.working, size, self.name)
-
-    def _draw(self, targets: Targets, count: int) -> Targets:
-        """All observations, or a fresh sample of as many as a step may look at."""
-        if len(targets.masks) <= count:
-            return targets
-        rows = torch.randperm(len(targets.masks), generator=self.generator)[:count]
-        return targets.select(rows.sort().values)
-
-    def _cost(self, targets: Targets, sigma: float, stage: Stage) -> Tensor:
-        shape, relief, swing, root = self.guesses.penalties()
-        config = self.config
-        penalty = config.shape_weight * shape + config.relief_weight * relief
-        penalty = penalty + config.angle_weight * swing + config.root_weight * root
-        if self.gaze is not None:
-            penalty = penalty + config.view_weight * (self.guesses.heading() @ self.gaze).square()
-        return mismatch(self.guesses.silhouettes(targets, stage), targets, sigma) + penalty
-
-    def run(self, stage: Stage) -> None:
-        """One round of descent, then the cut."""
-        targets = self._targets(stage.size)
-        names = [*STILL_PARAMETERS, *("angles",) * stage.joints, *("relief",) * stage.relief]
-        leaves = [getattr(self.guesses, name).detach().requires_grad_() for name in names]
-        for name, leaf in zip(names, leaves, strict=True):
-            setattr(self.guesses, name, leaf)
-        optimizer = torch.optim.Adam(leaves, lr=self.config.learning_rate, betas=(0.9, 0.98))
-        for step in range(stage.steps):
-            share = step / max(stage.steps - 1, 1)
-            optimizer.param_groups[0]["lr"] = self.config.learning_rate * (1 - 0.85 * share)
-            sigma = stage.size * (stage.blur[0] + share * (stage.blur[1] - stage.blur[0]))
-            cost = self._cost(self._draw(targets, stage.frames), sigma, stage)
-            if not torch.isfinite(cost).all():
-                raise FloatingPointError(f"{self.name}: the template fit's cost is not finite at step {step}: {cost}")
-            optimizer.zero_grad()
-            torch.autograd.backward(cost.sum(), inputs=leaves)
-            optimizer.step()
-            self.done += 1
-            self.log(self.done, self.total, {"prior": float(cost.detach().min())})
-        with torch.no_grad():
-            self.costs = self._cost(_spaced(targets, 2 * stage.frames), stage.size * stage.blur[1], stage)
-            if stage.joints:
-                self.costs = self.costs + self.config.gait_weight * self.guesses.backward_gait()
-        if not len(self.start_costs):
-            self.start_costs = self.costs
-        self._cut(stage.keep)
-
-    def _cut(self, keep: int) -> None:
-        """Keep the best, and the best that faces away from it while there is room."""
-        order = self.costs.argsort()
-        heads = self.guesses.heading().detach()
-        away = [int(row) for row in order if heads[row] @ heads[order[0]] < 0]
-        if away:
-            self.figures["facing_margin"] = float(self.costs[away[0]] - self.costs[order[0]])
-        kept = [int(row) for row in order[:keep]]
-        if keep > 1 and away and away[0] not in kept:
-            kept[-1] = away[0]
-        rows = torch.tensor(kept)
-        self.guesses, self.costs = self.guesses.select(rows), self.costs[rows]
+    def evidence(self) -> Tensor | float:
+        if self.gaze is None:
+            return 0.0
+        return self.config.view_weight * (self.guesses.heading() @ self.gaze).square()
 
     def winner(self) -> Animal:
         """The best guess in the world, with the rest mesh's diagonal scaled to the object frame's."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from scipy.spatial import cKDTree
@@ -76,6 +76,19 @@ def pose_at(prior: Prior, time: float) -> tuple[Tensor, Tensor]:
         blend_similarities(prior.object_to_world[before], prior.object_to_world[after], part),
         blend_similarities(prior.transforms[before].double(), prior.transforms[after].double(), part).float(),
     )
+
+
+def camera_at(prior: Prior, time: float) -> Camera:
+    """The prior's camera at any time in the object frame: exact at its frames, between them on the straight way."""
+    times = prior.times
+    after = min(int(torch.searchsorted(times, torch.tensor(time, dtype=times.dtype) - 1e-9)), len(times) - 1)
+    before = max(after - 1, 0)
+    span = float(times[after] - times[before])
+    part = min(max((time - float(times[before])) / span, 0.0), 1.0) if span > 0 else 0.0
+    first, second = prior.cameras[before], prior.cameras[after]
+    moved = blend_similarities(first.world_to_camera, second.world_to_camera, part)
+    intrinsics = (1 - part) * first.intrinsics + part * second.intrinsics
+    return replace(second, world_to_camera=moved, intrinsics=intrinsics)
 
 
 def blend_similarities(a: Tensor, b: Tensor, part: float) -> Tensor:

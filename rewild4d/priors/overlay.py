@@ -1,12 +1,16 @@
 """Pictures for people: the fitted template over the frames it was fitted to."""
 
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import cv2
+import imageio.v2 as imageio
 import numpy as np
 import torch
 from torch import Tensor
 
+from rewild4d.files import atomic
 from rewild4d.priors.silhouettes import outline
 from rewild4d.transforms import skin_points
 from rewild4d.types import Clip, Prior
@@ -47,3 +51,43 @@ def _color(prior: Prior, bone: int) -> tuple[int, int, int]:
         return LEFT_COLOR if float(prior.bones[bone, 0, 0]) > 0 else RIGHT_COLOR
     farthest = prior.bones[:, 1, 2].argmax()
     return HEAD_COLOR if bone == int(farthest) else BODY_COLOR
+
+
+def save_overlay(clip: Clip, prior: Prior, beside: Path, side: int = 320) -> list[Path]:
+    """Write the overlay of every frame as a video and of twelve of them as one picture, cut around the animal.
+
+    Args:
+        clip: the frames.
+        prior: one row per frame.
+        beside: the pictures get this path with .png and .mp4.
+        side: of one tile in pixels.
+
+    Returns:
+        The files written: <beside>.png and <beside>.mp4.
+    """
+    tiles = [_tile(clip, prior, moment, side) for moment in range(len(clip.frames))]
+    shown = [tiles[i] for i in np.linspace(0, len(tiles) - 1, min(12, len(tiles))).round().astype(int)]
+    shown += [np.zeros_like(tiles[0])] * (-len(shown) % 4 if len(shown) > 4 else 0)
+    rows = [np.concatenate(shown[i : i + 4], axis=1) for i in range(0, len(shown), 4)]
+    picture, video = beside.with_suffix(".png"), beside.with_suffix(".mp4")
+    with atomic(picture) as temporary:
+        imageio.imwrite(temporary, np.concatenate(rows), format="png")
+    with atomic(video) as temporary:
+        settings: Any = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+        imageio.mimwrite(temporary, tiles, fps=clip.fps, **settings)
+    return [picture, video]
+
+
+def _tile(clip: Clip, prior: Prior, moment: int, side: int) -> np.ndarray:
+    """The square around the animal: its picture, dimmed, under the overlay, uint8 [side, side, 3]."""
+    frame = clip.frames[moment]
+    drawn = overlay(clip, prior, [moment])[0]
+    both = torch.maximum(drawn, 0.4 * frame.rgb)
+    rows, columns = torch.nonzero(torch.maximum(frame.mask[0], drawn.amax(0)) > 0.2, as_tuple=True)
+    if not len(rows):
+        return np.zeros((side, side, 3), np.uint8)
+    reach = 0.55 * float(max(rows.max() - rows.min(), columns.max() - columns.min()) + 1)
+    x, y = float(columns.min() + columns.max() + 1) / 2, float(rows.min() + rows.max() + 1) / 2
+    matrix = np.array(((2 * reach / side, 0, x - reach), (0, 2 * reach / side, y - reach)))
+    image = (both.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
+    return cv2.warpAffine(image, matrix, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)

@@ -1,0 +1,279 @@
+"""Fit the quadruped template to real footage: masks, and cameras that nobody knows.
+
+Body proportions are shared by the clip and its mirrored copy; cameras and poses are found for each on its own (the two
+groups of the method). No world is known, so the object frame is the world: `object_to_world` is the identity and all
+motion of camera and animal lies in the per-frame cameras.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rewild4d.contracts import Log
+from rewild4d.errors import UserError
+from rewild4d.priors.config import PriorConfig, Stage
+from rewild4d.priors.io import seal
+from rewild4d.priors.kinematics import pose
+from rewild4d.priors.landmarks import Marks
+from rewild4d.priors.proportions import Proportions
+from rewild4d.priors.race import Race
+from rewild4d.priors.search import facings
+from rewild4d.priors.silhouettes import overlap
+from rewild4d.priors.template import MIRROR, PARENTS, diagonal, quadruped
+from rewild4d.priors.views import FIELD_OF_VIEW, Views, fauna_camera, windows
+from rewild4d.transforms import rigid, skin_points
+from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Prior
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a person or the images say besides the masks; all optional.
+
+    Attributes:
+        marks: keypoints in pixels of the clip's frames.
+        travel: motion of the animal against the background between neighbouring frames, pixels, [T - 1, 2].
+    """
+
+    marks: Marks | None = None
+    travel: Tensor | None = None
+
+    def mirrored(self, width: int) -> "Evidence":
+        """The same for the horizontally flipped frames."""
+        travel = None if self.travel is None else self.travel * self.travel.new_tensor((-1.0, 1.0))
+        return Evidence(None if self.marks is None else self.marks.mirrored(width), travel)
+
+
+NOTHING = Evidence()
+NEAR = 0.04
+"""Distance of a joint to its keypoint up to which the cost is quadratic and from which it is linear, window sides."""
+
+
+class StandingCamera(Race):
+    """Guesses before Fauna's camera.
+
+    Attributes:
+        said: marks and travel.
+        boxes: windows of the frames, [T, 3].
+        given: proportions are known and stay as they are.
+    """
+
+    said: Evidence
+    boxes: Tensor
+    guesses: Views
+    given: bool = False
+
+    def free(self, stage: Stage) -> list[str]:
+        names = super().free(stage)
+        return [name for name in names if name not in ("scale", "shape", "relief")] if self.given else names
+
+    def evidence(self) -> Tensor | float:
+        # towards or away from the camera a turned animal looks like a shorter one, as under known cameras
+        cost = self.config.view_weight * self.guesses.roots()[..., 2, 2].mean(1).square()
+        cost = cost + self.config.carriage_weight * self.guesses.carriage()
+        if self.said.marks is not None and len(self.said.marks):
+            cost = cost + self.config.keypoint_weight * self._off_marks(self.said.marks)
+        return cost
+
+    def _off_marks(self, found: Marks) -> Tensor:
+        """Robust mean distance of joints to their keypoints, [B]."""
+        boxes = self.boxes[found.moments]
+        side = 2 * math.tan(FIELD_OF_VIEW / 2)
+        wanted = (found.pixels - boxes[:, :2]) / boxes[:, 2:]
+        distance = (self.guesses.projected(found) / side - wanted).square().sum(-1)
+        return ((1 + distance / NEAR**2).sqrt() - 1).mean(-1)
+
+    def verdict(self, stage: Stage) -> Tensor | float:
+        return super().verdict(stage) + self.config.travel_weight * self._against_travel()
+
+    def _against_travel(self) -> Tensor | float:
+        """Whether heads point against (1) or along (-1) the way the animal goes across the image, [B]."""
+        if self.said.travel is None:
+            return 0.0
+        across = self.said.travel[:, 0] / self.boxes[1:, 2]
+        heads = self.guesses.roots()[:, 1:, 0, 2]
+        certainty = torch.tanh(2 * across.sum().abs())
+        return -certainty * (heads * across).sum(1) / across.abs().sum().clamp_min(1e-6)
+
+    def rivals(self, order: list[int]) -> list[int]:
+        """The best of each quadrant: head to the left or right, towards or away from the camera."""
+        heads = self.guesses.heading().detach()
+        quadrants = [(bool(heads[row, 0] > 0), bool(heads[row, 2] > 0)) for row in order]
+        best = {}
+        for row, quadrant in zip(order, quadrants, strict=True):
+            best.setdefault(quadrant, row)
+        return list(best.values())
+
+
+def fit_footage(
+    clip: Clip, *, config: PriorConfig, seed: int, log: Log, said: Evidence = NOTHING, name: str = "template"
+) -> Prior:
+    """Fit the template to a clip's masks under unknown cameras.
+
+    Args:
+        clip: frames; their cameras are not looked at, and their masks are all that is.
+        config: every choice of the fit.
+        seed: of the frames drawn for each step of a long clip.
+        log: progress.
+        said: keypoints and the animal's travel, where known.
+        name: of the prior.
+
+    Returns:
+        A prior with one camera and pose per frame and for its mirror image; `quality` holds mask_iou, mask_iou_flip,
+        facing_margin, facing_margin_flip and more.
+
+    Raises:
+        UserError: no mask shows anything.
+    """
+    if not any((frame.mask > 0.5).any() for frame in clip.frames):
+        raise UserError(
+            f"{clip.name}: expected at least one mask that shows the animal, but all {len(clip.frames)} are empty."
+        )
+    total = 2 * sum(stage.steps for stage in config.stages)
+    race = _run(clip, clip.frames, said, config, seed, log, total, None)
+    flipped = tuple(replace(f, rgb=f.rgb.flip(-1), mask=f.mask.flip(-1)) for f in clip.frames)
+    mirrored = said.mirrored(clip.frames[0].mask.shape[2])
+    race_flip = _run(clip, flipped, mirrored, config, seed, log, total, race.guesses)
+    return _prior(clip, flipped, race, race_flip, name, seed)
+
+
+def _run(
+    clip: Clip, frames: tuple[Frame, ...], said: Evidence, config: PriorConfig, seed: int, log: Log, total: int,
+    known: Views | None,
+) -> StandingCamera:  # fmt: skip
+    """All rounds, from all starts to one guess; ``known`` is the animal whose proportions are taken over."""
+    boxes = windows(frames)
+    seen = [
+        replace(frame, camera=fauna_camera(box, frame.mask.shape[2], frame.mask.shape[1]))
+        for frame, box in zip(frames, boxes, strict=True)
+    ]
+    moments, working = list(range(len(frames))), torch.eye(4, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(seed)
+    race = StandingCamera(seen, moments, clip.name, working, config, generator, log, total)
+    race.said, race.boxes = said, boxes.float()
+    starts = Views.start(facings(config.yaw_starts), torch.zeros(len(frames), 3))
+    race.begin(starts)
+    if known is not None:
+        race.given, race.done = True, total // 2
+        rows = torch.zeros(len(starts), dtype=torch.long)
+        for part in ("scale", "shape", "relief"):
+            setattr(race.guesses, part, getattr(known, part)[rows])
+    for stage in config.stages:
+        race.run(stage)
+    return race
+
+
+def _prior(
+    clip: Clip, flipped: tuple[Frame, ...], race: StandingCamera, race_flip: StandingCamera, name: str, seed: int
+) -> Prior:
+    shape = Proportions(race.guesses.shape[0], race.guesses.relief[0])
+    template, count = quadruped(shape), len(clip.frames)
+    halves = []
+    for frames, half in ((clip.frames, race), (flipped, race_flip)):
+        cameras = object_cameras(half)
+        transforms = pose(half.guesses.joint_angles()[0], template.bones[:, 0], PARENTS)
+        posed = skin_points(template.vertices, template.weights, transforms)
+        halves.append((cameras, transforms, overlap(list(posed), template.faces, cameras, [f.mask for f in frames])))
+    quality = {"mask_iou": halves[0][2], "mask_iou_flip": halves[1][2]}
+    for suffix, half in (("", race), ("_flip", race_flip)):
+        quality |= {f"{key}{suffix}": value for key, value in half.figures.items()}
+        quality[f"cost{suffix}"] = float(half.costs.min())
+    return seal(
+        Prior(
+            name=name,
+            provenance=f"Template fitted to the {count} masks of the clip and of its mirror image, cameras unknown, "
+            f"seed {seed}.",
+            vertices=template.vertices,
+            faces=template.faces,
+            weights=template.weights,
+            bones=template.bones,
+            parents=torch.tensor(PARENTS),
+            mirror=torch.tensor(MIRROR),
+            times=torch.tensor(clip.times, dtype=torch.float64),
+            object_to_world=torch.eye(4, dtype=torch.float64).repeat(count, 1, 1),
+            cameras=halves[0][0],
+            transforms=halves[0][1],
+            cameras_flip=halves[1][0],
+            transforms_flip=halves[1][1],
+            quality=quality,
+            digest="",
+        )
+    )
+
+
+def object_cameras(race: StandingCamera) -> tuple[Camera, ...]:
+    """The winner's cameras in the object frame, lengths scaled so that the rest diagonal is `OBJECT_DIAGONAL`."""
+    guesses = race.guesses
+    size = guesses.scales()[0] * diagonal(quadruped(Proportions(guesses.shape, guesses.relief), unit=False).vertices)[0]
+    cameras = []
+    for frame, root in zip(race.frames, guesses.roots()[0].double(), strict=True):
+        assert frame.camera is not None
+        moved = frame.camera.world_to_camera @ root
+        moved = rigid(_orthonormal(moved[:3, :3]), moved[:3, 3] * (OBJECT_DIAGONAL / float(size)))
+        cameras.append(replace(frame.camera, world_to_camera=moved))
+    return tuple(cameras)
+
+
+def _orthonormal(matrix: Tensor) -> Tensor:
+    """The nearest rotation: single precision leaves errors of 1e-7."""
+    u, _, v = torch.linalg.svd(matrix)
+    return u @ v
+
+
+def resized(prior: Prior, width: int, height: int) -> Prior:
+    """The same prior for frames of another size."""
+    cameras, flipped = (
+        tuple(camera.resized(width, height) for camera in each) for each in (prior.cameras, prior.cameras_flip)
+    )
+    return seal(replace(prior, cameras=cameras, cameras_flip=flipped))
+
+
+def in_crops(prior: Prior, clip: Clip) -> Prior:
+    """A prior of whole frames for a clip of square crops of them; rows are those of the clip's frames.
+
+    Raises:
+        UserError: a frame is no crop, or the prior is for frames of another size.
+    """
+    rows, cameras, flipped = [], [], []
+    for frame in clip.frames:
+        row = int((prior.times - frame.time).abs().argmin())
+        plain, crop, size = prior.cameras[row], frame.crop, frame.mask.shape[2]
+        if crop is None or (plain.width, plain.height) != (crop.width, crop.height):
+            held = "a whole frame" if crop is None else f"a crop of {crop.width}x{crop.height} pixels"
+            raise UserError(
+                f"{clip.name}: expected crops of {plain.width}x{plain.height} frames as prior '{prior.name}' knows, "
+                f"got {held}."
+            )
+        rows.append(row)
+        cameras.append(_cropped(plain, crop.left, crop.top, crop.side, size))
+        # in the flipped frame the crop starts as far from the left as it ends from the right
+        flipped.append(_cropped(prior.cameras_flip[row], crop.width - crop.left - crop.side, crop.top, crop.side, size))
+    return seal(
+        replace(
+            prior,
+            times=prior.times[rows],
+            object_to_world=prior.object_to_world[rows],
+            cameras=tuple(cameras),
+            transforms=prior.transforms[rows],
+            cameras_flip=tuple(flipped),
+            transforms_flip=prior.transforms_flip[rows],
+        )  # fmt: skip
+    )
+
+
+def _cropped(camera: Camera, left: float, top: float, side: float, size: int) -> Camera:
+    moved = camera.intrinsics.clone()
+    moved[0, 2] -= left
+    moved[1, 2] -= top
+    moved[:2] *= size / side
+    return replace(camera, intrinsics=moved, width=size, height=size)
+
+
+def with_cameras(clip: Clip, prior: Prior) -> Clip:
+    """The clip seen by the prior's cameras, since its own are unknown; frames match by time."""
+    frames = []
+    for frame in clip.frames:
+        row = int((prior.times - frame.time).abs().argmin())
+        frames.append(replace(frame, camera=prior.cameras[row]))
+    return replace(clip, frames=tuple(frames))

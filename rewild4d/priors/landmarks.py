@@ -1,0 +1,124 @@
+"""Named points of the template, and the files that say which annotated keypoint is which of them."""
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.priors.template import MIRROR
+from rewild4d.types import Camera, Keypoints, Prior
+
+
+def _landmarks() -> dict[str, tuple[int, float]]:
+    body = {
+        "nose": (0, 1.0), "jaw": (0, 0.8), "eye": (0, 0.35), "poll": (0, 0.0), "neck": (1, 0.0), "withers": (3, 1.0),
+        "back": (3, 0.0), "hips": (6, 0.0), "tail_root": (6, 1.0), "tail_middle": (5, 1.0), "tail_tip": (4, 1.0),
+    }  # fmt: skip
+    legs = {
+        f"{end}_{side}_{joint}": (foot + up, along)
+        for (end, side), foot in {
+            ("front", "left"): 8, ("rear", "left"): 11, ("rear", "right"): 14, ("front", "right"): 17,
+        }.items()
+        for joint, up, along in (("top", 2, 0.0), ("upper", 1, 0.0), ("lower", 0, 0.0), ("foot", 0, 1.0))
+    }  # fmt: skip
+    return body | legs
+
+
+LANDMARKS = _landmarks()
+"""Where each point lies: the bone and the share of its length from start (the pivot, 0) to end (1). On legs: "top" is
+the shoulder or hip, "upper" the elbow or stifle, "lower" the wrist or hock."""
+FRONT = tuple(name for name in LANDMARKS if name.startswith("front_")) + ("nose", "jaw", "eye", "poll", "neck")
+REAR = tuple(name for name in LANDMARKS if name.startswith("rear_")) + ("tail_root",)
+
+
+@dataclass(frozen=True)
+class Marks:
+    """Keypoints as places on the template.
+
+    Attributes:
+        moments: index of the frame of each mark, int64, [m].
+        bones: int64, [m].
+        along: share of the bone's length, [m].
+        pixels: where it was seen, in the frame's pixels, [m, 2].
+    """
+
+    moments: Tensor
+    bones: Tensor
+    along: Tensor
+    pixels: Tensor
+
+    def mirrored(self, width: int) -> "Marks":
+        """The same in horizontally flipped frames."""
+        flipped = torch.stack((width - self.pixels[:, 0], self.pixels[:, 1]), dim=1)
+        return Marks(self.moments, torch.tensor(MIRROR)[self.bones], self.along, flipped)
+
+    def chosen(self, rows: Tensor) -> "Marks":
+        """Some of the marks, by index or bool, [m]."""
+        return Marks(self.moments[rows], self.bones[rows], self.along[rows], self.pixels[rows])
+
+    def __len__(self) -> int:
+        return len(self.moments)
+
+
+def mapping_names() -> list[str]:
+    """Names of the mapping files that come with the package."""
+    folder = resources.files("rewild4d.priors") / "mappings"
+    return sorted(file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml"))
+
+
+def load_mapping(name: str) -> dict[str, str]:
+    """Keypoint name -> name of a landmark; ``name`` is one of ours or the path of a TOML file with a table [points].
+
+    Raises:
+        UserError: no such mapping, not TOML, or a landmark that does not exist.
+    """
+    file = resources.files("rewild4d.priors") / "mappings" / f"{name}.toml"
+    if not file.is_file():
+        file = Path(name)
+        if file.suffix != ".toml" or not file.is_file():
+            raise unknown_name("keypoint mapping", name, [*mapping_names(), "<your own>.toml"])
+    try:
+        points = tomllib.loads(file.read_text(encoding="utf-8"))["points"]
+        pairs = {str(key): str(value) for key, value in points.items()}
+    except (tomllib.TOMLDecodeError, KeyError, AttributeError, UnicodeDecodeError) as error:
+        raise UserError(f"{name}: expected a TOML file with a table [points], but: {error}.") from error
+    for value in pairs.values():
+        if value not in LANDMARKS:
+            raise unknown_name(f"landmark in the mapping {name}", value, LANDMARKS)
+    return pairs
+
+
+def marks(keypoints: Sequence[Keypoints | None], mapping: dict[str, str]) -> Marks:
+    """All visible keypoints that the mapping knows; frames without any have None."""
+    rows, pixels = [], []
+    for moment, points in enumerate(keypoints):
+        if points is None:
+            continue
+        for name, place, visible in zip(points.names, points.points.tolist(), points.visible.tolist(), strict=True):
+            if visible and name in mapping:
+                bone, along = LANDMARKS[mapping[name]]
+                rows.append((moment, bone, along))
+                pixels.append(place)
+    moments, bones, along = (torch.tensor(column) for column in zip(*rows, strict=True)) if rows else ([], [], [])
+    return Marks(
+        torch.as_tensor(moments).long(),
+        torch.as_tensor(bones).long(),
+        torch.as_tensor(along).float(),
+        torch.tensor(pixels, dtype=torch.float32).reshape(-1, 2),
+    )
+
+
+def landmark_pixels(prior: Prior, found: Marks, cameras: Sequence[Camera] | None = None) -> Tensor:
+    """Where the prior puts the marks, in pixels, [m, 2]; the marks' moments are rows of the prior."""
+    cameras = cameras or prior.cameras
+    start, end = prior.bones[found.bones].unbind(1)
+    rest = start + found.along[:, None] * (end - start)
+    transforms = prior.transforms[found.moments, found.bones]
+    posed = (transforms[:, :3, :3] @ rest[..., None])[..., 0] + transforms[:, :3, 3]
+    shown = [cameras[int(row)].project(point.double())[0] for row, point in zip(found.moments, posed, strict=True)]
+    return torch.stack(shown) if shown else torch.zeros(0, 2, dtype=torch.float64)

@@ -1,0 +1,129 @@
+"""Hypotheses that compete: rounds of gradient descent on silhouettes, and cuts between them."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from rewild4d.contracts import Log
+from rewild4d.priors.config import PriorConfig, Stage
+from rewild4d.priors.hypotheses import Hypotheses
+from rewild4d.priors.search import match_areas
+from rewild4d.priors.silhouettes import Targets, crop_targets, mismatch
+from rewild4d.types import Frame
+
+STILL_PARAMETERS = ("scale", "turn", "shift", "shape")
+
+
+class Race:
+    """Guesses that are fitted side by side.
+
+    Attributes:
+        guesses: those still in the race.
+        costs: of each after the last round, [B].
+        start_costs: of every start after the first round.
+        figures: named figures of the race (facing_margin, ...).
+        done: steps of descent so far, of the log's total.
+    """
+
+    def __init__(
+        self,
+        frames: Sequence[Frame],
+        moments: Sequence[int],
+        name: str,
+        working: Tensor,
+        config: PriorConfig,
+        generator: torch.Generator,
+        log: Log,
+        total: int,
+    ) -> None:
+        self.frames, self.moments, self.name = frames, moments, name
+        self.working, self.config, self.generator = working, config, generator
+        self.log, self.total, self.done = log, total, 0
+        self.costs = self.start_costs = torch.zeros(0)
+        self.figures: dict[str, float] = {}
+        self.guesses: Hypotheses
+
+    def begin(self, guesses: Hypotheses) -> None:
+        """Take the starts, at the size that covers the masks' area."""
+        self.guesses = guesses
+        match_areas(self.guesses, self._targets(self.config.stages[0].size), self.config.stages[0])
+
+    def free(self, stage: Stage) -> list[str]:
+        """Names of the parameters that a round may change."""
+        return [*STILL_PARAMETERS, *("angles",) * stage.joints, *("relief",) * stage.relief]
+
+    def evidence(self) -> Tensor | float:
+        """What speaks against each guess at every step besides its silhouette and its penalties, [B]."""
+        return 0.0
+
+    def verdict(self, stage: Stage) -> Tensor | float:
+        """What counts only when guesses are compared, [B]."""
+        return self.config.gait_weight * self.guesses.backward_gait() if stage.joints else 0.0
+
+    def rivals(self, order: list[int]) -> list[int]:
+        """Guesses that stay in the race although others are better, most wanted first; ``order`` is by cost."""
+        heads = self.guesses.heading().detach()
+        return [row for row in order if heads[row] @ heads[order[0]] < 0][:1]
+
+    def run(self, stage: Stage) -> None:
+        """One round of descent, then the cut."""
+        targets = self._targets(stage.size)
+        names = self.free(stage)
+        leaves = [getattr(self.guesses, name).detach().requires_grad_() for name in names]
+        for name, leaf in zip(names, leaves, strict=True):
+            setattr(self.guesses, name, leaf)
+        optimizer = torch.optim.Adam(leaves, lr=self.config.learning_rate, betas=(0.9, 0.98))
+        for step in range(stage.steps):
+            share = step / max(stage.steps - 1, 1)
+            optimizer.param_groups[0]["lr"] = self.config.learning_rate * (1 - 0.85 * share)
+            sigma = stage.size * (stage.blur[0] + share * (stage.blur[1] - stage.blur[0]))
+            cost = self._cost(self._draw(targets, stage.frames), sigma, stage)
+            if not torch.isfinite(cost).all():
+                raise FloatingPointError(f"{self.name}: the template fit's cost is not finite at step {step}: {cost}")
+            optimizer.zero_grad()
+            torch.autograd.backward(cost.sum(), inputs=leaves)
+            optimizer.step()
+            self.done += 1
+            self.log(self.done, self.total, {"prior": float(cost.detach().min())})
+        with torch.no_grad():
+            self.costs = self._cost(_spaced(targets, 2 * stage.frames), stage.size * stage.blur[1], stage)
+            self.costs = self.costs + self.verdict(stage)
+        if not len(self.start_costs):
+            self.start_costs = self.costs
+        self._cut(stage.keep)
+
+    def _targets(self, size: int) -> Targets:
+        return crop_targets(self.frames, self.moments, self.working, size, self.name)
+
+    def _draw(self, targets: Targets, count: int) -> Targets:
+        """All observations, or a fresh sample of as many as a step may look at."""
+        if len(targets.masks) <= count:
+            return targets
+        rows = torch.randperm(len(targets.masks), generator=self.generator)[:count]
+        return targets.select(rows.sort().values)
+
+    def _cost(self, targets: Targets, sigma: float, stage: Stage) -> Tensor:
+        shape, relief, swing, root = self.guesses.penalties()
+        config = self.config
+        penalty = config.shape_weight * shape + config.relief_weight * relief
+        penalty = penalty + config.angle_weight * swing + config.root_weight * root + self.evidence()
+        return mismatch(self.guesses.silhouettes(targets, stage), targets, sigma) + penalty
+
+    def _cut(self, keep: int) -> None:
+        """Keep the best, and its rivals while there is room."""
+        order = self.costs.argsort().tolist()
+        heads = self.guesses.heading().detach()
+        away = [row for row in order if heads[row] @ heads[order[0]] < 0]
+        if away:
+            self.figures["facing_margin"] = float(self.costs[away[0]] - self.costs[order[0]])
+        wanted = [order[0], *(row for row in self.rivals(order) if row != order[0])][:keep]
+        rest = [row for row in order if row not in wanted][: keep - len(wanted)]
+        rows = torch.tensor(sorted(wanted + rest, key=order.index))
+        self.guesses, self.costs = self.guesses.select(rows), self.costs[rows]
+
+
+def _spaced(targets: Targets, count: int) -> Targets:
+    """At most ``count`` evenly spaced observations."""
+    count = min(len(targets.masks), count)
+    return targets.select(torch.linspace(0, len(targets.masks) - 1, count).round().long())

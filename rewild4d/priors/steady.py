@@ -1,0 +1,110 @@
+"""Which cameras of a sequence belong together: an estimate that hops between facings must not supervise anything.
+
+The density clustering of Ester et al. 1996 (DBSCAN) on the direction of the camera's centre and on its translation; the
+largest cluster stays (METHOD, section 2). Both sequences, the clip and its mirror image, are filtered on their own.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rewild4d.errors import UserError
+from rewild4d.priors.io import seal
+from rewild4d.transforms import mirror_camera, mirror_matrix
+from rewild4d.types import Camera, Prior
+
+REACH, NEIGHBOURS = 0.25, 3
+"""DBSCAN's eps, in units of the feature, and min_samples (a point counts itself)."""
+TRANSLATION_RANGE = 0.11
+"""Reach of Fauna's translation along the view over its camera's distance: 1.1 of 10 units."""
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """A prior without the frames whose camera fell out.
+
+    Attributes:
+        prior: with the kept rows; a mirrored camera that fell out is the mirror image of the plain one.
+        kept: rows of the original prior.
+        notes: what fell out, a sentence each.
+    """
+
+    prior: Prior
+    kept: tuple[int, ...]
+    notes: tuple[str, ...]
+
+
+def clusters(points: Tensor, reach: float = REACH, neighbours: int = NEIGHBOURS) -> Tensor:
+    """DBSCAN: the cluster of each point, counted from 0; -1 is noise. int64, [n].
+
+    Args:
+        points: [n, d].
+        reach: points at most this far apart are neighbours.
+        neighbours: a point with at least as many, itself included, starts or spreads a cluster.
+    """
+    near = torch.cdist(points, points) <= reach
+    dense = near.sum(1) >= neighbours
+    labels = torch.full((len(points),), -1)
+    count = 0
+    for seed in torch.nonzero(dense)[:, 0].tolist():
+        if labels[seed] >= 0:
+            continue
+        front = torch.zeros(len(points), dtype=torch.bool)
+        front[seed] = True
+        while front.any():
+            labels[front] = count
+            front = near[front & dense].any(0) & (labels < 0)
+        count += 1
+    return labels
+
+
+def steady(cameras: Sequence[Camera]) -> Tensor:
+    """Which cameras belong to the largest cluster; all of them where no cluster forms. bool, [T]."""
+    matrices = torch.stack([camera.world_to_camera.double() for camera in cameras])
+    centers = -(matrices[:, :3, :3].transpose(1, 2) @ matrices[:, :3, 3:])[..., 0]
+    distance = matrices[:, 2, 3].median()
+    shifts = (matrices[:, :3, 3] - matrices[:, :3, 3].median(0).values) / (TRANSLATION_RANGE * distance)
+    labels = clusters(torch.cat((torch.nn.functional.normalize(centers, dim=1), shifts), dim=1))
+    if bool((labels < 0).all()):
+        return torch.ones(len(cameras), dtype=torch.bool)
+    return labels == labels[labels >= 0].mode().values
+
+
+def without_hops(prior: Prior) -> Filtered:
+    """Leave out frames whose camera is not steady, and mend mirrored ones by the mirror image of the plain one.
+
+    Raises:
+        UserError: fewer than two frames are left.
+    """
+    plain, flipped = steady(prior.cameras), steady(prior.cameras_flip)
+    kept = tuple(torch.nonzero(plain)[:, 0].tolist())
+    if len(kept) < 2:
+        raise UserError(f"prior '{prior.name}': expected cameras of at least 2 frames that agree, got {len(kept)}.")
+    mended = [row for row in kept if not flipped[row]]
+    cameras_flip, transforms_flip = list(prior.cameras_flip), prior.transforms_flip.clone()
+    for row in mended:
+        cameras_flip[row] = mirror_camera(prior.cameras[row])
+        transforms_flip[row] = mirror_matrix(prior.transforms[row, prior.mirror])
+    rows = torch.tensor(kept)
+    smaller = replace(
+        prior,
+        times=prior.times[rows],
+        object_to_world=prior.object_to_world[rows],
+        cameras=tuple(prior.cameras[row] for row in kept),
+        transforms=prior.transforms[rows],
+        cameras_flip=tuple(cameras_flip[row] for row in kept),
+        transforms_flip=transforms_flip[rows],
+    )
+    left = [row for row in range(len(plain)) if not plain[row]]
+    notes = [_told(left, len(plain), "left out: the camera is far from those of the other frames")]
+    notes.append(_told(mended, len(plain), "mirrored from the plain frame: the camera of the mirrored one is far off"))
+    return Filtered(seal(smaller), kept, tuple(note for note in notes if note))
+
+
+def _told(rows: list[int], count: int, what: str) -> str:
+    if not rows:
+        return ""
+    shown = ", ".join(map(str, rows[:12])) + (", ..." if len(rows) > 12 else "")
+    return f"{len(rows)} of {count} frames {what}: {shown}"

@@ -1,0 +1,293 @@
+"""Keypoint files, camera clusters, 3D-Fauna's files and the command, at tiny size."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from rewild4d.cli import main
+from rewild4d.commands import prior as command
+from rewild4d.errors import UserError
+from rewild4d.priors.annotations import read_keypoints
+from rewild4d.priors.config import FOOTAGE
+from rewild4d.priors.fauna import read_fauna
+from rewild4d.priors.fauna_bones import estimate_bones, joint_transforms, skinning_weights
+from rewild4d.priors.io import load_prior
+from rewild4d.priors.steady import clusters, steady, without_hops
+from rewild4d.priors.template import quadruped
+from rewild4d.priors.travel import TravelMeter, between
+from rewild4d.transforms import look_at, skin_points
+from rewild4d.types import Camera, Prior
+
+STEMS = ("00000", "00005", "00010")
+
+
+def test_badja_is_row_column_at_its_own_size(tmp_path: Path) -> None:
+    entry = {"image_path": "DAVIS/x/00005.jpg", "joints": [[540, 960], [0, 0], [5000, 3]], "visibility": [1, 0, 1]}
+    (tmp_path / "a.json").write_text(json.dumps([entry]))
+    found = read_keypoints(tmp_path / "a.json", STEMS, (960, 540))
+    assert found[0] is None and found[2] is None and found[1] is not None
+    assert found[1].points[0].tolist() == [960.5 / 2, 540.5 / 2]
+    # the third joint lies below the frame
+    assert found[1].visible.tolist() == [True, False, False]
+
+
+def test_of_several_coco_animals_the_largest_box_counts(tmp_path: Path) -> None:
+    content = {
+        "images": [{"id": 7, "file_name": "easy/cat/00010.jpg"}],
+        "categories": [{"id": 1, "keypoints": ["nose", "neck"]}],
+        "annotations": [
+            {"image_id": 7, "category_id": 1, "bbox": [0, 0, 5, 5], "keypoints": [1, 1, 2, 2, 2, 2]},
+            {"image_id": 7, "category_id": 1, "bbox": [0, 0, 9, 9], "keypoints": [3, 4, 2, 0, 0, 0]},
+        ],
+    }
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    found = read_keypoints(tmp_path / "a.json", STEMS, (20, 20))[2]
+    assert found is not None and found.names == ("nose", "neck")
+    assert found.points[0].tolist() == [3.5, 4.5] and found.visible.tolist() == [True, False]
+
+
+def test_deeplabcut_rows_count_frames_or_name_images(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(
+        "scorer,net,net,net,net,net,net\nbodyparts,nose,nose,nose,paw,paw,paw\n"
+        "coords,x,y,likelihood,x,y,likelihood\n0,1,2,0.9,3,4,0.2\n2,5,6,0.7,7,8,0.99\n"
+    )
+    found = read_keypoints(tmp_path / "a.csv", STEMS, (20, 20))
+    assert found[1] is None and found[0] is not None and found[2] is not None
+    assert found[0].visible.tolist() == [True, False] and found[2].points[1].tolist() == [7.5, 8.5]
+    (tmp_path / "b.csv").write_text(
+        "scorer,,,me,me\nbodyparts,,,nose,nose\ncoords,,,x,y\nlabeled-data,clip,00005.png,1,2\n"
+    )
+    labelled = read_keypoints(tmp_path / "b.csv", STEMS, (20, 20))[1]
+    assert labelled is not None and labelled.points.tolist() == [[1.5, 2.5]]
+
+
+def test_sleap_takes_the_best_instance_of_a_frame(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(
+        "track,frame_idx,instance.score,nose.x,nose.y,nose.score\n"
+        "t0,1,0.3,1,1,0.9\nt1,1,0.8,2,2,0.9\nt0,2,0.5,,,\n"
+    )  # fmt: skip
+    found = read_keypoints(tmp_path / "a.csv", STEMS, (20, 20))
+    assert found[1] is not None and found[1].points.tolist() == [[2.5, 2.5]]
+    assert found[2] is not None and not found[2].visible.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.json", "{", "expected keypoints as BADJA, COCO, DeepLabCut or SLEAP write them"),
+        ("a.json", '{"images": []}', "expected keypoints as BADJA, COCO, DeepLabCut or SLEAP write them"),
+        ("a.csv", "x,y\n1,2\n", "expected keypoints as BADJA, COCO, DeepLabCut or SLEAP write them"),
+        ("a.json", '[{"image_path": "q.jpg", "joints": [[1, 1]], "visibility": [1]}]', "got those of q"),
+    ],
+)
+def test_a_broken_keypoint_file_is_one_sentence(tmp_path: Path, name: str, text: str, message: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(UserError, match=message):
+        read_keypoints(tmp_path / name, STEMS, (20, 20))
+
+
+def test_clusters_are_those_of_the_definition() -> None:
+    generator = torch.Generator().manual_seed(3)
+    points = torch.cat(
+        [torch.randn(20, 2, generator=generator) * 0.1 + 3 * k for k in range(3)] + [torch.ones(1, 2) * 9]
+    )
+    labels = clusters(points, 0.25, 3)
+    near = (points[:, None] - points).norm(dim=-1) <= 0.25
+    dense = near.sum(1) >= 3
+    for i in range(len(points)):
+        assert (labels[i] < 0) == (not dense[i] and not (near[i] & dense).any())
+        for j in range(len(points)):
+            if near[i, j] and dense[i] and dense[j]:
+                assert labels[i] == labels[j]
+    assert len({int(x) for x in labels[dense]}) >= 3 and labels[-1] == -1
+
+
+def ring(angles: list[float]) -> tuple[Camera, ...]:
+    up, origin = torch.tensor((0.0, 1.0, 0.0)).double(), torch.zeros(3).double()
+    eyes = [torch.tensor((14 * math.sin(a), 2.0, 14 * math.cos(a))).double() for a in angles]
+    intrinsics = torch.tensor(((100.0, 0, 32), (0, 100, 32), (0, 0, 1))).double()
+    return tuple(Camera(look_at(eye, origin, up), intrinsics, 64, 64) for eye in eyes)
+
+
+def a_prior(angles: list[float], flipped: list[float]) -> Prior:
+    template, count = quadruped(), len(angles)
+    still = torch.eye(4).repeat(count, 20, 1, 1)
+    return Prior(
+        "made", "", template.vertices, template.faces, template.weights, template.bones, torch.full((20,), -1),
+        torch.arange(20), torch.arange(count).double() / 24, torch.eye(4).double().repeat(count, 1, 1), ring(angles),
+        still, ring(flipped), still, {}, "",
+    )  # fmt: skip
+
+
+def test_a_camera_that_hops_is_left_out_and_a_hop_of_the_mirrored_one_is_mended() -> None:
+    angles = [0.1 * t for t in range(12)]
+    hopping = [a + math.pi * (t == 4) for t, a in enumerate(angles)]
+    mirrored = [-a + math.pi * (t == 7) for t, a in enumerate(angles)]
+    assert steady(ring(angles)).all() and steady(ring(hopping)).tolist() == [t != 4 for t in range(12)]
+    filtered = without_hops(a_prior(hopping, mirrored))
+    assert filtered.kept == tuple(t for t in range(12) if t != 4) and len(filtered.prior.cameras) == 11
+    # row 7 is the sixth of those kept; its mirrored camera is now the mirror image of the plain one
+    assert torch.allclose(filtered.prior.cameras_flip[6].world_to_camera, ring([-0.7])[0].world_to_camera, atol=1e-6)
+    assert filtered.notes[0].startswith("1 of 12 frames left out") and filtered.notes[0].endswith(": 4")
+    assert filtered.notes[1].startswith("1 of 12 frames mirrored") and filtered.notes[1].endswith(": 7")
+    nothing = without_hops(a_prior(angles, [-a for a in angles]))
+    assert nothing.notes == () and len(nothing.kept) == 12
+
+
+def test_travel_is_measured_against_a_background_that_moves() -> None:
+    scene = np.random.default_rng(0).integers(0, 255, (120, 400, 3), dtype=np.uint8)
+    scene = cv2.GaussianBlur(scene, (0, 0), 2.0)
+    meter = TravelMeter()
+    for t in range(4):
+        image, mask = scene[:, 10 * t : 10 * t + 200].copy(), np.zeros((120, 200), np.uint8)
+        mask[40:80, 80:120] = 255  # stays in the image while the camera pans to the right
+        image[mask > 0] = 200
+        meter.add(image, mask)
+    steps = meter.result()
+    assert torch.allclose(steps, torch.tensor((10.0, 0.0)).expand(3, 2), atol=0.5)
+    assert torch.allclose(between(steps, [0, 3]), torch.tensor(((30.0, 0.0),)), atol=1.0)
+
+
+def write_fauna(folder: Path, rest: torch.Tensor, faces: torch.Tensor, angles: torch.Tensor, pose: np.ndarray) -> None:
+    folder.mkdir()
+    bones, parents = estimate_bones(rest)
+    weights = skinning_weights(rest, bones)
+    for frame, each in enumerate(angles):
+        posed = skin_points(rest, weights, joint_transforms(bones, parents, each))
+        stem = folder / f"0001000_{frame:>10}"
+        lines = [f"v {x:.8f} {y:.8f} {z:.8f}" for x, y, z in posed.tolist()]
+        lines += [f"f {a + 1}//{a + 1} {b + 1}//{b + 1} {c + 1}//{c + 1}" for a, b, c in faces.tolist()]
+        Path(f"{stem}_mesh.obj").write_text("\n".join(lines))
+        np.savetxt(f"{stem}_pose.txt", pose, fmt="%.6f")
+        np.savetxt(f"{stem}_arti_params.txt", each.numpy())
+
+
+def test_fauna_files_become_a_prior(tmp_path: Path) -> None:
+    template = quadruped()
+    rest = 0.8 * template.vertices.double()
+    angles = 0.15 * torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    # looking along the animal's -x: object +z (its head) points to the camera's left
+    rotation = np.array(((0.0, 0, -1), (0, 1, 0), (1, 0, 0)))
+    write_fauna(tmp_path / "f", rest, template.faces, angles, np.concatenate((rotation.T.ravel(), (0.1, 0.2, 0.3))))
+    prior = read_fauna(tmp_path / "f", flip=None, boxes=None, size=512, fps=10.0)
+    assert prior.times.tolist() == [0.0, 0.1] and prior.cameras[0].width == 512
+    assert prior.cameras[0].intrinsics[0, 0] == pytest.approx(256 / math.tan(math.radians(12.5)))
+    assert float((prior.vertices - template.vertices).norm(dim=1).mean()) < 0.05
+    assert prior.quality["unposed_residual"] < 0.01
+    # FORMATS 4.7: x right, y up, the camera 10 units from the origin; u grows with x, v against y
+    eye = torch.from_numpy(rotation) @ rest[5] + torch.tensor((0.1, 0.2, 0.3 - 10.0), dtype=torch.float64)
+    focal = 256 / math.tan(math.radians(12.5))
+    wanted = torch.stack((256 + focal * eye[0] / -eye[2], 256 - focal * eye[1] / -eye[2]))
+    scale = 5.0 / float((rest.amax(0) - rest.amin(0)).norm())
+    assert torch.allclose(prior.cameras[1].project(scale * rest[5])[0], wanted, atol=1e-3)
+
+
+def test_fauna_boxes_place_the_crop_and_faults_are_one_sentence(tmp_path: Path) -> None:
+    template = quadruped()
+    pose = np.concatenate((np.eye(3).ravel(), np.zeros(3)))
+    write_fauna(tmp_path / "f", template.vertices.double(), template.faces, torch.zeros(2, 20, 3).double(), pose)
+    (tmp_path / "b").mkdir()
+    for frame in range(2):
+        (tmp_path / "b" / f"{frame}_box.txt").write_text(f"{frame} 30 40 100 100 320 240 1.0")
+    prior = read_fauna(tmp_path / "f", flip=tmp_path / "f", boxes=tmp_path / "b", size=256, fps=24.0)
+    origin = torch.zeros(3).double()
+    assert (prior.cameras[0].width, prior.cameras[0].height) == (320, 240)
+    assert prior.cameras[0].project(origin)[0].tolist() == pytest.approx([30 + 50, 40 + 50])
+    assert prior.cameras_flip[0].project(origin)[0].tolist() == pytest.approx([320 - 30 - 50, 40 + 50])
+    next((tmp_path / "f").glob("*1_pose.txt")).write_text("1 2 3")
+    with pytest.raises(UserError, match="expected 12 finite numbers, got 3"):
+        read_fauna(tmp_path / "f", flip=None, boxes=None, size=256, fps=24.0)
+    with pytest.raises(UserError, match="expected files named <step>_<frame>_mesh.obj"):
+        read_fauna(tmp_path / "b", flip=None, boxes=None, size=256, fps=24.0)
+
+
+def write_frames(folder: Path, count: int) -> None:
+    for name in ("frames", "masks"):
+        (folder / name).mkdir()
+    for t in range(count):
+        mask = np.zeros((48, 64), np.uint8)
+        cv2.ellipse(mask, (28 + 2 * t, 20), (16, 7), 0, 0, 360, 255, -1)
+        for x in (18, 36):
+            mask[22:38, x + 2 * t : x + 3 + 2 * t] = 255
+        cv2.imwrite(str(folder / "frames" / f"{t}.png"), np.full((48, 64, 3), 90, np.uint8))
+        cv2.imwrite(str(folder / "masks" / f"{t}.png"), mask)
+
+
+def test_the_command_writes_a_prior_and_its_pictures(tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+    import msgspec
+
+    stages = tuple(msgspec.structs.replace(stage, steps=1, frames=3) for stage in FOOTAGE.stages)
+    monkeypatch.setattr(command, "FOOTAGE", msgspec.structs.replace(FOOTAGE, stages=stages, yaw_starts=4))
+    write_frames(tmp_path, 11)
+    (tmp_path / "masks" / "3.png").unlink()
+    arguments = [
+        "--frames",
+        str(tmp_path / "frames"),
+        "--masks",
+        str(tmp_path / "masks"),
+        "--out",
+        str(tmp_path / "p.npz"),
+    ]
+    entry = {"image_path": "2.jpg", "joints": [[540, 960]] * 34, "visibility": [1] * 34}
+    (tmp_path / "k.json").write_text(json.dumps([entry, entry | {"image_path": "10.jpg"}]))
+    keypoints = ["--keypoints", str(tmp_path / "k.json"), "--mapping", "badja", "--use", "half"]
+    assert command.main(["fit", *arguments, *keypoints]) == 0
+    prior = load_prior(tmp_path / "p.npz")
+    # 2 before 10, and the frame without a mask leaves a gap in time
+    assert torch.allclose(prior.times * 24, torch.tensor((0.0, 1, 2, 4, 5, 6, 7, 8, 9, 10)).double())
+    assert (prior.cameras[0].width, prior.cameras[0].height) == (64, 48) and 0 <= prior.quality["pck"] <= 1
+    assert (tmp_path / "p.png").is_file() and (tmp_path / "p.mp4").is_file()
+    said = capsys.readouterr().out
+    assert "1 of 11 frames without a mask left out" in said and "mask_iou" in said
+
+
+def test_bad_input_to_the_command_is_one_sentence(tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
+    write_frames(tmp_path, 2)
+    frames, masks, out = (
+        ["--frames", str(tmp_path / "frames")],
+        ["--masks", str(tmp_path / "masks")],
+        ["--out", "p.npz"],
+    )
+    cv2.imwrite(str(tmp_path / "masks" / "1.png"), np.zeros((10, 10), np.uint8))
+    (tmp_path / "other").mkdir()
+    cases = [
+        (["fit", *frames, *masks, *out], "expected a mask of 64x48 pixels like 1.png, got 10x10"),
+        (["fit", *frames, "--masks", str(tmp_path / "none"), *out], "expected a folder of masks, but there is none"),
+        (["fit", *frames, "--masks", str(tmp_path / "other"), *out], "expected masks as .png, .jpg, .jpeg"),
+        (["fit", *frames, *masks, *out, "--mapping", "badja"], "--keypoints and --mapping: expected both or neither"),
+        (["fitt"], "fit"),
+    ]
+    for arguments, message in cases:
+        with pytest.raises(SystemExit) as stop:
+            main(["prior", *arguments])
+        said = capsys.readouterr().err
+        assert stop.value.code == 2 and message in said and said.count("\n") == 1
+    (tmp_path / "masks" / "1.png").write_bytes(b"no image")
+    with pytest.raises(UserError, match="expected an image that can be read"):
+        command.main(["fit", *frames, *masks, *out])
+
+
+def test_masks_are_read_by_what_they_hold() -> None:
+    from rewild4d.priors.folder import _foreground
+
+    grey = np.array([[0, 100, 255]], np.uint8)
+    assert _foreground(grey).tolist() == [[0, 100, 255]]
+    assert _foreground(np.array([[0, 1, 2]], np.uint8)).tolist() == [[0, 255, 255]]
+    colored = np.array([[[0, 0, 0], [0, 0, 128], [128, 0, 0]]], np.uint8)
+    assert _foreground(colored).tolist() == [[0, 255, 255]]
+    alpha = np.concatenate((np.full((1, 3, 3), 9, np.uint8), grey[..., None]), axis=2)
+    assert _foreground(alpha).tolist() == [[0, 100, 255]]
+
+
+def test_replacing_times_keeps_a_prior_valid(tmp_path: Path) -> None:
+    filtered = without_hops(a_prior([0.1 * t for t in range(5)], [-0.1 * t for t in range(5)])).prior
+    from rewild4d.priors.io import save_prior
+
+    save_prior(replace(filtered, name="kept"), tmp_path / "p.npz")
+    assert len(load_prior(tmp_path / "p.npz").cameras) == 5
