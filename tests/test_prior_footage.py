@@ -24,7 +24,7 @@ from rewild4d.transforms import look_at, skin_points
 from rewild4d.types import Camera, Clip, Crop, Frame, Keypoints, Prior
 
 AZIMUTH = 115.0
-"""Of the true cameras, degrees from the head towards the animal's left, at the first frame; it grows by four a frame."""
+"""Of the first true camera, degrees from the head towards the animal's left; it grows by four a frame."""
 
 
 @pytest.fixture(autouse=True, scope="module")
