@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -17,7 +18,8 @@ from rewild4d.priors.annotations import read_keypoints
 from rewild4d.priors.config import FOOTAGE
 from rewild4d.priors.fauna import read_fauna
 from rewild4d.priors.fauna_bones import estimate_bones, joint_transforms, skinning_weights
-from rewild4d.priors.io import load_prior
+from rewild4d.priors.folder import _foreground
+from rewild4d.priors.io import load_prior, save_prior
 from rewild4d.priors.steady import clusters, steady, without_hops
 from rewild4d.priors.template import quadruped
 from rewild4d.priors.travel import TravelMeter, between
@@ -172,6 +174,7 @@ def test_fauna_files_become_a_prior(tmp_path: Path) -> None:
     template = quadruped()
     rest = 0.8 * template.vertices.double()
     angles = 0.15 * torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    angles[1] *= 0.2  # the strongly bent first frame is not the one whose rest mesh is kept
     # looking along the animal's -x: object +z (its head) points to the camera's left
     rotation = np.array(((0.0, 0, -1), (0, 1, 0), (1, 0, 0)))
     write_fauna(tmp_path / "f", rest, template.faces, angles, np.concatenate((rotation.T.ravel(), (0.1, 0.2, 0.3))))
@@ -179,7 +182,8 @@ def test_fauna_files_become_a_prior(tmp_path: Path) -> None:
     assert prior.times.tolist() == [0.0, 0.1] and prior.cameras[0].width == 512
     assert prior.cameras[0].intrinsics[0, 0] == pytest.approx(256 / math.tan(math.radians(12.5)))
     assert float((prior.vertices - template.vertices).norm(dim=1).mean()) < 0.05
-    assert prior.quality["unposed_residual"] < 0.01
+    assert prior.quality["unposed_residual"] < 0.01 and prior.quality["rest_asymmetry"] < 0.01
+    assert prior.provenance.endswith("of frame 1.")
     # FORMATS 4.7: x right, y up, the camera 10 units from the origin; u grows with x, v against y
     eye = torch.from_numpy(rotation) @ rest[5] + torch.tensor((0.1, 0.2, 0.3 - 10.0), dtype=torch.float64)
     focal = 256 / math.tan(math.radians(12.5))
@@ -220,8 +224,6 @@ def write_frames(folder: Path, count: int) -> None:
 
 
 def test_the_command_writes_a_prior_and_its_pictures(tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
-    import msgspec
-
     stages = tuple(msgspec.structs.replace(stage, steps=1, frames=3) for stage in FOOTAGE.stages)
     monkeypatch.setattr(command, "FOOTAGE", msgspec.structs.replace(FOOTAGE, stages=stages, yaw_starts=4))
     write_frames(tmp_path, 11)
@@ -274,8 +276,6 @@ def test_bad_input_to_the_command_is_one_sentence(tmp_path: Path, capsys) -> Non
 
 
 def test_masks_are_read_by_what_they_hold() -> None:
-    from rewild4d.priors.folder import _foreground
-
     grey = np.array([[0, 100, 255]], np.uint8)
     assert _foreground(grey).tolist() == [[0, 100, 255]]
     assert _foreground(np.array([[0, 1, 2]], np.uint8)).tolist() == [[0, 255, 255]]
@@ -287,7 +287,5 @@ def test_masks_are_read_by_what_they_hold() -> None:
 
 def test_replacing_times_keeps_a_prior_valid(tmp_path: Path) -> None:
     filtered = without_hops(a_prior([0.1 * t for t in range(5)], [-0.1 * t for t in range(5)])).prior
-    from rewild4d.priors.io import save_prior
-
     save_prior(replace(filtered, name="kept"), tmp_path / "p.npz")
     assert len(load_prior(tmp_path / "p.npz").cameras) == 5

@@ -1,8 +1,8 @@
 """Read what 3D-Fauna's test run writes (design notes, FORMATS 4.8) as a prior.
 
 Per image it leaves a posed mesh, a pose and joint angles, but neither the rest mesh nor the skinning weights. Bones and
-weights are functions of the rest vertices (FORMATS 4.4, 4.5), so the rest mesh of the first image is found as the fixed
-point of undoing the pose. All poses are then recomputed with the first image's bones (METHOD, section 2).
+weights are functions of the rest vertices (FORMATS 4.4, 4.5), so the rest mesh of an image is found as the fixed point
+of undoing the pose. One image's mesh is kept and all poses are recomputed with its bones (METHOD, section 2).
 """
 
 import math
@@ -12,19 +12,22 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from rewild4d.errors import UserError
 from rewild4d.priors.fauna_bones import estimate_bones, joint_transforms, skinning_weights
 from rewild4d.priors.io import seal
 from rewild4d.priors.template import MIRROR
-from rewild4d.transforms import mirror_camera, mirror_transforms, rigid, skin_points
+from rewild4d.transforms import mirror_camera, mirror_points, mirror_transforms, rigid, skin_points
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Prior
 
 FIELD_OF_VIEW, OFFSET = math.radians(25.0), 10.0
 NATIVE = 256
 SWEEPS = 12
 """Rounds of undoing the pose; the rest mesh moves by less than a thousandth after a few."""
+TRIED = 4
+"""Least bent poses that are undone; the most symmetric rest mesh is taken."""
 _NAME = re.compile(r"(?P<step>\d+)_\s*(?P<frame>\S+)_mesh\.obj")
 
 
@@ -43,8 +46,7 @@ def read_fauna(folder: Path, *, flip: Path | None, boxes: Path | None, size: int
     """
     stems = _stems(folder)
     angles, cameras = _frames(folder, stems, boxes, size, flipped=False)
-    posed, faces = _read_obj(folder / f"{list(stems.values())[0]}_mesh.obj")
-    rest, residual = _unposed(posed, angles[0])
+    rest, faces, used, quality = _rest(folder, list(stems.values()), angles)
     bones, parents = estimate_bones(rest)
     weights = skinning_weights(rest, bones)
     scale = OBJECT_DIAGONAL / float((rest.amax(0) - rest.amin(0)).norm())
@@ -61,7 +63,8 @@ def read_fauna(folder: Path, *, flip: Path | None, boxes: Path | None, size: int
         transforms_flip = torch.stack([joint_transforms(bones, parents, each) for each in angles_flip])
     prior = Prior(
         name="fauna",
-        provenance=f"3D-Fauna's files of {len(stems)} frames in {folder.name}; rest mesh by undoing the first pose.",
+        provenance=f"3D-Fauna's files of {len(stems)} frames in {folder.name}; rest mesh by undoing the pose of frame "
+        f"{list(stems)[used]}.",
         vertices=(scale * rest).float(),
         faces=faces,
         weights=weights.float(),
@@ -74,7 +77,7 @@ def read_fauna(folder: Path, *, flip: Path | None, boxes: Path | None, size: int
         transforms=_moved(transforms, scale),
         cameras_flip=tuple(_scaled(camera, scale) for camera in cameras_flip),
         transforms_flip=_moved(transforms_flip, scale),
-        quality={"unposed_residual": residual * scale / OBJECT_DIAGONAL},
+        quality=quality,
         digest="",
     )
     return seal(prior)
@@ -163,6 +166,24 @@ def _read_obj(path: Path) -> tuple[Tensor, Tensor]:
     if table.ndim != 2 or corners.ndim != 2 or corners.shape[1] != 3 or corners.max() >= len(table):
         raise UserError(f"{path}: expected a mesh of triangles, got {len(vertices)} vertices and {len(faces)} faces.")
     return torch.from_numpy(table), torch.from_numpy(corners)
+
+
+def _rest(folder: Path, stems: list[str], angles: list[Tensor]) -> tuple[Tensor, Tensor, int, dict[str, float]]:
+    """The most symmetric rest mesh among the first image's and those of the least bent poses; Fauna's are symmetric.
+
+    Returns:
+        Vertices, faces, the index of the image they are from, and the figures of the undoing.
+    """
+    bent = torch.stack(angles).square().sum((1, 2)).argsort().tolist()
+    found = []
+    for index in dict.fromkeys([0, *bent[:TRIED]]):
+        posed, faces = _read_obj(folder / f"{stems[index]}_mesh.obj")
+        rest, residual = _unposed(posed, angles[index])
+        diagonal = float((rest.amax(0) - rest.amin(0)).norm())
+        asymmetry = float(np.mean(cKDTree(rest.numpy()).query(mirror_points(rest).numpy())[0]))
+        found.append((asymmetry / diagonal, index, residual / diagonal, rest, faces))
+    asymmetry, index, residual, rest, faces = min(found, key=lambda each: each[0])
+    return rest, faces, index, {"rest_asymmetry": asymmetry, "unposed_residual": residual}
 
 
 def _unposed(posed: Tensor, angles: Tensor) -> tuple[Tensor, float]:

@@ -46,6 +46,8 @@ class Evidence:
 
 
 NOTHING = Evidence()
+ASCENT = 0.3
+"""Motion up the image per motion away over the ground (sine of a camera's elevation); taken high, since it is noisy."""
 NEAR = 0.04
 """Distance of a joint to its keypoint up to which the cost is quadratic and from which it is linear, window sides."""
 
@@ -88,19 +90,21 @@ class StandingCamera(Race):
         return super().verdict(stage) + self.config.travel_weight * self._against_travel()
 
     def _against_travel(self) -> Tensor | float:
-        """Whether heads point against (1) or along (-1) the way the animal goes across the image, [B]."""
+        """Whether heads point against (1) or along (-1) the way the animal goes over the ground, [B]."""
         if self.said.travel is None:
             return 0.0
-        across = self.said.travel[:, 0] / self.boxes[1:, 2]
-        heads = self.guesses.roots()[:, 1:, 0, 2]
-        certainty = torch.tanh(2 * across.sum().abs())
-        return -certainty * (heads * across).sum(1) / across.abs().sum().clamp_min(1e-6)
+        steps = self.said.travel / self.boxes[1:, 2:]
+        # who walks up the image walks away, on a ground that is seen from above
+        ground = torch.stack((steps[:, 0], steps[:, 1] / ASCENT), dim=1)
+        certainty = torch.tanh(2 * ground.sum(0).norm())
+        along = (self.guesses.roots()[:, 1:, (0, 2), 2] * ground).sum((1, 2))
+        return -certainty * along / ground.norm(dim=1).sum().clamp_min(1e-6)
 
     def rivals(self, order: list[int]) -> list[int]:
         """The best of each quadrant: head to the left or right, towards or away from the camera."""
         heads = self.guesses.heading().detach()
         quadrants = [(bool(heads[row, 0] > 0), bool(heads[row, 2] > 0)) for row in order]
-        best = {}
+        best: dict[tuple[bool, bool], int] = {}
         for row, quadrant in zip(order, quadrants, strict=True):
             best.setdefault(quadrant, row)
         return list(best.values())
@@ -152,7 +156,9 @@ def _run(
     generator = torch.Generator().manual_seed(seed)
     race = StandingCamera(seen, moments, clip.name, working, config, generator, log, total)
     race.said, race.boxes = said, boxes.float()
-    starts = Views.start(facings(config.yaw_starts), torch.zeros(len(frames), 3))
+    # with proportions given, Fauna's four quadrants and two more are enough
+    count = config.yaw_starts if known is None else max(4, config.yaw_starts // 2)
+    starts = Views.start(facings(count), torch.zeros(len(frames), 3))
     race.begin(starts)
     if known is not None:
         race.given, race.done = True, total // 2

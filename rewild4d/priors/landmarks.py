@@ -104,11 +104,10 @@ def marks(keypoints: Sequence[Keypoints | None], mapping: dict[str, str]) -> Mar
                 bone, along = LANDMARKS[mapping[name]]
                 rows.append((moment, bone, along))
                 pixels.append(place)
-    moments, bones, along = (torch.tensor(column) for column in zip(*rows, strict=True)) if rows else ([], [], [])
     return Marks(
-        torch.as_tensor(moments).long(),
-        torch.as_tensor(bones).long(),
-        torch.as_tensor(along).float(),
+        torch.tensor([moment for moment, _, _ in rows], dtype=torch.long),
+        torch.tensor([bone for _, bone, _ in rows], dtype=torch.long),
+        torch.tensor([along for _, _, along in rows], dtype=torch.float32),
         torch.tensor(pixels, dtype=torch.float32).reshape(-1, 2),
     )
 

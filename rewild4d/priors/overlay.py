@@ -65,7 +65,7 @@ def save_overlay(clip: Clip, prior: Prior, beside: Path, side: int = 320) -> lis
     Returns:
         The files written: <beside>.png and <beside>.mp4.
     """
-    tiles = [_tile(clip, prior, moment, side) for moment in range(len(clip.frames))]
+    tiles: list[Any] = [_tile(clip, prior, moment, side) for moment in range(len(clip.frames))]
     shown = [tiles[i] for i in np.linspace(0, len(tiles) - 1, min(12, len(tiles))).round().astype(int)]
     shown += [np.zeros_like(tiles[0])] * (-len(shown) % 4 if len(shown) > 4 else 0)
     rows = [np.concatenate(shown[i : i + 4], axis=1) for i in range(0, len(shown), 4)]

@@ -35,6 +35,8 @@ SHIFT_SPREADS = (0.10, 0.10, 0.6)
 HEAD_FORWARD, NOSE_FORWARD, POLL_FORWARD = 0.4, 0.35, 0.1
 """How far heads reach forwards at least: the nose from the poll, in head lengths; nose and poll from the withers, in
 body lengths."""
+CARRIAGE_MOMENTS = 16
+"""Moments of a clip at which the carriage is looked at."""
 STEADY = 24
 """Frames of a clip whose motion is penalised as `Hypotheses` does; longer ones by the same periods in frames."""
 
@@ -138,7 +140,8 @@ class Views(Hypotheses):
         the head into the body and take a raised tail for a neck.
         """
         bones = quadruped(Proportions(self.shape, self.relief), unit=False).bones
-        chain = pose(self.joint_angles()[:, :, :8], bones[:, None, :8, 0], PARENTS[:8])
+        every = max(1, len(self.path) // CARRIAGE_MOMENTS)
+        chain = pose(self.joint_angles()[:, ::every, :8], bones[:, None, :8, 0], PARENTS[:8])
         ends = torch.einsum("btjac,bjkc->btjka", chain[..., :3, :3], bones[:, :8]) + chain[..., None, :3, 3]
         nose, poll, withers, tip, hips = (
             ends[:, :, bone, end] for bone, end in ((0, 1), (0, 0), (3, 1), (4, 1), (6, 0))
@@ -152,7 +155,7 @@ class Views(Hypotheses):
             (tip - hips)[..., 1],
             (tip - hips)[..., 2],
         )
-        return sum((fault.clamp_min(0) / length).square().mean(1) for fault in faults)
+        return (torch.stack(faults).clamp_min(0) / length).square().mean(2).sum(0)
 
 
 def _about_x(angle: Tensor) -> Tensor:
