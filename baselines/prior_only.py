@@ -20,6 +20,7 @@ from rewild4d.priors.motion import (
     pose_gaussians,
     quats_from_normals,
     sample_surface,
+    world_camera,
 )
 from rewild4d.transforms import transform_splats
 from rewild4d.types import Camera, Clip, Prior, Splats
@@ -52,7 +53,8 @@ class PriorOnlyReconstruction:
         )
 
     def camera(self, time: float) -> Camera | None:
-        return self.cameras.get(time)
+        """The input camera; at a time without an input frame the prior's."""
+        return self.cameras.get(time) or world_camera(self.prior, time)
 
     def canonical(self) -> Splats:
         """The Gaussians at rest, in the object frame."""

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from rewild4d.errors import UserError
 from rewild4d.files import atomic
 from rewild4d.ours.canonical import NAMES, Gaussians
-from rewild4d.ours.motion import frame_position, interpolate_similarity
+from rewild4d.ours.motion import camera_between, frame_position, interpolate_similarity
 from rewild4d.ours.symmetry import match_times
 from rewild4d.transforms import transform_splats
 from rewild4d.types import Camera, Clip, Prior, Splats
@@ -52,8 +52,8 @@ class Root:
         return transform_splats(splats, matrix.to(splats.means.device))
 
     def camera(self, time: float) -> Camera | None:
-        """The input camera of the frame nearest to a time."""
-        return self.cameras[round(self.position(time))]
+        """The input camera at a time, in the world; between frames it interpolates."""
+        return camera_between(self.cameras, self.position(time))
 
     def state(self) -> dict[str, Any]:
         """As plain tensors and numbers."""

@@ -30,6 +30,7 @@ from rewild4d.files import write_text
 from rewild4d.leaderboard.records import FILE, SCHEMA, RunRecord, Timing, make_run_id, read_record, write_record
 from rewild4d.machine import code_version, machine, peak_memory_mib
 from rewild4d.priors.choose import PriorChoice, make_prior
+from rewild4d.priors.footage import with_cameras
 from rewild4d.protocol import Protocol, evaluate
 from rewild4d.rasterizer import pick_rasterizer, set_default
 from rewild4d.registry import load_method
@@ -170,7 +171,8 @@ def _run_case(plan: Plan, name: str) -> list[RunRecord]:
     if all(job.finished() for job in jobs):
         return [read_record(job.folder / FILE) for job in jobs]
     try:
-        case = Case(clip, _prior(plan, clip, truth), truth)
+        prior = _prior(plan, clip, truth)
+        case = Case(with_cameras(clip, prior), prior, truth)
     except UserError as error:
         return [job.fail(str(error)) for job in jobs]
     seen = coverage(clip, truth)

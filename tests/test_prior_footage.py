@@ -111,7 +111,9 @@ def test_the_object_frame_is_the_world_and_cameras_have_no_roll(walk, fitted) ->
         assert float((rotation @ rotation.T - torch.eye(3)).abs().max()) < 1e-9
         assert abs(float(rotation[0, 1])) < 1e-5
     posed = with_cameras(walk[0], fitted)
-    assert posed.frames[3].camera is fitted.cameras[3]
+    placed = posed.frames[3].camera
+    assert placed is not None
+    torch.testing.assert_close(placed.world_to_camera, fitted.cameras[3].world_to_camera)
 
 
 def test_a_camera_between_two_frames_lies_between_theirs(fitted: Prior) -> None:

@@ -1,9 +1,13 @@
 """The animal's root motion and the input cameras between the frames of a clip."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from rewild4d.priors.motion import blend_similarities
+from rewild4d.types import Camera
 
 
 def frame_position(times: Tensor, time: float) -> float:
@@ -37,3 +41,26 @@ def interpolate_similarity(matrices: Tensor, position: float) -> Tensor:
     if part == 0:
         return matrices[low]
     return blend_similarities(matrices[low], matrices[low + 1], part)
+
+
+def camera_between(cameras: Sequence[Camera | None], position: float) -> Camera | None:
+    """The camera between those of the frames: exact at a frame, None where a neighbour is unknown.
+
+    Args:
+        cameras: of the frames.
+        position: from `frame_position`.
+    """
+    low = int(position)
+    part = position - low
+    first = cameras[low]
+    if part == 0 or first is None:
+        return first
+    second = cameras[low + 1]
+    if second is None:
+        return None
+    matrices = torch.stack((first.world_to_camera, second.world_to_camera))
+    return replace(
+        first,
+        world_to_camera=interpolate_similarity(matrices, part),
+        intrinsics=torch.lerp(first.intrinsics, second.intrinsics, part),
+    )

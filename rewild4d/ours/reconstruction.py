@@ -13,7 +13,7 @@ from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.config import Config
 from rewild4d.ours.geometry_losses import relative_turn
 from rewild4d.ours.model import Model
-from rewild4d.ours.motion import frame_position, interpolate_similarity
+from rewild4d.ours.motion import camera_between, frame_position, interpolate_similarity
 from rewild4d.ours.pose import Pose
 from rewild4d.ours.schedule import ramp
 from rewild4d.ours.skinning import SkinningField
@@ -56,8 +56,8 @@ class OursReconstruction:
         return replace(world, colors=own.splat_colors(world.quats))
 
     def camera(self, time: float) -> Camera | None:
-        """The input camera of the frame nearest to a time, in the world frame."""
-        return self.cameras[round(frame_position(self.times, time))]
+        """The input camera at a time, in the world frame; between frames it interpolates."""
+        return camera_between(self.cameras, frame_position(self.times, time))
 
     def canonical(self) -> Splats:
         """The Gaussians at rest, in the object frame; `weights` [n, J] belong to the same rows."""

@@ -10,8 +10,9 @@ from rewild4d.errors import UserError
 from rewild4d.files import digest
 from rewild4d.machine import code_version
 from rewild4d.priors.coarse import coarse_prior
-from rewild4d.priors.config import PriorConfig
+from rewild4d.priors.config import FOOTAGE, PriorConfig
 from rewild4d.priors.fit import fit_template
+from rewild4d.priors.footage import fit_footage
 from rewild4d.priors.io import load_prior, save_prior
 from rewild4d.types import Clip, Prior, Truth
 
@@ -24,8 +25,8 @@ class PriorChoice:
     """What `--prior` said.
 
     Attributes:
-        name: "template" (fitted to the clip alone), "coarse" or "coarse:<noise>" (from the truth, plus noise; for
-            studies of prior quality only) or the path of an npz file.
+        name: "template" (fitted to the clip alone, with its cameras where it has any), "coarse" or "coarse:<noise>"
+            (from the truth, plus noise; for studies of prior quality only) or the path of an npz file.
         config: settings of the template fit.
     """
 
@@ -60,7 +61,9 @@ def make_prior(choice: PriorChoice, clip: Clip, truth: Truth, path: Path, log: L
     if choice.name != "template" and choice.noise is None:
         return load_prior(Path(choice.name))
     if not path.is_file():
-        if choice.noise is None:
+        if choice.noise is None and any(frame.camera is None for frame in clip.frames):
+            prior = fit_footage(clip, config=FOOTAGE, seed=PRIOR_SEED, log=log)
+        elif choice.noise is None:
             prior = fit_template(clip, config=choice.config, seed=PRIOR_SEED, log=log)
         else:
             prior = coarse_prior(

@@ -17,6 +17,7 @@ from rewild4d.priors.config import PriorConfig, Stage
 from rewild4d.priors.io import seal
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.landmarks import Marks
+from rewild4d.priors.motion import world_camera
 from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.race import Race
 from rewild4d.priors.search import facings
@@ -277,9 +278,10 @@ def _cropped(camera: Camera, left: float, top: float, side: float, size: int) ->
 
 
 def with_cameras(clip: Clip, prior: Prior) -> Clip:
-    """The clip seen by the prior's cameras, since its own are unknown; frames match by time."""
+    """The clip with the prior's cameras, in the prior's world, where its own are unknown; frames match by time."""
+    if all(frame.camera is not None for frame in clip.frames):
+        return clip
     frames = []
     for frame in clip.frames:
-        row = int((prior.times - frame.time).abs().argmin())
-        frames.append(replace(frame, camera=prior.cameras[row]))
+        frames.append(frame if frame.camera is not None else replace(frame, camera=world_camera(prior, frame.time)))
     return replace(clip, frames=tuple(frames))

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
 from rewild4d.transforms import (
+    camera_in_object,
     matrix_to_quat,
     mirror_points,
     quat_to_matrix,
@@ -89,6 +90,11 @@ def camera_at(prior: Prior, time: float) -> Camera:
     moved = blend_similarities(first.world_to_camera, second.world_to_camera, part)
     intrinsics = (1 - part) * first.intrinsics + part * second.intrinsics
     return replace(second, world_to_camera=moved, intrinsics=intrinsics)
+
+
+def world_camera(prior: Prior, time: float) -> Camera:
+    """`camera_at` in the world where the prior's animal stands."""
+    return camera_in_object(camera_at(prior, time), torch.linalg.inv(pose_at(prior, time)[0]))
 
 
 def blend_similarities(a: Tensor, b: Tensor, part: float) -> Tensor:
