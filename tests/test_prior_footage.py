@@ -19,8 +19,8 @@ from rewild4d.priors.overlay import save_overlay
 from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.silhouettes import outline
 from rewild4d.priors.template import MIRROR, PARENTS, quadruped
-from rewild4d.priors.views import DISTANCE, WINDOW, Views, fauna_camera, windows
-from rewild4d.transforms import look_at, skin_points
+from rewild4d.priors.views import DISTANCE, ELEVATION, ELEVATION_SPREAD, WINDOW, Views, fauna_camera, windows
+from rewild4d.transforms import axis_angle_to_matrix, look_at, skin_points
 from rewild4d.types import Camera, Clip, Crop, Frame, Keypoints, Prior
 
 AZIMUTH = 115.0
@@ -194,6 +194,23 @@ def test_marks_project_like_the_prior_that_a_guess_becomes(fitted: Prior) -> Non
     wanted = torch.stack((seen[:, 0], -seen[:, 1]), -1) / (DISTANCE - seen[:, 2:])
     assert torch.allclose(guess.projected(found)[0], wanted, atol=1e-5)
     assert landmark_pixels(fitted, found).shape == (3, 2)
+
+
+def test_a_guess_reflected_in_depth_has_the_same_outline_from_afar() -> None:
+    generator = torch.Generator().manual_seed(0)
+    guess = Views.start(axis_angle_to_matrix(torch.tensor(((0.0, 0.7, 0.0),))), torch.zeros(8, 3))
+    guess.turn = torch.randn(guess.turn.shape, generator=generator) * torch.tensor((1.0, 0.0))
+    guess.turn[..., 0, 1] = -ELEVATION / ELEVATION_SPREAD  # eye level
+    guess.angles = 0.5 * torch.randn(guess.angles.shape, generator=generator)
+    both = guess.with_depth_mirrored()
+    assert torch.allclose(both.heading()[0] * torch.tensor((1.0, 1.0, -1.0)), both.heading()[1], atol=1e-5)
+    bones = torch.arange(20)
+    for moment in (0, 5):
+        here = torch.full((20,), moment)
+        plain = both.projected(Marks(here, bones, torch.ones(20), torch.zeros(20, 2)))[0]
+        swapped = both.projected(Marks(here, torch.tensor(MIRROR), torch.ones(20), torch.zeros(20, 2)))[1]
+        # the same but for perspective: a depth of one unit in ten
+        assert torch.allclose(plain, swapped, atol=0.06) and float((plain - swapped).abs().mean()) < 0.02
 
 
 def test_a_folded_head_and_a_raised_tail_cost() -> None:

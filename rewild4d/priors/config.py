@@ -83,7 +83,7 @@ FOOTAGE = PriorConfig(
     stages=(
         Stage(size=32, steps=50, blur=(0.08, 0.04), keep=6, joints=False, frames=12),
         Stage(size=48, steps=80, blur=(0.05, 0.03), keep=4, frames=16),
-        Stage(size=64, steps=150, blur=(0.04, 0.015), keep=2, frames=16),
+        Stage(size=64, steps=150, blur=(0.04, 0.015), keep=1, frames=16),
         Stage(size=80, steps=250, blur=(0.02, 0.006), keep=1, rasterized=True, relief=True),
     ),
     shape_weight=0.035,

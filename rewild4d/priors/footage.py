@@ -101,6 +101,12 @@ class StandingCamera(Race):
         along = (self.guesses.roots()[:, 1:, (0, 2), 2] * ground).sum((1, 2))
         return -certainty * along / ground.norm(dim=1).sum().clamp_min(1e-6)
 
+    def run(self, stage: Stage) -> None:
+        """One round; before the fine ones every guess gets its reflection in depth as a rival."""
+        if stage.rasterized:
+            self.guesses = self.guesses.with_depth_mirrored()
+        super().run(stage)
+
     def rivals(self, order: list[int]) -> list[int]:
         """The best of each quadrant: head to the left or right, towards or away from the camera."""
         heads = self.guesses.heading().detach()

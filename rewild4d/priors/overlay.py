@@ -19,7 +19,7 @@ BODY_COLOR, LEFT_COLOR, RIGHT_COLOR = (255, 255, 255), (255, 170, 0), (0, 170, 2
 HEAD_COLOR = (255, 0, 80)
 
 
-def overlay(clip: Clip, prior: Prior, moments: Sequence[int] | None = None) -> Tensor:
+def overlay(clip: Clip, prior: Prior, moments: Sequence[int] | None = None, photo: float = 0.0) -> Tensor:
     """Masks in green, the template in magenta (grey where they agree), bones on top.
 
     Left legs are drawn orange, right legs blue, the spine white and the head red, so that a turned template shows.
@@ -28,6 +28,7 @@ def overlay(clip: Clip, prior: Prior, moments: Sequence[int] | None = None) -> T
         clip: the frames.
         prior: a prior with one pose per frame.
         moments: which frames; None is all.
+        photo: share of the animal's picture in the colours under the bones, from 0 to 1.
 
     Returns:
         float32 in [0, 1], [k, 3, h, w].
@@ -37,7 +38,8 @@ def overlay(clip: Clip, prior: Prior, moments: Sequence[int] | None = None) -> T
         frame, camera, transforms = clip.frames[moment], prior.cameras[moment], prior.transforms[moment]
         drawn = outline(skin_points(prior.vertices, prior.weights, transforms), prior.faces, camera)
         mask = (frame.mask[0].numpy() * 255).astype(np.uint8)
-        picture = np.ascontiguousarray(np.stack((drawn, mask, drawn), -1) // 2)
+        shades = np.stack((drawn, mask, drawn), -1) * (0.5 * (1 - photo))
+        picture = np.ascontiguousarray(shades + photo * 255 * frame.rgb.permute(1, 2, 0).numpy()).astype(np.uint8)
         posed = torch.einsum("jab,jkb->jka", transforms[:, :3, :3], prior.bones) + transforms[:, None, :3, 3]
         ends = camera.project(posed.double())[0].round().int().tolist()
         for bone, (start, end) in enumerate(ends):
@@ -81,13 +83,12 @@ def save_overlay(clip: Clip, prior: Prior, beside: Path, side: int = 320) -> lis
 def _tile(clip: Clip, prior: Prior, moment: int, side: int) -> np.ndarray:
     """The square around the animal: its picture, dimmed, under the overlay, uint8 [side, side, 3]."""
     frame = clip.frames[moment]
-    drawn = overlay(clip, prior, [moment])[0]
-    both = torch.maximum(drawn, 0.4 * frame.rgb)
+    drawn = overlay(clip, prior, [moment], photo=0.5)[0]
     rows, columns = torch.nonzero(torch.maximum(frame.mask[0], drawn.amax(0)) > 0.2, as_tuple=True)
     if not len(rows):
         return np.zeros((side, side, 3), np.uint8)
     reach = 0.55 * float(max(rows.max() - rows.min(), columns.max() - columns.min()) + 1)
     x, y = float(columns.min() + columns.max() + 1) / 2, float(rows.min() + rows.max() + 1) / 2
     matrix = np.array(((2 * reach / side, 0, x - reach), (0, 2 * reach / side, y - reach)))
-    image = (both.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
+    image = (drawn.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
     return cv2.warpAffine(image, matrix, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)

@@ -17,7 +17,7 @@ from rewild4d.priors.hypotheses import ANGLE_SPREADS, Hypotheses, cosine_series
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.landmarks import Marks
 from rewild4d.priors.proportions import PROPORTIONS, SECTIONS, Proportions
-from rewild4d.priors.template import PARENTS, quadruped
+from rewild4d.priors.template import MIRROR, PARENTS, quadruped
 from rewild4d.transforms import rigid
 from rewild4d.types import Camera, Frame
 
@@ -94,6 +94,25 @@ class Views(Hypotheses):
     def select(self, rows: Tensor) -> "Views":
         rest = {f.name: getattr(self, f.name).detach()[rows] for f in fields(self) if f.name != "path"}
         return Views(path=self.path, **rest)
+
+    def with_depth_mirrored(self) -> "Views":
+        """These guesses and their reflections in the image plane: animals with left and right exchanged that head away
+        instead of towards the camera. From afar and at eye level the two have the same outline, [2 B].
+        """
+        # the reflection of a turn by a about y is one by pi - a, shared by the facing and the series
+        half_turn = torch.diag(torch.tensor((-1.0, 1.0, -1.0)))
+        swapped = self.angles[..., list(MIRROR), :] * torch.tensor((1.0, -1.0, -1.0))
+        parts = {
+            "facing": half_turn @ self.facing.transpose(-1, -2),
+            "turn": self.turn * torch.tensor((-1.0, 1.0)),
+            "angles": swapped,
+        }
+        both = {
+            f.name: torch.cat((getattr(self, f.name), parts.get(f.name, getattr(self, f.name)))).detach()
+            for f in fields(self)
+            if f.name != "path"
+        }
+        return Views(path=self.path, **both)
 
     def roots(self) -> Tensor:
         """Rigid root motion without the scale: azimuth, then the camera's elevation, [B, T, 4, 4]."""
