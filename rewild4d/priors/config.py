@@ -58,7 +58,7 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     root_weight: float = 0.2
     view_weight: float = 0.01
     gait_weight: float = 0.015
-    travel_weight: float = 0.05
+    travel_weight: float = 0.08
     carriage_weight: float = 1.0
     keypoint_weight: float = 0.1
 

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
+from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from rewild4d.contracts import Log
@@ -39,6 +40,11 @@ class Evidence:
 
     marks: Marks | None = None
     travel: Tensor | None = None
+
+    def __str__(self) -> str:
+        """What was known, for a sentence: each part ends with a comma and a space."""
+        points = "" if self.marks is None else f"with {len(self.marks)} keypoints, "
+        return points + ("" if self.travel is None else "with the animal's travel, ")
 
     def mirrored(self, width: int) -> "Evidence":
         """The same for the horizontally flipped frames."""
@@ -94,7 +100,9 @@ class StandingCamera(Race):
         """Whether heads point against (1) or along (-1) the way the animal goes over the ground, [B]."""
         if self.said.travel is None:
             return 0.0
-        steps = self.said.travel / self.boxes[1:, 2:]
+        walked = self.said.travel / self.boxes[1:, 2:]
+        # a step is noise: legs move the mask's centre up and down, and what matters is where the way leads
+        steps = torch.from_numpy(gaussian_filter1d(walked.numpy(), max(1.0, len(walked) / 12), axis=0, mode="nearest"))
         # who walks up the image walks away, on a ground that is seen from above
         ground = torch.stack((steps[:, 0], steps[:, 1] / ASCENT), dim=1)
         certainty = torch.tanh(2 * ground.sum(0).norm())
@@ -196,7 +204,7 @@ def _prior(
         Prior(
             name=name,
             provenance=f"Template fitted to the {count} masks of the clip and of its mirror image, cameras unknown, "
-            f"seed {seed}.",
+            f"{race.said}seed {seed}.",
             vertices=template.vertices,
             faces=template.faces,
             weights=template.weights,
