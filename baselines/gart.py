@@ -20,6 +20,7 @@ a cap, the number of Gaussians is capped, every Gaussian has half an input pixel
 length of the original is the template's diagonal. The schedule is given in fractions of the original's 10k steps.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -103,6 +104,14 @@ class GartTraining(SplatTraining):
 
     def changed(self) -> None:
         self.near = None
+
+    def state(self) -> dict[str, Any]:
+        return super().state() | {"near": self.near}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        super().restore(state)
+        # Looked up anew they would be those of today's places, not of the last change's.
+        self.near = state["near"]
 
     def step(self, index: int) -> dict[str, float]:
         done = index - self.config.iterations

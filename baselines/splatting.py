@@ -233,7 +233,6 @@ class SplatTraining(ABC):
         parts = [part.to(device).clone() for part in state["density"]]
         self.density.gradient, self.density.seen, self.density.radius = parts
         self.generator.set_state(state["generator"])
-        self.changed()
 
 
 def run_steps(training: SplatTraining, identity: str, log: Log, workdir: Path | None) -> None:

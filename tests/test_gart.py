@@ -163,6 +163,20 @@ def test_poses_and_skinning_wait_for_their_turn(case: Case) -> None:
     assert made.rate("skinning", 1.0) == pytest.approx(1e-5)
 
 
+def test_a_resumed_fit_keeps_its_neighbours(case: Case) -> None:
+    """They are looked up when the set of Gaussians changes; places move on, and a resumed fit must not look again."""
+    config = msgspec.convert(SETTINGS | {"density": {"end": 0.0}}, GartConfig)
+    made = training(case, config)
+    made.step(0)
+    before, state = made.near, made.state()
+    with torch.no_grad():
+        made.gaussians.means.copy_(made.gaussians.means.flip(0).roll(1, 1))
+    other = training(case, config)
+    other.restore(state | {"model": made.model.state_dict()})
+    other.step(1)
+    assert before is not None and other.near is not None and torch.equal(other.near, before)
+
+
 def test_refinement_moves_one_frame_back(case: Case) -> None:
     """From an animal moved away, SGD on the frame's own image brings it nearer; the other frames stay."""
     settings = SETTINGS | {"iterations": 0, "refine": {"steps": 40, "rate": 0.05}}
