@@ -3,6 +3,8 @@
 import json
 import math
 import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -340,10 +342,13 @@ def test_a_first_image_tells_time_and_compiled_kernels(
 
 
 def test_peak_memory_is_above_what_was_held() -> None:
-    def work() -> None:
-        torch.ones(2**24)  # 64 MiB
-
-    found = probes._peak(work)
+    # In a process of its own, as `bench` measures it: from this one the system may take pages back meanwhile.
+    program = """
+import json, torch
+from rewild4d.benchmarks import probes
+print(json.dumps(probes._peak(lambda: torch.ones(2**24))))  # 64 MiB
+"""
+    found = json.loads(subprocess.check_output([sys.executable, "-c", program], text=True))
     if not found:
         pytest.skip("this system does not tell a process its peak")
     assert 60 <= found["peak"] - found["before"] <= 90
