@@ -68,9 +68,10 @@ def html(table: Table) -> str:
     for row in table.rows:
         stubs = [f"<td>{_text(stub)}</td>" for stub in row.stubs]
         number = table.number(*row.notes)
-        stubs[-1] = f"<td>{_text(row.stubs[-1])}{f'<sup>{number}</sup>' if number else ''}</td>"
+        flags = "".join(f' <small class="flag">{_text(flag.partition(":")[0])}</small>' for flag in row.flags)
+        stubs[-1] = f"<td>{_text(row.stubs[-1])}{f'<sup>{number}</sup>' if number else ''}{flags}</td>"
         cells = [_html_cell(cell, table) for cell in row.cells]
-        lines.append(f'<tr class="{row.kind}">{"".join(stubs)}{"".join(cells)}</tr>')
+        lines.append(f'<tr class="{row.kind}">{"".join(stubs + cells)}</tr>')
     lines += ["</tbody>", "</table>"]
     notes = [f"<sup>{number}</sup> {_text(note)}" for number, note in enumerate(table.notes, 1)]
     return "\n".join([*lines, *(f'<p class="note">{line}</p>' for line in [*notes, *map(_text, table.remarks)])])

@@ -55,12 +55,14 @@ class Row:
         cells: one for each column.
         kind: rules are drawn between kinds.
         notes: sentences on the whole row.
+        flags: those of the notes that keep the row out of the ranking, to be seen at once.
     """
 
     stubs: tuple[str, ...]
     cells: tuple[Cell, ...]
     kind: Kind = "method"
     notes: tuple[str, ...] = ()
+    flags: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

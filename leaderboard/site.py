@@ -4,6 +4,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -23,21 +24,35 @@ TITLE = "Reconstructing 4D animals from one video"
 MARKER = ".rewild4d-leaderboard"
 """Lies in every folder that was built, so that only such a folder is ever replaced."""
 CAPTIONS = {
-    "comparison.png": "Input, render, and a view that was held out: truth and render. One row a moment.",
-    "canonical.png": "Canonical Gaussians, coloured by the parts that move them.",
-    "input.mp4": "Input beside render, from the input view.",
-    "orbit.mp4": "One turn around the moving animal.",
+    "comparison": "Input, render, and a view that was held out: truth and render. One row a moment.",
+    "canonical": "Canonical Gaussians, coloured by the parts that move them.",
+    "input": "Input beside render, from the input view.",
+    "orbit": "One turn around the moving animal.",
 }
 Found = tuple[Path, RunRecord]
 
 
-def build_site(found: Sequence[Found], out: Path, tables: Sequence[Table] = ()) -> Path:
+@dataclass(frozen=True)
+class Part:
+    """Records whose cases are averaged with each other: one folder of runs.
+
+    Attributes:
+        title: heading.
+        found: records with the folders that hold them and their pictures.
+        tables: named ones, shown above those of the protocols.
+    """
+
+    title: str
+    found: Sequence[Found]
+    tables: Sequence[Table] = ()
+
+
+def build_site(parts: Sequence[Part], out: Path) -> Path:
     """Write the page of all records; an older one in the same place is replaced once the new one is complete.
 
     Args:
-        found: records with the folders that hold them and their pictures.
+        parts: of the first page, each with tables of its own.
         out: a folder that is not there, is empty, or was built before.
-        tables: named ones, to be shown below those of the protocols.
 
     Returns:
         The path of its first page.
@@ -50,7 +65,7 @@ def build_site(found: Sequence[Found], out: Path, tables: Sequence[Table] = ()) 
     building = out.with_name(f".{out.name}.{os.getpid()}")
     try:
         building.mkdir(parents=True)
-        _write(_unique(found), building, tables)
+        _write(parts, building)
         if out.exists():
             shutil.rmtree(out)
         building.rename(out)
@@ -61,12 +76,13 @@ def build_site(found: Sequence[Found], out: Path, tables: Sequence[Table] = ()) 
     return out / "index.html"
 
 
-def _write(found: Sequence[Found], folder: Path, tables: Sequence[Table]) -> None:
+def _write(parts: Sequence[Part], folder: Path) -> None:
     (folder / MARKER).touch()
     pages = jinja2.Environment(
         loader=jinja2.FunctionLoader(_template), autoescape=True, undefined=jinja2.StrictUndefined
     )
     assets = {"style": Markup(_template("style.css")), "script": Markup(_template("script.js"))}
+    found = _unique([pair for part in parts for pair in part.found])
     for source, record in found:
         page = folder / _place(record)
         page.mkdir(parents=True)
@@ -77,12 +93,21 @@ def _write(found: Sequence[Found], folder: Path, tables: Sequence[Table]) -> Non
             pictures=pictures, provenance=_provenance(record), **assets,
         )  # fmt: skip
         (page / "index.html").write_text(text, encoding="utf-8")
-    named = [{"name": t.name, "title": t.title, "html": Markup(html(t))} for t in tables]
+    shown = [_part(part, f"{index}-" if len(parts) > 1 else "") for index, part in enumerate(parts, 1)]
     text = pages.get_template("index.html").render(
-        title=TITLE, counts=_counts(found), sections=_sections([record for _, record in found]), tables=named,
-        arrows=ARROWS, **assets,
-    )  # fmt: skip
+        title=TITLE, counts=_counts(found), parts=shown, arrows=ARROWS, **assets
+    )
     (folder / "index.html").write_text(text, encoding="utf-8")
+
+
+def _part(part: Part, key: str) -> dict[str, Any]:
+    """What the first page shows of a folder of runs; ``key`` tells its tables from those of other parts."""
+    records = [record for _, record in _unique(part.found)]
+    tables = [
+        {"name": key + table.name, "title": table.title, "html": Markup(html(replace(table, name=key + table.name)))}
+        for table in part.tables
+    ]
+    return {"title": part.title, "counts": _counts(part.found), "tables": tables, "sections": _sections(records, key)}
 
 
 def _template(name: str) -> str:
@@ -102,20 +127,20 @@ def _place(record: RunRecord) -> Path:
 
 
 def _counts(found: Sequence[Found]) -> str:
-    records = [record for _, record in found]
+    records = [record for _, record in _unique(found)]
     cases, methods = len({r.case for r in records}), len({r.method for r in records})
     return f"{len(records)} runs of {methods} methods on {cases} cases."
 
 
-def _sections(records: Sequence[RunRecord]) -> list[dict[str, Any]]:
+def _sections(records: Sequence[RunRecord], key: str) -> list[dict[str, Any]]:
     """What the first page shows of each protocol."""
     sections = []
     for group, table in zip(by_protocol(records), standings(records), strict=True):
         labels = {record.run_id: variant.label for variant in variants(group) for record in variant.records}
         protocol = group[0].protocol
         sections.append({
-            "name": table.name, "title": table.title, "description": protocol.get("description", ""),
-            "standings": Markup(html(table)), "columns": columns_of(group),
+            "name": key + table.name, "title": table.title, "description": protocol.get("description", ""),
+            "standings": Markup(html(replace(table, name=key + table.name))), "columns": columns_of(group),
             "runs": [_run_row(record, labels[record.run_id]) for record in group],
         })  # fmt: skip
     return sections
@@ -124,7 +149,7 @@ def _sections(records: Sequence[RunRecord]) -> list[dict[str, Any]]:
 def _run_row(record: RunRecord, label: str) -> dict[str, Any]:
     return {
         "id": record.run_id, "href": f"{_place(record).as_posix()}/index.html", "case": record.case, "label": label,
-        "preset": record.preset, "seed": record.seed, "status": record.status, "seconds": record.timing.fit_seconds,
+        "flags": [mark.partition(":")[0] for mark in record.marks], "preset": record.preset, "seed": record.seed, "status": record.status, "seconds": record.timing.fit_seconds,
         "cells": [cell([record], [record.case], name) for name in record.protocol["scores"]],
     }  # fmt: skip
 
@@ -155,11 +180,12 @@ def _curves(record: RunRecord) -> list[Markup]:
 def _copy_pictures(source: Path, record: RunRecord, page: Path) -> Iterator[dict[str, Any]]:
     """Pictures that lie beside the record, held-out comparison first."""
     order = list(CAPTIONS)
-    names = sorted({Path(name).name for name in record.pictures}, key=lambda n: order.index(n) if n in order else 9)
+    stems = {Path(name).name: Path(name).stem for name in record.pictures}
+    names = sorted(stems, key=lambda name: order.index(stems[name]) if stems[name] in order else len(order))
     for name in names:
         if (source / name).is_file():
             shutil.copyfile(source / name, page / name)
-            yield {"name": name, "caption": CAPTIONS.get(name, name), "video": name.endswith(".mp4")}
+            yield {"name": name, "caption": CAPTIONS.get(stems[name], name), "video": name.endswith(".mp4")}
 
 
 def _provenance(record: RunRecord) -> list[tuple[str, list[tuple[str, str]]]]:

@@ -120,9 +120,7 @@ def named_table(frame: Frame, entrants: Sequence[Entrant], reported: Reported | 
     everything = [record for entrant in entrants for under in entrant.records for record in under]
     columns = _columns(frame, everything)
     rows = [_named_row(entrant, entrants, columns, frame) for entrant in entrants]
-    rows = _ranked(rows, entrants, columns, frame)
-    order = {"method": 0, "unranked": 1, "floor": 2}
-    rows.sort(key=lambda row: order[row.kind])
+    rows = _apart(_ranked(rows, columns))
     remarks = list(frame.remarks)
     if reported is not None:
         rows += _reported_rows(reported, columns)
@@ -132,6 +130,9 @@ def named_table(frame: Frame, entrants: Sequence[Entrant], reported: Reported | 
 
 def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) -> Table:
     """Every row less a reference row: mean of the cases' differences, and its 95 % bootstrap interval in brackets.
+
+    A row that is better than the reference, by an interval without 0, is bold; one that is worse by such an interval is
+    not marked. Rows that had what the others had not are never marked.
 
     Raises:
         UserError: no row of that name.
@@ -145,20 +146,34 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
     for entrant in entrants:
         if entrant is reference:
             continue
-        cells = []
-        for index in range(len(frame.conditions)):
-            pair = entrant.records[index], reference.records[index]
-            cells += [_difference(*pair, name) for name in frame.scores]
-        rows.append(Row((entrant.label,), tuple(cells), _kind(entrant), (*entrant.notes,)))
+        pairs = [
+            (entrant.records[index], reference.records[index], name)
+            for index in range(len(frame.conditions))
+            for name in frame.scores
+        ]
+        cells = [_difference(*pair) for pair in pairs]
+        flags = marks([record for under in entrant.records for record in under])
+        if not flags:
+            cells = [_leading(cell, column.better) for cell, column in zip(cells, columns, strict=True)]
+        rows.append(Row((entrant.label,), tuple(cells), _kind(entrant), (*entrant.notes, *flags), flags))
     return Table(
         f"{frame.name}-difference",
         f"{frame.title}: difference to {reference.label}",
-        "Mean of the cases' differences; in brackets the 95 % interval of a bootstrap over cases and seeds",
+        f"The row less {reference.label}, so that where ↑ stands a minus is behind it, and where ↓ stands a plus is. Mean "
+        "of the cases' differences; in brackets the 95 % interval of a bootstrap over cases and seeds. Bold: "
+        f"ahead of {reference.label}, by an interval without 0",
         ("method",),
         columns,
-        tuple(rows),
+        tuple(_apart(rows)),
         frame.remarks,
     )
+
+
+def _leading(found: Cell, better: str) -> Cell:
+    """The difference, marked where its whole interval is on the better side of 0."""
+    low, high = found.interval or (0.0, 0.0)
+    leads = low > 0 if better == "higher" else high < 0
+    return replace(found, mark="best") if leads else found
 
 
 def columns_of(records: Sequence[RunRecord]) -> tuple[Column, ...]:
@@ -208,7 +223,8 @@ def _timed_row(title: str, variant: Variant, cases: list[str], scores: Sequence[
     seeds = "" if len(cases) > 1 else str(len(good)) if len(good) == len(runs) else f"{len(good)} of {len(runs)}"
     seconds = f"{statistics.fmean(run.timing.fit_seconds for run in good):.0f}" if whole else "-"
     cells = (*(cell(runs, cases, name) for name in scores), Cell(seeds), Cell(seconds))
-    return Row((title, variant.label), cells, "floor" if variant.is_floor else "method", variant.marks)
+    kind = "floor" if variant.is_floor else "method"
+    return Row((title, variant.label), cells, kind, variant.marks, variant.marks)
 
 
 def _named_row(entrant: Entrant, entrants: Sequence[Entrant], columns: Sequence[Column], frame: Frame) -> Row:
@@ -221,7 +237,8 @@ def _named_row(entrant: Entrant, entrants: Sequence[Entrant], columns: Sequence[
             else:
                 cells.append(cell(entrant.records[index], cases, name))
     everything = [record for under in entrant.records for record in under]
-    return Row((entrant.label,), tuple(cells), _kind(entrant), (*entrant.notes, *marks(everything)))
+    flags = marks(everything)
+    return Row((entrant.label,), tuple(cells), _kind(entrant), (*entrant.notes, *flags), flags)
 
 
 def _kind(entrant: Entrant) -> str:
@@ -231,7 +248,13 @@ def _kind(entrant: Entrant) -> str:
     return "floor" if records and is_floor(records[0]) else "method"
 
 
-def _ranked(rows: list[Row], entrants: Sequence[Entrant], columns: Sequence[Column], frame: Frame) -> list[Row]:
+def _apart(rows: list[Row]) -> list[Row]:
+    """Methods, then those that are not ranked, then floors."""
+    order = {"method": 0, "unranked": 1, "floor": 2}
+    return sorted(rows, key=lambda row: order[row.kind])
+
+
+def _ranked(rows: list[Row], columns: Sequence[Column]) -> list[Row]:
     """The same rows with the best and the second of each column marked; floors compete too."""
     competing = [index for index, row in enumerate(rows) if row.kind != "unranked"]
     for place, column in enumerate(columns):

@@ -3,6 +3,7 @@ function key(cell, numeric) {
   if (!numeric) return cell.textContent.trim();
   return cell.dataset.value === undefined ? null : Number(cell.dataset.value);
 }
+const KINDS = ["method", "unranked", "floor", "reported"];  // stay apart, whatever is sorted by
 function sort(head) {
   const table = head.closest("table"), body = table.tBodies[0];
   const column = [...head.parentNode.children].indexOf(head);
@@ -13,7 +14,9 @@ function sort(head) {
   head.setAttribute("aria-sort", order);
   const sign = order === "ascending" ? 1 : -1;
   const rows = [...body.rows].map(row => [key(row.cells[column], head.dataset.better), row]);
-  rows.sort(([a], [b]) => {
+  rows.sort(([a, one], [b, other]) => {
+    const apart = KINDS.indexOf(one.className) - KINDS.indexOf(other.className);  // -1, and so alike, in a table of runs
+    if (apart) return apart;
     if (a === null || b === null) return (a === null) - (b === null);  // what has no figure comes last either way
     return sign * (typeof a === "number" ? a - b : a.localeCompare(b, undefined, {numeric: true}));
   });

@@ -1,27 +1,34 @@
-"""`leaderboard build`: the records of a folder as a static page."""
+"""`leaderboard`: records of a folder as data for a repository, and as a static page."""
 
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 from rewild4d import planning
+from rewild4d.commands.shared import require_writable
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError, unknown_name
+from rewild4d.leaderboard.collect import collect, title_of
 from rewild4d.leaderboard.layout import Table
 from rewild4d.leaderboard.records import RunRecord, find_records
-from rewild4d.leaderboard.site import build_site
+from rewild4d.leaderboard.site import Part, build_site
 from rewild4d.leaderboard.specs import load_specs
 from rewild4d.leaderboard.tables import named_table
 
-DESCRIPTION = """Make a static page from records alone: a sortable table per protocol, the named tables that have
-records, and a page per run with its settings, provenance, curves over time and pictures. It opens from the disk."""
+BUILD = """Make a static page from records alone: a sortable table per protocol, the named tables that have records, and a
+page per run with its settings, provenance, curves over time and pictures. Every folder of runs is a part of its own, and
+its cases are averaged with no others. It opens from the disk."""
+COLLECT = """Gather from folders of runs what a repository should keep and `leaderboard build` and `table` need: the latest
+record of every run, without absolute paths, and for the first seed of every row a small comparison picture and orbit."""
 
 
 @dataclass(frozen=True)
-class Options:
+class BuildOptions:
     """Flags of `leaderboard build`.
 
     Attributes:
-        runs: folders of runs (what `run --out` named), pictures beside the records.
+        runs: folders of runs (what `run --out` or `leaderboard collect --out` named), pictures beside the records.
         out: the page's folder: new, empty, or an earlier page, which is replaced.
         preset: of the runs in the named tables; each table's own where it is left out.
     """
@@ -31,18 +38,64 @@ class Options:
     preset: str = ""
 
 
+@dataclass(frozen=True)
+class CollectOptions:
+    """Flags of `leaderboard collect`.
+
+    Attributes:
+        out: the folder: new, empty, or an earlier collection, which is replaced.
+        runs: folders of runs (what `run --out` named).
+        title: heading of this part of the page; the name of the folder where it is left out.
+        pictures: of which data: open (a licence that lets them be passed on), all or none.
+        limit_mb: most that all files may take.
+    """
+
+    out: Path
+    runs: tuple[Path, ...] = (Path("runs"),)
+    title: str = ""
+    pictures: Literal["open", "all", "none"] = "open"
+    limit_mb: float = 15.0
+
+
 def main(arguments: list[str]) -> int:
     if arguments[:1] in (["-h"], ["--help"]) or not arguments:
         print("usage: rewild4d-bench leaderboard build --runs DIR --out DIR      (leaderboard build --help tells more)")
+        print("       rewild4d-bench leaderboard collect --runs DIR --out DIR    (leaderboard collect --help tells more)")
         return 0 if arguments else 2
-    if arguments[0] != "build":
-        raise unknown_name("leaderboard command", arguments[0], ["build"])
-    options = parse_flags(Options, arguments[1:], prog="rewild4d-bench leaderboard build", description=DESCRIPTION)
-    found = [pair for folder in options.runs for pair in find_records(folder)]
-    if not found:
-        raise UserError(f"{' '.join(map(str, options.runs))}: expected run records, found none.")
-    print(build_site(found, options.out.absolute(), _named([record for _, record in found], options.preset)))
+    commands = {"build": build, "collect": collect_runs}
+    if arguments[0] not in commands:
+        raise unknown_name("leaderboard command", arguments[0], commands)
+    return commands[arguments[0]](arguments[1:])
+
+
+def build(arguments: list[str]) -> int:
+    options = parse_flags(BuildOptions, arguments, prog="rewild4d-bench leaderboard build", description=BUILD)
+    parts = []
+    for folder in options.runs:
+        found = find_records(folder)
+        parts.append(Part(title_of(folder), found, _named([record for _, record in found], options.preset)))
+    _require_records(options.runs, [part for part in parts if part.found])
+    print(build_site([part for part in parts if part.found], options.out.absolute()))
     return 0
+
+
+def collect_runs(arguments: list[str]) -> int:
+    options = parse_flags(CollectOptions, arguments, prog="rewild4d-bench leaderboard collect", description=COLLECT)
+    found = [pair for folder in options.runs for pair in find_records(folder)]
+    _require_records(options.runs, found)
+    out = options.out.absolute()
+    require_writable(out.parent)
+    limit = round(options.limit_mb * 1e6)
+    made = collect(found, out, title=options.title or out.name, pictures=options.pictures, limit=limit)
+    for remark in made.remarks:
+        print(remark, file=sys.stderr)
+    print(f"{made.runs} runs, {made.pictured} of them with pictures, {made.size / 1e6:.1f} MB: {options.out}")
+    return 0
+
+
+def _require_records(folders: tuple[Path, ...], found: list) -> None:
+    if not found:
+        raise UserError(f"{' '.join(map(str, folders))}: expected run records, found none.")
 
 
 def _named(records: list[RunRecord], preset: str) -> list[Table]:

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import msgspec
 from rewild4d import planning
 from rewild4d.commands.shared import check_numbers, floor_entry, open_dataset, require_writable
 from rewild4d.config import parse_flags
+from rewild4d.contracts import DatasetReader
 from rewild4d.leaderboard.formats import markdown
 from rewild4d.leaderboard.layout import Table
 from rewild4d.leaderboard.records import RunRecord, to_json
@@ -19,6 +21,7 @@ from rewild4d.machine import pick_device
 from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import PRESETS as PRIOR_PRESETS
 from rewild4d.priors.config import STANDARD
+from rewild4d.protocol import Protocol
 from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_dataset
 from rewild4d.runner import Entry, Plan, choose_cases, execute, pieces
@@ -34,8 +37,13 @@ class Options:
     Attributes:
         table: which one.
         data: one animal's folder or a folder of animals; the built-in animals where it is left out.
+        video: the same as --data, for a video file or a folder of frames (a protocol of online).
+        masks: of the animal: a folder or, for online, a video; in place of the data set's own where it has some.
+        start: seconds from where on frames of the video are used.
+        end: seconds up to which they are used.
+        fps: how many of them a second; of a folder of frames the rate at which it was taken.
         case: names or patterns of cases ("wolf/Run", "wolf/*"); all that the table wants where it is left out.
-        protocol: instead of the table's, where it has one condition.
+        protocol: instead of the table's, where it has one condition; one of another data set brings that data set.
         preset: size of the effort: quick, standard or paper; the table's where it is left out.
         seeds: one run for each; the table's where they are left out.
         device: auto, cpu or cuda.
@@ -49,6 +57,11 @@ class Options:
 
     table: str
     data: Path | None = None
+    video: Path | None = None
+    masks: Path | None = None
+    start: float | None = None
+    end: float | None = None
+    fps: float | None = None
     case: tuple[str, ...] = ()
     protocol: str = ""
     preset: str = ""
@@ -95,13 +108,13 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
     protocols = {one.protocol: planning.protocol_of(spec, one.protocol) for one in spec.conditions}
     entries = planning.entries(options.table, spec, tuple(dict.fromkeys(options.seeds or spec.seeds)))
     require_writable(options.out)
-    root, reader = open_dataset(spec.dataset, options.data)
+    root, reader = open_dataset(spec.dataset, options.data, options)
     cores = 1 if device.type == "cuda" else len(os.sched_getaffinity(0))
     effort = PRIOR_PRESETS.get(spec.preset, STANDARD)
     plans = []
     for (name, prior), patterns in planning.grounds(spec).items():
         protocol = protocols[name]
-        cases = choose_cases(choose_cases(reader.cases(protocol.selection), patterns), options.case)
+        cases = _cases(options, reader, protocol, patterns)
         own = {entry.method for entry in entries}
         floors = [floor_entry(floor) for floor in protocol.floors if floor not in own]
         plans.append(
@@ -112,6 +125,17 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
             )
         )  # fmt: skip
     return plans
+
+
+def _cases(options: Options, reader: DatasetReader, protocol: Protocol, patterns: Sequence[str]) -> tuple[str, ...]:
+    """What the table wants and the data has; where the table wants all, what `run` takes by itself."""
+    preferred = getattr(reader, "default_cases", None)
+    whole = preferred is None or patterns or options.case
+    names = reader.cases(protocol.selection) if whole else preferred(protocol.selection)
+    found, remark = planning.cases_of(options.table, names, patterns)
+    if remark:
+        print(remark, file=sys.stderr)
+    return choose_cases(found, options.case)
 
 
 def _table(options: Options, spec: Spec, records: list[RunRecord]) -> Table:

@@ -1,0 +1,232 @@
+"""Records as data for a repository: small, without paths, with the few pictures that a page needs."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import imageio_ffmpeg
+import msgspec
+from PIL import Image
+
+from rewild4d.errors import UserError
+from rewild4d.leaderboard.curves import MOMENT, moments
+from rewild4d.leaderboard.privacy import without_paths
+from rewild4d.leaderboard.records import FILE, RunRecord, Score
+from rewild4d.leaderboard.tables import by_protocol
+from rewild4d.leaderboard.variants import latest, variants
+
+MARKER = "collection.json"
+"""Lies in every collected folder: its title and what was done to the records."""
+RUN_BYTES = 150_000
+"""Most that the files of one run may take."""
+PICTURE_WIDTH, VIDEO_WIDTH = 960, 320
+DIGITS = 4
+"""Significant digits of the value of a single image; means are kept whole."""
+NOTE = (
+    "Absolute paths are cut to their last part. Values of single items have four significant digits; of the further "
+    "seeds of a row the items are the means over the views of a moment. Means over all items are as they were measured."
+)
+_OPEN = re.compile(r"cc0|cc[ -]by(?![ -]n)|mit\b|apache|bsd|public domain", re.IGNORECASE)
+Found = tuple[Path, RunRecord]
+
+
+@dataclass
+class Collection:
+    """What was collected.
+
+    Attributes:
+        out: the folder.
+        runs: how many.
+        pictured: how many of them with pictures.
+        size: bytes of all files.
+        remarks: what was left out and why, a sentence each.
+    """
+
+    out: Path
+    runs: int = 0
+    pictured: int = 0
+    size: int = 0
+    remarks: list[str] = field(default_factory=list)
+
+
+def collect(found: Sequence[Found], out: Path, *, title: str, pictures: str = "open", limit: int) -> Collection:
+    """Write the records and the pictures of the first seed of every row; an earlier collection there is replaced.
+
+    Args:
+        found: records with the folders that hold them.
+        out: a folder that is not there, is empty, or was collected before.
+        title: heading of the page's part.
+        pictures: "open" (of data that may be passed on), "all" or "none".
+        limit: most bytes in all.
+
+    Raises:
+        UserError: the folder holds something else or cannot be written, or the files are too large in all.
+    """
+    if out.exists() and not (out.is_dir() and ((out / MARKER).is_file() or not any(out.iterdir()))):
+        raise UserError(f"{out}: expected an empty folder or an earlier collection, but it holds something else.")
+    made = Collection(out)
+    building = out.with_name(f".{out.name}.{os.getpid()}")
+    try:
+        building.mkdir(parents=True)
+        _write(found, building, pictures, made)
+        about = {"title": title, "runs": made.runs, "with_pictures": made.pictured, "note": NOTE}
+        (building / MARKER).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+        made.size = sum(path.stat().st_size for path in building.rglob("*") if path.is_file())
+        if made.size > limit:
+            raise UserError(
+                f"{out}: expected at most {limit / 1e6:.1f} MB in all, got {made.size / 1e6:.1f} MB of {made.runs} "
+                "runs; raise --limit-mb, or leave pictures out with --pictures none."
+            )
+        if out.exists():
+            shutil.rmtree(out)
+        building.rename(out)
+    except OSError as error:
+        raise UserError(f"{out}: the records could not be collected: {error.strerror or error}.") from error
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+    return made
+
+
+def title_of(folder: Path) -> str:
+    """The title of a collected folder; the name of any other."""
+    path = folder / MARKER
+    return json.loads(path.read_text(encoding="utf-8"))["title"] if path.is_file() else folder.resolve().name
+
+
+def _write(found: Sequence[Found], folder: Path, pictures: str, made: Collection) -> None:
+    folders = {record.run_id: source for source, record in found}
+    for group in by_protocol([record for _, record in found]):
+        kept, remarks = latest(list({record.run_id: record for record in group}.values()))
+        made.remarks += remarks
+        first = _first_seeds(kept)
+        for record in kept:
+            source = folders[record.run_id]
+            place = folder / _place(record)
+            shown = record.run_id in first and _may_show(record, pictures, made)
+            _write_run(source, record, place, record.run_id in first, shown, made)
+
+
+def _write_run(source: Path, record: RunRecord, place: Path, whole: bool, shown: bool, made: Collection) -> None:
+    if place.exists():
+        raise UserError(f"{source}: expected a run of its own, but there is another one called {place.name}.")
+    place.mkdir(parents=True)
+    names = []
+    if shown:
+        names = [name for name in (_picture(source, place), _video(source, place)) if name]
+    small = rounded(without_paths(record) if whole else per_moment(without_paths(record)))
+    text = compact(msgspec.structs.replace(small, pictures=names))
+    while names and len(text.encode()) + sum((place / name).stat().st_size for name in names) > RUN_BYTES:
+        (place / names[-1]).unlink()
+        made.remarks.append(f"{place.name}: {names.pop()} left out, the run takes more than {RUN_BYTES / 1e3:.0f} kB.")
+        text = compact(msgspec.structs.replace(small, pictures=names))
+    (place / FILE).write_text(text, encoding="utf-8")
+    made.runs += 1
+    made.pictured += bool(names)
+
+
+def _place(record: RunRecord) -> Path:
+    """Where a run lies in the collection, as the runner would put it; nothing in a record is taken for a path."""
+    run = f"{record.method}-{record.preset}-seed{record.seed}-{record.run_id[:8]}"
+    parts = (record.protocol["name"], record.case.replace("/", "__"), run)
+    return Path(*(re.sub(r"[^\w@+-]", "_", part) for part in parts))
+
+
+def _first_seeds(records: Sequence[RunRecord]) -> set[str]:
+    """Run ids of the lowest good seed of every case of every variant."""
+    best: dict[tuple[int, str], RunRecord] = {}
+    for index, variant in enumerate(variants(records)):
+        for record in sorted(variant.records, key=lambda r: (r.status != "ok", r.seed)):
+            best.setdefault((index, record.case), record)
+    return {record.run_id for record in best.values()}
+
+
+def _may_show(record: RunRecord, pictures: str, made: Collection) -> bool:
+    licence = record.data.get("licence", "")
+    if pictures != "open" or _OPEN.match(licence):
+        return pictures != "none"
+    remark = f"{record.case}: no pictures, because of its licence ('{licence}'); --pictures all keeps them."
+    if remark not in made.remarks:
+        made.remarks.append(remark)
+    return False
+
+
+def _picture(source: Path, place: Path) -> str:
+    """The comparison as a small WebP."""
+    target = place / "comparison.webp"
+    if (source / target.name).is_file():
+        shutil.copyfile(source / target.name, target)
+    elif (source / "comparison.png").is_file():
+        with Image.open(source / "comparison.png") as image:
+            width = min(image.width, PICTURE_WIDTH)
+            small = image.convert("RGB").resize((width, round(image.height * width / image.width)), Image.LANCZOS)
+        small.save(target, quality=75, method=6)
+    return target.name if target.is_file() else ""
+
+
+def _video(source: Path, place: Path) -> str:
+    """The orbit as a small H.264 film; one that is small already is copied."""
+    film, target = source / "orbit.mp4", place / "orbit.mp4"
+    if not film.is_file():
+        return ""
+    if film.stat().st_size <= RUN_BYTES // 3:
+        shutil.copyfile(film, target)
+        return target.name
+    words = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(film), "-threads", "1", "-an",
+             "-vf", f"scale='min({VIDEO_WIDTH},iw)':-2", "-c:v", "libx264", "-crf", "30", "-preset", "slow",
+             "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-map_metadata", "-1", "-fflags", "+bitexact",
+             str(target)]  # fmt: skip
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise UserError(f"{film}: the film could not be made smaller: {(done.stderr.splitlines() or ['?'])[-1]}.")
+    return target.name
+
+
+def compact(record: RunRecord) -> str:
+    """The record as JSON, a line a field and a line a score: small, and changes can be read."""
+    parts = msgspec.to_builtins(record)
+    lines = [f"{json.dumps(name)}: {_line(value)}" for name, value in sorted(parts.items()) if name != "scores"]
+    scores = ",\n".join(f"  {json.dumps(name)}: {_line(value)}" for name, value in sorted(parts["scores"].items()))
+    body = ",\n".join([*lines, f'"scores": {{\n{scores}\n}}' if scores else '"scores": {}'])
+    return f"{{\n{body}\n}}\n"
+
+
+def _line(value: object) -> str:
+    return json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+
+
+def rounded(record: RunRecord) -> RunRecord:
+    """The values of single items with `DIGITS` significant digits; means stay as they are."""
+
+    def short(score: Score) -> Score:
+        items = [None if value is None else float(f"{value:.{DIGITS}g}") for value in score.per_item]
+        return msgspec.structs.replace(score, per_item=items)
+
+    return msgspec.structs.replace(record, scores={name: short(score) for name, score in record.scores.items()})
+
+
+def per_moment(record: RunRecord) -> RunRecord:
+    """The values of single images averaged over the views of each moment; the curve over time stays the same."""
+    views: dict[float, int] = defaultdict(int)
+    for label in record.items:
+        found = MOMENT.search(label)
+        if not found:
+            return record
+        views[float(found[1])] += 1
+    if len(views) == len(record.items):
+        return record
+
+    def mean(score: Score) -> Score:
+        if len(score.per_item) != len(record.items):
+            return score
+        means = {time: sum(values) / len(values) for time, values in moments(score, record.items)}
+        return msgspec.structs.replace(score, per_item=[means.get(time) for time in sorted(views)])
+
+    items = [f"mean of {views[time]} views at {time:.4f} s" for time in sorted(views)]
+    scores = {name: mean(score) for name, score in record.scores.items()}
+    return msgspec.structs.replace(record, scores=scores, items=items)
