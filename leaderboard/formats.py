@@ -36,7 +36,8 @@ def latex(table: Table) -> str:
     groups = [(group, len(list(columns))) for group, columns in groupby(table.columns, key=lambda column: column.group)]
     heads = [*table.stubs, *(f"{column.title} {ARROWS[column.better]}".strip() for column in table.columns)]
     lines = [
-        r"\begin{table}", r"\centering", rf"\caption{{{_tex(table.title)}. {_tex(table.caption)}}}",
+        r"\begin{table}", r"\centering\small\setlength{\tabcolsep}{4pt}",
+        rf"\caption{{{_tex(table.title)}. {_tex(table.caption)}}}",
         rf"\label{{tab:{table.name}}}", rf"\begin{{tabular}}{{{'l' * len(table.stubs)}{'r' * len(table.columns)}}}",
         r"\toprule", *_latex_groups(groups, len(table.stubs)), " & ".join(map(_tex, heads)) + r" \\",
     ]  # fmt: skip
@@ -48,7 +49,7 @@ def latex(table: Table) -> str:
             lines.append(" & ".join([*stubs, *(_latex_cell(cell, table) for cell in row.cells)]) + r" \\")
     lines += [r"\bottomrule", r"\end{tabular}"]
     notes = [f"{_tex_number(str(number))} {_tex(note)}" for number, note in enumerate(table.notes, 1)]
-    lines += [rf"\par\smallskip\footnotesize {line}" for line in [*notes, *map(_tex, table.remarks)]]
+    lines += [rf"\par\smallskip\raggedright\footnotesize {line}" for line in [*notes, *map(_tex, table.remarks)]]
     return "\n".join([*lines, r"\end{table}"])
 
 
@@ -58,7 +59,7 @@ def html(table: Table) -> str:
     head = [*(f"<th>{_text(stub)}</th>" for stub in table.stubs), *map(_html_head, table.columns)]
     lines = [
         f'<table id="{_text(table.name)}">',
-        f"<caption><span>{_text(table.title)}. {_text(table.caption)}</span></caption>",
+        f"<caption><span><b>{_text(table.title)}.</b> {_text(table.caption)}</span></caption>",
         "<thead>",
     ]
     if any(group for group, _ in groups):

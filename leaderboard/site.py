@@ -39,12 +39,12 @@ class Part:
     Attributes:
         title: heading.
         found: records with the folders that hold them and their pictures.
-        tables: named ones, shown above those of the protocols.
+        tables: named ones, shown above those of the protocols; each with those that belong to it behind it.
     """
 
     title: str
     found: Sequence[Found]
-    tables: Sequence[Table] = ()
+    tables: Sequence[Sequence[Table]] = ()
 
 
 def build_site(parts: Sequence[Part], out: Path) -> Path:
@@ -103,11 +103,13 @@ def _write(parts: Sequence[Part], folder: Path) -> None:
 def _part(part: Part, key: str) -> dict[str, Any]:
     """What the first page shows of a folder of runs; ``key`` tells its tables from those of other parts."""
     records = [record for _, record in _unique(part.found)]
-    tables = [
-        {"name": key + table.name, "title": table.title, "html": Markup(html(replace(table, name=key + table.name)))}
-        for table in part.tables
-    ]
+    tables = [[_shown(table, key) for table in group] for group in part.tables]
     return {"title": part.title, "counts": _counts(part.found), "tables": tables, "sections": _sections(records, key)}
+
+
+def _shown(table: Table, key: str) -> dict[str, Any]:
+    name = key + table.name
+    return {"name": name, "title": table.title, "html": Markup(html(replace(table, name=name)))}
 
 
 def _template(name: str) -> str:
@@ -139,8 +141,7 @@ def _sections(records: Sequence[RunRecord], key: str) -> list[dict[str, Any]]:
         labels = {record.run_id: variant.label for variant in variants(group) for record in variant.records}
         protocol = group[0].protocol
         sections.append({
-            "name": key + table.name, "title": table.title, "description": protocol.get("description", ""),
-            "standings": Markup(html(replace(table, name=key + table.name))), "columns": columns_of(group),
+            **_shown(table, key), "description": protocol.get("description", ""), "columns": columns_of(group),
             "runs": [_run_row(record, labels[record.run_id]) for record in group],
         })  # fmt: skip
     return sections
@@ -149,7 +150,8 @@ def _sections(records: Sequence[RunRecord], key: str) -> list[dict[str, Any]]:
 def _run_row(record: RunRecord, label: str) -> dict[str, Any]:
     return {
         "id": record.run_id, "href": f"{_place(record).as_posix()}/index.html", "case": record.case, "label": label,
-        "flags": [mark.partition(":")[0] for mark in record.marks], "preset": record.preset, "seed": record.seed, "status": record.status, "seconds": record.timing.fit_seconds,
+        "flags": [mark.partition(":")[0] for mark in record.marks], "preset": record.preset, "seed": record.seed,
+        "status": record.status, "seconds": record.timing.fit_seconds,
         "cells": [cell([record], [record.case], name) for name in record.protocol["scores"]],
     }  # fmt: skip
 

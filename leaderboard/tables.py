@@ -159,9 +159,9 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
     return Table(
         f"{frame.name}-difference",
         f"{frame.title}: difference to {reference.label}",
-        f"The row less {reference.label}, so that where ↑ stands a minus is behind it, and where ↓ stands a plus is. Mean "
-        "of the cases' differences; in brackets the 95 % interval of a bootstrap over cases and seeds. Bold: "
-        f"ahead of {reference.label}, by an interval without 0",
+        f"The row less {reference.label}: behind it is a minus where ↑ stands and a plus where ↓ stands. Mean of the "
+        "cases' differences; in brackets the 95 % interval of a bootstrap over cases and seeds. Bold: ahead of "
+        f"{reference.label} by an interval without 0",
         ("method",),
         columns,
         tuple(_apart(rows)),

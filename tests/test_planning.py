@@ -34,7 +34,9 @@ def spec(rows: Sequence[Line], **changes: Any) -> Spec:
 
 def test_every_table_that_ships_can_be_planned() -> None:
     specs = load_specs()
-    assert set(specs) == {"ablation", "artemis", "input-view", "novel-view", "prior-mismatch", "protocols"}
+    assert set(specs) == {
+        "ablation", "artemis", "input-view", "novel-view", "prior-mismatch", "protocols", "sweep-random",
+    }  # fmt: skip
     for name, found in specs.items():
         for preset in ("quick", "standard", "paper"):
             full = planning.with_choice(name, found, planning.Choice(preset=preset))

@@ -14,7 +14,7 @@ from rewild4d import cli
 from rewild4d.errors import UserError
 from rewild4d.leaderboard.curves import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, curve, moments
 from rewild4d.leaderboard.records import RunRecord, Score, find_records, write_record
-from rewild4d.leaderboard.site import MARKER, build_site
+from rewild4d.leaderboard.site import MARKER, Part, build_site
 
 NASTY = "<script>alert('x')</script> & \"y\""
 VOID = {"meta", "link", "img", "input", "br", "hr"}
@@ -71,7 +71,7 @@ def runs(tmp_path: Path) -> Path:
 
 
 def test_every_link_leads_to_a_file_of_the_page(runs: Path, tmp_path: Path) -> None:
-    first = build_site(find_records(runs), tmp_path / "page")
+    first = build_site([Part("Runs", find_records(runs))], tmp_path / "page")
     shutil.move(str(tmp_path / "page"), str(tmp_path / "elsewhere"))
     first = tmp_path / "elsewhere" / first.name
     pages = [first, *sorted((tmp_path / "elsewhere" / "runs").glob("*/index.html"))]
@@ -85,7 +85,7 @@ def test_every_link_leads_to_a_file_of_the_page(runs: Path, tmp_path: Path) -> N
 
 
 def test_a_run_shows_what_it_was(runs: Path, tmp_path: Path) -> None:
-    build_site(find_records(runs), tmp_path / "page")
+    build_site([Part("Runs", find_records(runs))], tmp_path / "page")
     page = Page(tmp_path / "page" / "runs" / ("a" * 16) / "index.html")
     for text in ("loss.ssim", "0.2", "c1", "CC0 1.0", "abacus", "joint_angle_mean", "1.5, 2.5", "20.00", "p-v1"):
         assert text in page.text, text
@@ -97,7 +97,7 @@ def test_a_run_shows_what_it_was(runs: Path, tmp_path: Path) -> None:
 
 
 def test_names_and_messages_are_text(runs: Path, tmp_path: Path) -> None:
-    first = build_site(find_records(runs), tmp_path / "page")
+    first = build_site([Part("Runs", find_records(runs))], tmp_path / "page")
     for path in (first, *(tmp_path / "page" / "runs").glob("*/index.html")):
         assert "<script>alert" not in path.read_text()
     assert NASTY in Page(first).text
@@ -106,13 +106,13 @@ def test_names_and_messages_are_text(runs: Path, tmp_path: Path) -> None:
 
 def test_an_older_page_is_replaced_and_anything_else_is_not(runs: Path, tmp_path: Path) -> None:
     out = tmp_path / "page"
-    build_site(find_records(runs), out)
+    build_site([Part("Runs", find_records(runs))], out)
     (out / "runs" / "old").mkdir()
-    build_site(find_records(runs), out)
+    build_site([Part("Runs", find_records(runs))], out)
     assert not (out / "runs" / "old").exists()
     (out / MARKER).unlink()
     with pytest.raises(UserError, match="page: expected an empty folder or an earlier leaderboard, but it holds some"):
-        build_site(find_records(runs), out)
+        build_site([Part("Runs", find_records(runs))], out)
     assert (out / "index.html").is_file()
 
 
@@ -120,7 +120,7 @@ def test_an_older_page_is_replaced_and_anything_else_is_not(runs: Path, tmp_path
 def test_a_run_id_is_no_path(runs: Path, tmp_path: Path, name: str) -> None:
     keep(runs / "d", record(run_id=name))
     with pytest.raises(UserError, match="expected a run id of letters and digits"):
-        build_site(find_records(runs), tmp_path / "page")
+        build_site([Part("Runs", find_records(runs))], tmp_path / "page")
     assert not (tmp_path / "page").exists() and not list(tmp_path.glob(".page*")), "nothing half-written"
 
 
@@ -174,7 +174,7 @@ def test_a_curve_by_hand() -> None:
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "google-chrome"))), None)
 CLICKS = """<script>
 const table = document.querySelector("section table"), head = table.querySelectorAll(".heads th")[1];
-const names = () => [...table.tBodies[0].rows].map(row => row.cells[0].textContent).join(",");
+const names = () => [...table.tBodies[0].rows].map(row => row.cells[0].firstChild.textContent).join(",");
 head.click(); const down = names(); head.click();
 const input = document.querySelector("[data-filters]"); input.value = "GART"; input.dispatchEvent(new Event("input"));
 const shown = [...document.querySelectorAll(".runs tbody tr")].filter(row => !row.hidden).length;
@@ -184,20 +184,45 @@ document.title = [down, names(), shown, document.documentElement.scrollWidth <= 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no headless Chromium here: sorting and the phone's width are not tried")
 def test_a_browser_sorts_filters_and_fits_a_phone(tmp_path: Path) -> None:
-    for number, (method, value) in enumerate((("ours", 20.0), ("gart", 5.0), ("d3dgs", 10.0), ("none", None))):
+    found = (("ours", 20.0), ("gart", 5.0), ("d3dgs", 10.0), ("none", None), ("star", 30.0), ("empty", 15.0))
+    for number, (method, value) in enumerate(found):
         protocol = {**PROTOCOL, "description": "A long description. " * 20}
         made = record(
-            run_id=str(number) * 16, method=method, scores=psnr(value, "not computed: why"), protocol=protocol
-        )
+            run_id=str(number) * 16, method=method, scores=psnr(value, "not computed: why"), protocol=protocol,
+            marks=["upper bound: rotated"] if method == "star" else [],
+        )  # fmt: skip
         keep(tmp_path / "runs" / method, made)
-    first = build_site(find_records(tmp_path / "runs"), tmp_path / "page")
+    first = build_site([Part("Runs", find_records(tmp_path / "runs"))], tmp_path / "page")
     first.write_text(first.read_text().replace("</body>", CLICKS + "</body>"))
     dumped = subprocess.run(
         [str(CHROMIUM), "--no-sandbox", "--disable-gpu", "--window-size=390,844", "--dump-dom", first.as_uri()],
         capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     (title,) = re.findall("<title>(.*?)</title>", dumped.stdout)
-    assert title == "ours,d3dgs,gart,none ; gart,d3dgs,ours,none ; 1 ; true"
+    # What is not ranked and the floor stay below, whatever is sorted by.
+    assert title == "ours,d3dgs,gart,none,star,empty ; gart,d3dgs,ours,none,star,empty ; 1 ; true"
+
+
+def test_folders_of_runs_are_parts_that_are_not_averaged_together(tmp_path: Path) -> None:
+    """The same method on one case here and on another there: no mean over both, and no two elements of one id."""
+    for number, (folder, case, value) in enumerate((("one", "a", 10.0), ("two", "b", 20.0))):
+        keep(tmp_path / folder / "run", record(run_id=str(number) * 16, case=case, scores=psnr(value)))
+    parts = [Part(name.title(), find_records(tmp_path / name)) for name in ("one", "two")]
+    first = build_site(parts, tmp_path / "page")
+    text = first.read_text()
+    found = re.findall(r'<table id="(\d-p-v1)">.*?<td data-value="([0-9.]+)">', text, re.DOTALL)
+    assert found == [("1-p-v1", "10"), ("2-p-v1", "20")]
+    ids = re.findall(r' id="([^"]+)"', text)
+    assert len(ids) == len(set(ids)) and "2 runs of 1 methods on 2 cases." in text
+    assert all(link[1:] in ids for link in Page(first).links if link.startswith("#"))
+    alone = build_site(parts[:1], tmp_path / "alone").read_text()
+    assert "<h2>P</h2>" in alone and "One" not in Page(tmp_path / "alone" / "index.html").text
+
+
+def test_what_keeps_a_row_out_of_the_ranking_is_seen_at_once(runs: Path, tmp_path: Path) -> None:
+    text = build_site([Part("Runs", find_records(runs))], tmp_path / "page").read_text()
+    assert text.count('<small class="flag">upper bound</small>') == 2, "in the table and among its runs"
+    assert re.search(r'<tr class="unranked"><td>.*?<small class="flag">upper bound</small></td>', text)
 
 
 def test_records_beside_each_other_are_found_with_their_folders(runs: Path) -> None:

@@ -14,13 +14,17 @@ from rewild4d.leaderboard.layout import Table
 from rewild4d.leaderboard.records import RunRecord, find_records
 from rewild4d.leaderboard.site import Part, build_site
 from rewild4d.leaderboard.specs import load_specs
-from rewild4d.leaderboard.tables import named_table
+from rewild4d.leaderboard.tables import difference_table, named_table
 
-BUILD = """Make a static page from records alone: a sortable table per protocol, the named tables that have records, and a
-page per run with its settings, provenance, curves over time and pictures. Every folder of runs is a part of its own, and
-its cases are averaged with no others. It opens from the disk."""
-COLLECT = """Gather from folders of runs what a repository should keep and `leaderboard build` and `table` need: the latest
-record of every run, without absolute paths, and for the first seed of every row a small comparison picture and orbit."""
+BUILD = """Make a static page from records alone: a sortable table per protocol, the named tables that have records, and
+a page per run with its settings, provenance, curves over time and pictures. Every folder of runs is a part of its own,
+and its cases are averaged with no others. It opens from the disk."""
+COLLECT = """Gather from folders of runs what a repository should keep and `leaderboard build` and `table` need: the
+latest record of every run, without absolute paths, and for the first seed of every row a small comparison picture and
+orbit."""
+
+REFERENCE = "Ours"
+"""Row that all others of its table are compared with on the page."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +63,7 @@ class CollectOptions:
 
 def main(arguments: list[str]) -> int:
     if arguments[:1] in (["-h"], ["--help"]) or not arguments:
-        print("usage: rewild4d-bench leaderboard build --runs DIR --out DIR      (leaderboard build --help tells more)")
-        print("       rewild4d-bench leaderboard collect --runs DIR --out DIR    (leaderboard collect --help tells more)")
+        print("usage: rewild4d-bench leaderboard build|collect --runs DIR --out DIR      (... build --help tells more)")
         return 0 if arguments else 2
     commands = {"build": build, "collect": collect_runs}
     if arguments[0] not in commands:
@@ -98,13 +101,18 @@ def _require_records(folders: tuple[Path, ...], found: list) -> None:
         raise UserError(f"{' '.join(map(str, folders))}: expected run records, found none.")
 
 
-def _named(records: list[RunRecord], preset: str) -> list[Table]:
-    """The named tables of which at least one row that is no floor has a record."""
+def _named(records: list[RunRecord], preset: str) -> list[tuple[Table, ...]]:
+    """The named tables that compare something, each with the differences to `REFERENCE`: two rows that are no floors
+    have records under every condition."""
     tables = []
     for name, spec in load_specs().items():
         full = planning.with_choice(name, spec, planning.Choice(preset=preset))
         rows, remarks = planning.entrants(name, full, records)
-        if any(any(under) for row in rows[: len(full.rows)] for under in row.records):
-            frame = replace(planning.frame(name, full), remarks=tuple(remarks))
-            tables.append(named_table(frame, rows, planning.reported(full)))
+        whole = [row for row in rows[: len(full.rows)] if all(row.records)]
+        if len(whole) < 2:
+            continue
+        frame = replace(planning.frame(name, full), remarks=tuple(remarks))
+        table = named_table(frame, rows, planning.reported(full))
+        compared = any(row.label == REFERENCE for row in whole)
+        tables.append((table, difference_table(frame, rows, REFERENCE)) if compared else (table,))
     return tables

@@ -69,7 +69,8 @@ def _named(options: Options) -> list[Table]:
     frame = planning.frame(name, spec)
     gaps = [entrant.label for entrant in entrants if not entrant.absent and not all(entrant.records)]
     if gaps:
-        command = f"rewild4d-bench run --table {name} --preset {spec.preset}"
+        other = f" --protocol {options.protocol}" if options.protocol else ""
+        command = f"rewild4d-bench run --table {name} --preset {spec.preset}{other}"
         remarks = [*remarks, f"Without records: {', '.join(gaps)}; `{command}` makes what is missing."]
     frame = replace(frame, remarks=tuple(remarks))
     tables = [named_table(frame, entrants, planning.reported(spec))]
