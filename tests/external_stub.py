@@ -1,6 +1,6 @@
 """A program of somebody else: reads the written clip, writes an animal in one of many layouts, or fails in many ways.
 
-Run by tests/test_external.py as a separate process; it imports nothing of ours, as somebody else's would not.
+Run by tests/test_external*.py as a separate process; it imports nothing of ours, as somebody else's would not.
 """
 
 import json

@@ -208,6 +208,12 @@ def test_a_table_is_run_printed_and_only_completed(
     ]
     assert command(capsys, *wanted) == shown
     assert fitted == [(PriorOnlyConfig(gaussians=lost.config["gaussians"]), 1)]
+    (gone / FILE).unlink()
+    times = {path: path.stat().st_mtime_ns for path in Path(out).rglob(FILE)}
+    assert command(capsys, *wanted) == shown
+    assert len(fitted) == 1, "what was fitted is scored again, not fitted again"
+    assert {path: path.stat().st_mtime_ns for path in Path(out).rglob(FILE) if path.parent != gone} == times
+    assert (gone / FILE).is_file()
 
 
 def test_a_named_table_tells_its_gaps(demo: Spec, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

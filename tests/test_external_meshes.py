@@ -1,0 +1,146 @@
+"""Meshes of others: animated glTF, OBJ files whole and damaged, and the discs that they become."""
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pygltflib
+import pytest
+import torch
+from external_program import coarse_grid, fit, posed
+
+from rewild4d.baselines.external import ExternalConfig
+from rewild4d.baselines.external_folder import find_outputs
+from rewild4d.baselines.external_gltf import read_animation
+from rewild4d.baselines.external_profiles import PROFILES
+from rewild4d.conformance import tiny_case
+from rewild4d.errors import UserError
+from rewild4d.meshes import Mesh, discs, read_mesh
+from rewild4d.types import Case
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    return tiny_case(frames=3)
+
+
+@pytest.fixture(autouse=True)
+def fewer_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    coarse_grid(monkeypatch)
+
+
+def glb(path: Path, morph: bool, moving: bool, clips: int = 1) -> None:
+    """A square that grows by a morph target, or moves with its node, over one second."""
+    points = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], np.float32)
+    faces = np.array([0, 1, 2, 0, 2, 3], np.uint16)
+    offsets = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], np.float32)
+    keys, shift = np.array([0, 1], np.float32), np.array([(0, 0, 0), (0, 0, 8)], np.float32)
+    blocks = [points, faces, offsets, keys, np.array([0, 1], np.float32), shift]
+    data, views, at = b"", [], 0
+    for block in blocks:
+        raw = block.tobytes() + b"\0" * (-block.nbytes % 4)
+        views.append(pygltflib.BufferView(buffer=0, byteOffset=at, byteLength=block.nbytes))
+        data, at = data + raw, at + len(raw)
+    floats, shorts = 5126, 5123
+    accessors = [
+        pygltflib.Accessor(bufferView=0, componentType=floats, count=4, type="VEC3", min=[0, 0, 0], max=[1, 1, 0]),
+        pygltflib.Accessor(bufferView=1, componentType=shorts, count=6, type="SCALAR"),
+        pygltflib.Accessor(bufferView=2, componentType=floats, count=4, type="VEC3"),
+        pygltflib.Accessor(bufferView=3, componentType=floats, count=2, type="SCALAR", min=[0], max=[1]),
+        pygltflib.Accessor(bufferView=4, componentType=floats, count=2, type="SCALAR"),
+        pygltflib.Accessor(bufferView=5, componentType=floats, count=2, type="VEC3"),
+    ]
+    primitive = pygltflib.Primitive(
+        attributes=pygltflib.Attributes(POSITION=0), indices=1, targets=[{"POSITION": 2}] if morph else []
+    )
+    target = pygltflib.AnimationChannelTarget(node=0, path="weights" if morph else "translation")
+    animation = pygltflib.Animation(
+        samplers=[pygltflib.AnimationSampler(input=3, output=4 if morph else 5)],
+        channels=[pygltflib.AnimationChannel(sampler=0, target=target)],
+    )
+    tree = pygltflib.GLTF2(
+        scene=0, scenes=[pygltflib.Scene(nodes=[0])], nodes=[pygltflib.Node(mesh=0)],
+        meshes=[pygltflib.Mesh(primitives=[primitive])], accessors=accessors, bufferViews=views,
+        buffers=[pygltflib.Buffer(byteLength=len(data))], animations=[animation] * clips if moving else [],
+    )  # fmt: skip
+    tree.set_binary_blob(data)
+    tree.save_binary(str(path))
+
+
+def test_an_animated_glb_moves_by_morphs_and_by_nodes(tmp_path: Path) -> None:
+    """Four moments of a second: at 0, 1/4, 1/2 and 3/4."""
+    glb(tmp_path / "morph.glb", morph=True, moving=True)
+    moments = read_animation(tmp_path / "morph.glb", 4)
+    assert [float(parts[0].vertices[2, 0]) for parts in moments] == pytest.approx([1.0, 1.25, 1.5, 1.75])
+    glb(tmp_path / "node.glb", morph=False, moving=True)
+    moments = read_animation(tmp_path / "node.glb", 4)
+    assert [float(parts[0].vertices[0, 2]) for parts in moments] == pytest.approx([0.0, 2.0, 4.0, 6.0])
+    glb(tmp_path / "still.glb", morph=False, moving=False)
+    with pytest.raises(UserError, match="still.glb: expected one animation, got none"):
+        read_animation(tmp_path / "still.glb", 4)
+    glb(tmp_path / "two.glb", morph=False, moving=True, clips=2)
+    with pytest.raises(UserError, match="two.glb: expected one animation, got clip_0, clip_1"):
+        read_animation(tmp_path / "two.glb", 4)
+
+
+def test_a_glb_is_a_result(case: Case, tmp_path: Path) -> None:
+    glb(tmp_path / "square.glb", morph=True, moving=True)
+    config = ExternalConfig(folder=str(tmp_path), profile="glb", points=500)
+    found = fit(case, config)
+    sizes = [float(found.at(time).means[:, 0].amax()) for time in case.clip.times]
+    assert sizes == pytest.approx([1.0, 4 / 3, 5 / 3], abs=0.05)
+    glb(tmp_path / "other.glb", morph=True, moving=True)
+    with pytest.raises(UserError, match=re.escape("expected one animated file *.glb or *.gltf, found 2")):
+        fit(case, config)
+
+
+def test_files_are_ordered_by_their_numbers(tmp_path: Path) -> None:
+    for name in ("frame_10", "frame_9", "frame_2"):
+        (tmp_path / f"{name}.ply").touch()
+    found = find_outputs(tmp_path, PROFILES["frames"], 3)
+    assert [path.stem for path in found] == ["frame_2", "frame_9", "frame_10"]
+
+
+OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (OBJ + "f 1 2 9\n", "expected faces of vertices 1 to 4, got one of another"),
+        (OBJ + "f 1 2 x\n", "expected numbers in line 5, got 'f 1 2 x'"),
+        ("v 0 0\nf 1 1 1\n", "expected vertices with three coordinates, got fewer"),
+        ("", "expected vertices with three coordinates, got no vertex"),
+        (OBJ, "expected a mesh with triangles, got 4 points without any"),
+        ("v 0 0 nan\n" + OBJ + "f 1 2 3\n", "expected finite coordinates, got a NaN or an infinite value in vertex 0"),
+    ],
+)
+def test_a_damaged_obj_is_one_sentence(tmp_path: Path, text: str, sentence: str) -> None:
+    (tmp_path / "a.obj").write_text(text)
+    with pytest.raises(UserError, match=re.escape(f"a.obj: {sentence}")):
+        read_mesh(tmp_path / "a.obj")
+
+
+def test_an_obj_has_polygons_backward_indices_and_colours(tmp_path: Path) -> None:
+    square = "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 1 1 0 0 1 0\nv 0 1 0 0 1 0\nf -4 -3 -2 -1\n"
+    (tmp_path / "a.obj").write_text(square)
+    mesh = read_mesh(tmp_path / "a.obj")
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+    (found,) = discs([mesh], 2000, 0)
+    assert found.colors is not None
+    torch.testing.assert_close(found.colors[:, 1], found.points[:, 1], atol=1e-5, rtol=0)
+    assert found.radius == pytest.approx(math.sqrt(1 / (math.pi * 2000)))
+    # Uniform on the unit square.
+    torch.testing.assert_close(found.points[:, :2].mean(0), torch.full((2,), 0.5), atol=0.03, rtol=0)
+    flat = Mesh(torch.zeros(3, 3), torch.tensor([[0, 1, 2]]))
+    with pytest.raises(ValueError, match="expected triangles with an area, got 1 triangles without"):
+        discs([flat], 10, 0)
+
+
+def test_meshes_of_one_topology_keep_their_points(case: Case) -> None:
+    meshes = [Mesh(posed(case, index).float(), case.prior.faces) for index in range(2)]
+    moved = meshes[0].vertices + torch.tensor((1.0, 0.0, 0.0))
+    first, second = discs([meshes[0], replace(meshes[0], vertices=moved)], 300, 0)
+    torch.testing.assert_close(second.points - first.points, torch.tensor((1.0, 0, 0)).expand(300, 3))
