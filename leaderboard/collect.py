@@ -163,8 +163,9 @@ def _picture(source: Path, place: Path) -> str:
         shutil.copyfile(source / target.name, target)
     elif (source / "comparison.png").is_file():
         with Image.open(source / "comparison.png") as image:
-            width = min(image.width, PICTURE_WIDTH)
-            small = image.convert("RGB").resize((width, round(image.height * width / image.width)), Image.LANCZOS)
+            scale = min(1.0, PICTURE_WIDTH / image.width)
+            size = round(image.width * scale), round(image.height * scale)
+            small = image.convert("RGB").resize(size, Image.Resampling.LANCZOS)
         small.save(target, quality=75, method=6)
     return target.name if target.is_file() else ""
 

@@ -1,6 +1,7 @@
 """`leaderboard`: records of a folder as data for a repository, and as a static page."""
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -96,7 +97,7 @@ def collect_runs(arguments: list[str]) -> int:
     return 0
 
 
-def _require_records(folders: tuple[Path, ...], found: list) -> None:
+def _require_records(folders: tuple[Path, ...], found: Sequence[object]) -> None:
     if not found:
         raise UserError(f"{' '.join(map(str, folders))}: expected run records, found none.")
 
@@ -104,7 +105,7 @@ def _require_records(folders: tuple[Path, ...], found: list) -> None:
 def _named(records: list[RunRecord], preset: str) -> list[tuple[Table, ...]]:
     """The named tables that compare something, each with the differences to `REFERENCE`: two rows that are no floors
     have records under every condition."""
-    tables = []
+    tables: list[tuple[Table, ...]] = []
     for name, spec in load_specs().items():
         full = planning.with_choice(name, spec, planning.Choice(preset=preset))
         rows, remarks = planning.entrants(name, full, records)

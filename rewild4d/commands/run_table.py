@@ -130,8 +130,8 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
 def _cases(options: Options, reader: DatasetReader, protocol: Protocol, patterns: Sequence[str]) -> tuple[str, ...]:
     """What the table wants and the data has; where the table wants all, what `run` takes by itself."""
     preferred = getattr(reader, "default_cases", None)
-    whole = preferred is None or patterns or options.case
-    names = reader.cases(protocol.selection) if whole else preferred(protocol.selection)
+    free = not patterns and not options.case
+    names = preferred(protocol.selection) if preferred and free else reader.cases(protocol.selection)
     found, remark = planning.cases_of(options.table, names, patterns)
     if remark:
         print(remark, file=sys.stderr)
