@@ -13,6 +13,7 @@ from itertools import groupby
 
 from rewild4d.leaderboard.layout import Cell, Column, Row, Table
 
+EDGE = ' class="edge"'
 ARROWS = {"higher": "↑", "lower": "↓", "": ""}
 
 
@@ -56,14 +57,16 @@ def latex(table: Table) -> str:
 def html(table: Table) -> str:
     """A table element; cells carry their value in `data-value`, so that a page can sort by it."""
     groups = [(group, len(list(columns))) for group, columns in groupby(table.columns, key=lambda column: column.group)]
-    head = [*(f"<th>{_text(stub)}</th>" for stub in table.stubs), *map(_html_head, table.columns)]
+    edges = _edges(groups)
+    columns = zip(edges, table.columns, strict=True)
+    head = [*(f"<th>{_text(stub)}</th>" for stub in table.stubs), *(_html_head(*column) for column in columns)]
     lines = [
         f'<table id="{_text(table.name)}">',
         f"<caption><span><b>{_text(table.title)}.</b> {_text(table.caption)}</span></caption>",
         "<thead>",
     ]
     if any(group for group, _ in groups):
-        over = "".join(f'<th colspan="{span}">{_text(group)}</th>' for group, span in groups)
+        over = "".join(f'<th{EDGE} colspan="{span}">{_text(group)}</th>' for group, span in groups)
         lines.append(f'<tr><th colspan="{len(table.stubs)}"></th>{over}</tr>')
     lines += [f'<tr class="heads">{"".join(head)}</tr>', "</thead>", "<tbody>"]
     for row in table.rows:
@@ -71,7 +74,7 @@ def html(table: Table) -> str:
         number = table.number(*row.notes)
         flags = "".join(f' <small class="flag">{_text(flag.partition(":")[0])}</small>' for flag in row.flags)
         stubs[-1] = f"<td>{_text(row.stubs[-1])}{f'<sup>{number}</sup>' if number else ''}{flags}</td>"
-        cells = [_html_cell(cell, table) for cell in row.cells]
+        cells = [_html_cell(edge, cell, table) for edge, cell in zip(edges, row.cells, strict=True)]
         lines.append(f'<tr class="{row.kind}">{"".join(stubs + cells)}</tr>')
     lines += ["</tbody>", "</table>"]
     notes = [f"<sup>{number}</sup> {_text(note)}" for number, note in enumerate(table.notes, 1)]
@@ -152,16 +155,21 @@ def _tex(text: str) -> str:
     return re.sub('"([^"]*)"', r"``\1''", coded)
 
 
-def _html_head(column: Column) -> str:
-    return f'<th data-better="{column.better}">{_text(column.title)} {ARROWS[column.better]}</th>'
+def _edges(groups: list[tuple[str, int]]) -> list[str]:
+    """Of each column, the attribute that draws a line before it where a group begins."""
+    return [EDGE if group and place == 0 else "" for group, span in groups for place in range(span)]
 
 
-def _html_cell(cell: Cell, table: Table) -> str:
+def _html_head(edge: str, column: Column) -> str:
+    return f'<th{edge} data-better="{column.better}">{_text(column.title)} {ARROWS[column.better]}</th>'
+
+
+def _html_cell(edge: str, cell: Cell, table: Table) -> str:
     value = "" if cell.value is None else f' data-value="{cell.value:.9g}"'
     shown = {"best": "<b>{}</b>", "second": "<u>{}</u>", "": "{}"}[cell.mark].format(_text(cell.text))
     spread = f" <small>± {_text(cell.spread)}</small>" if cell.spread else ""
     number = table.number(cell.note)
-    return f"<td{value}>{shown}{spread}{f'<sup>{number}</sup>' if number else ''}</td>"
+    return f"<td{edge}{value}>{shown}{spread}{f'<sup>{number}</sup>' if number else ''}</td>"
 
 
 def _text(text: str) -> str:

@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import re
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -297,3 +298,15 @@ def test_runs_on_data_that_has_changed_are_left_out_and_told() -> None:
     (made,) = protocol_tables([old, new])
     assert [row.stubs[1] for row in made.rows] == ["ours"]
     assert made.remarks == ("p-v1, wolf/Run: 1 older records of other data left out.",)
+
+
+def test_a_line_stands_before_every_condition() -> None:
+    frame = replace(FRAME, conditions=("fixed", "sweep"), scores=("psnr", "iou"))
+    made = html(named_table(frame, [Entrant("ours", (runs({"a": [10.0]}), runs({"a": [20.0]})))]))
+    (over, heads, cells) = re.findall("<tr.*?</tr>", made)
+    assert re.findall(r'class="edge" colspan="2">(\w+)<', over) == ["fixed", "sweep"]
+    assert re.findall("<(?:td|th)([^>]*)>", cells) == [
+        "", ' class="edge" data-value="10"', "", ' class="edge" data-value="20"', "",
+    ]  # fmt: skip
+    assert heads.count('class="edge"') == 2
+    assert "edge" not in html(table(ours=runs({"a": [10.0]})))
