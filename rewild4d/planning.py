@@ -26,7 +26,7 @@ class Choice:
 
     Attributes:
         preset: of every row that names none; "" leaves the table's.
-        protocol: instead of that of a table with one condition, its data set with it; "" leaves both.
+        protocol: instead of that of a table with one condition; "" leaves it.
     """
 
     preset: str = ""
@@ -39,21 +39,13 @@ def with_choice(name: str, spec: Spec, choice: Choice) -> Spec:
     Raises:
         UserError: an unknown protocol, or one for a table of several conditions.
     """
+    conditions = spec.conditions
     if choice.protocol:
-        if len(spec.conditions) > 1:
-            raise UserError(f"--protocol: the table '{name}' compares {len(spec.conditions)} conditions of its own.")
-        spec = _under_protocol(spec, newest_protocol(choice.protocol))
-    full = tuple(msgspec.structs.replace(one, protocol=newest_protocol(one.protocol)) for one in spec.conditions)
+        if len(conditions) > 1:
+            raise UserError(f"--protocol: the table '{name}' compares {len(conditions)} conditions of its own.")
+        conditions = (msgspec.structs.replace(conditions[0], protocol=choice.protocol),)
+    full = tuple(msgspec.structs.replace(one, protocol=newest_protocol(one.protocol)) for one in conditions)
     return msgspec.structs.replace(spec, conditions=full, preset=choice.preset or spec.preset)
-
-
-def _under_protocol(spec: Spec, protocol: str) -> Spec:
-    """The table under another protocol; one of another data set brings all cases of that data set."""
-    known = load_protocols().get(protocol)
-    dataset = known.dataset if known else spec.dataset
-    cases = spec.conditions[0].cases if dataset == spec.dataset else ()
-    condition = msgspec.structs.replace(spec.conditions[0], protocol=protocol, cases=cases)
-    return msgspec.structs.replace(spec, conditions=(condition,), dataset=dataset)
 
 
 def newest_protocol(name: str) -> str:
@@ -101,27 +93,6 @@ def grounds(spec: Spec) -> dict[tuple[str, str], tuple[str, ...]]:
         whole = not one.cases or (key in found and not found[key])
         found[key] = () if whole else (*found.get(key, ()), *one.cases)
     return found
-
-
-def cases_of(name: str, known: Sequence[str], patterns: Sequence[str]) -> tuple[tuple[str, ...], str]:
-    """The cases of a table that the data has, and a sentence on those that it has not.
-
-    Args:
-        name: of the table.
-        known: cases of the data.
-        patterns: names or patterns of the table, () for all.
-
-    Raises:
-        UserError: the data has none of them.
-    """
-    absent = [pattern for pattern in patterns if not any(fnmatchcase(case, pattern) for case in known)]
-    found = tuple(case for case in known if not patterns or any(fnmatchcase(case, pattern) for pattern in patterns))
-    if not found:
-        raise UserError(
-            f"table '{name}': expected data with cases among {', '.join(patterns)}, got {', '.join(known[:8])}"
-            f"{', ...' if len(known) > 8 else ''}."
-        )
-    return found, f"table '{name}': the data has no {', '.join(absent)}" if absent else ""
 
 
 def frame(name: str, spec: Spec) -> Frame:

@@ -10,10 +10,11 @@ from records_for_tests import record
 
 from rewild4d import cli, planning
 from rewild4d.commands import run_table
+from rewild4d.commands.choice import cases_of, chosen
 from rewild4d.datasets.davis import known_sequences
 from rewild4d.leaderboard.records import Score, write_record
 from rewild4d.leaderboard.specs import load_specs
-from rewild4d.planning import Choice, cases_of, with_choice
+from rewild4d.planning import Choice
 from rewild4d.protocol import load_protocols
 
 DAVIS = Path("/work/shared/data/davis")
@@ -56,7 +57,7 @@ def test_both_tables_take_the_eight_animals_of_davis(name: str) -> None:
     ("name", "scores"), [("input-view", ("psnr", "ssim", "lpips_alex")), ("novel-view", ("kid_v", "fvd_f", "fvd_diag"))]
 )
 def test_both_tables_read_the_same_runs(name: str, scores: tuple[str, ...]) -> None:
-    spec = with_choice(name, load_specs()[name], Choice())
+    spec = chosen(name, load_specs()[name], Choice())
     assert (spec.dataset, spec.conditions[0].protocol, spec.scores) == ("davis", "davis-512-v1", scores)
     protocol = load_protocols()["davis-512-v1"]
     assert set(scores) <= set(protocol.scores) and protocol.default
@@ -101,11 +102,11 @@ def test_the_cases_of_a_table() -> None:
     ("protocol", "dataset"), [("aptv2-512", "aptv2"), ("online-256", "online"), ("artemis-orbit-256", "artemis")]
 )
 def test_a_protocol_of_another_data_set_brings_that_data_set(protocol: str, dataset: str) -> None:
-    spec = with_choice("novel-view", load_specs()["novel-view"], Choice(protocol=protocol))
+    spec = chosen("novel-view", load_specs()["novel-view"], Choice(protocol=protocol))
     (condition,) = spec.conditions
     assert (spec.dataset, condition.protocol, condition.cases) == (dataset, f"{protocol}-v1", ())
     assert set(spec.scores) <= set(load_protocols()[condition.protocol].scores)
-    other = with_choice("novel-view", load_specs()["novel-view"], Choice(protocol="davis-256"))
+    other = chosen("novel-view", load_specs()["novel-view"], Choice(protocol="davis-256"))
     assert other.conditions[0].cases[0] == "bear"
 
 
@@ -124,14 +125,14 @@ def test_a_video_of_ones_own_can_fill_the_table(tmp_path: Path, capsys: pytest.C
 @pytest.mark.parametrize("name", NAMES)
 def test_the_real_sequences_can_be_planned(name: str, tmp_path: Path) -> None:
     options = run_table.Options(table=name, data=DAVIS, out=tmp_path / "runs", protocol="davis-256", seeds=(0,))
-    spec = with_choice(name, load_specs()[name], Choice(protocol="davis-256"))
+    spec = chosen(name, load_specs()[name], Choice(protocol="davis-256"))
     (plan,) = run_table.make_plans(options, spec)
     assert plan.cases == ("camel", "cows")
 
 
 def test_distances_that_were_not_computed_say_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One run fills both tables; what the networks' weights are missing for is n/a, with the reason below."""
-    spec = with_choice("novel-view", load_specs()["novel-view"], Choice())
+    spec = chosen("novel-view", load_specs()["novel-view"], Choice())
     entry = planning.row_entry("novel-view", spec.rows[-1], spec, (0,))
     scores = {
         "psnr": Score(21.0, "dB", "higher", 1, [21.0]),

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from rewild4d import planning
+from rewild4d.commands.choice import chosen
 from rewild4d.commands.shared import require_writable
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError, unknown_name
@@ -107,7 +108,7 @@ def _named(records: list[RunRecord], preset: str) -> list[tuple[Table, ...]]:
     have records under every condition."""
     tables: list[tuple[Table, ...]] = []
     for name, spec in load_specs().items():
-        full = planning.with_choice(name, spec, planning.Choice(preset=preset))
+        full = chosen(name, spec, planning.Choice(preset=preset))
         rows, remarks = planning.entrants(name, full, records)
         whole = [row for row in rows[: len(full.rows)] if all(row.records)]
         if len(whole) < 2:

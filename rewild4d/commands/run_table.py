@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 
 from rewild4d import planning
+from rewild4d.commands.choice import cases_of, chosen
 from rewild4d.commands.shared import check_numbers, floor_entry, open_dataset, require_writable
 from rewild4d.config import parse_flags
 from rewild4d.contracts import DatasetReader
@@ -79,7 +80,7 @@ def main(arguments: list[str]) -> int:
     """Run the command; 0 where every run has scores, 1 where one failed."""
     options = parse_flags(Options, arguments, prog="rewild4d-bench run", description=DESCRIPTION)
     found = find_spec(options.table)
-    spec = planning.with_choice(options.table, found, planning.Choice(options.preset, options.protocol))
+    spec = chosen(options.table, found, planning.Choice(options.preset, options.protocol))
     plans = make_plans(options, spec)
     if options.plan:
         labels = {_key(planning.row_entry(options.table, row, spec, ())): row.label for row in reversed(spec.rows)}
@@ -132,7 +133,7 @@ def _cases(options: Options, reader: DatasetReader, protocol: Protocol, patterns
     preferred = getattr(reader, "default_cases", None)
     free = not patterns and not options.case
     names = preferred(protocol.selection) if preferred and free else reader.cases(protocol.selection)
-    found, remark = planning.cases_of(options.table, names, patterns)
+    found, remark = cases_of(options.table, names, patterns)
     if remark:
         print(remark, file=sys.stderr)
     return choose_cases(found, options.case)

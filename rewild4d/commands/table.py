@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from rewild4d import planning
+from rewild4d.commands.choice import chosen
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.leaderboard.formats import FORMATS
@@ -64,7 +65,7 @@ def _everything(options: Options) -> list[Table]:
 def _named(options: Options) -> list[Table]:
     name = options.name[0]
     choice = planning.Choice(options.preset, options.protocol)
-    spec = planning.with_choice(name, find_spec(name), choice)
+    spec = chosen(name, find_spec(name), choice)
     entrants, remarks = planning.entrants(name, spec, _records(options))
     frame = planning.frame(name, spec)
     gaps = [entrant.label for entrant in entrants if not entrant.absent and not all(entrant.records)]

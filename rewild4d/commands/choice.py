@@ -1,0 +1,46 @@
+"""What the command line makes of a named table: another protocol with its data set, the cases that the data has."""
+
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+
+import msgspec
+
+from rewild4d import planning
+from rewild4d.errors import UserError
+from rewild4d.leaderboard.specs import Spec
+from rewild4d.protocol import load_protocols
+
+
+def chosen(name: str, spec: Spec, choice: planning.Choice) -> Spec:
+    """The table after the command line's changes; a protocol of another data set brings all cases of that data set.
+
+    Raises:
+        UserError: as `planning.with_choice`.
+    """
+    if choice.protocol and len(spec.conditions) == 1:
+        known = load_protocols().get(planning.newest_protocol(choice.protocol))
+        if known is not None and known.dataset != spec.dataset:
+            condition = msgspec.structs.replace(spec.conditions[0], cases=())
+            spec = msgspec.structs.replace(spec, conditions=(condition,), dataset=known.dataset)
+    return planning.with_choice(name, spec, choice)
+
+
+def cases_of(name: str, known: Sequence[str], patterns: Sequence[str]) -> tuple[tuple[str, ...], str]:
+    """The cases of a table that the data has, and a sentence on those that it has not.
+
+    Args:
+        name: of the table.
+        known: cases of the data.
+        patterns: names or patterns of the table, () for all.
+
+    Raises:
+        UserError: the data has none of them.
+    """
+    absent = [pattern for pattern in patterns if not any(fnmatchcase(case, pattern) for case in known)]
+    found = tuple(case for case in known if not patterns or any(fnmatchcase(case, pattern) for pattern in patterns))
+    if not found:
+        raise UserError(
+            f"table '{name}': expected data with cases among {', '.join(patterns)}, got {', '.join(known[:8])}"
+            f"{', ...' if len(known) > 8 else ''}."
+        )
+    return found, f"table '{name}': the data has no {', '.join(absent)}" if absent else ""
