@@ -16,13 +16,14 @@ from rewild4d.contracts import Log
 from rewild4d.errors import UserError
 from rewild4d.priors.config import PriorConfig, Stage
 from rewild4d.priors.io import seal
+from rewild4d.priors.judge import agreement
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.landmarks import Marks
-from rewild4d.priors.motion import world_camera
 from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.race import Race
 from rewild4d.priors.search import facings
 from rewild4d.priors.silhouettes import overlap
+from rewild4d.priors.steady import steady
 from rewild4d.priors.template import MIRROR, PARENTS, diagonal, quadruped
 from rewild4d.priors.views import FIELD_OF_VIEW, Views, fauna_camera, windows
 from rewild4d.transforms import rigid, skin_points
@@ -35,7 +36,7 @@ class Evidence:
 
     Attributes:
         marks: keypoints in pixels of the clip's frames.
-        travel: motion of the animal against the background between neighbouring frames, pixels, [T - 1, 2].
+        travel: of the animal over the background, pixels (`Clip.travel`), [T - 1, 2].
     """
 
     marks: Marks | None = None
@@ -98,7 +99,7 @@ class StandingCamera(Race):
 
     def _against_travel(self) -> Tensor | float:
         """Whether heads point against (1) or along (-1) the way the animal goes over the ground, [B]."""
-        if self.said.travel is None:
+        if self.said.travel is None or not len(self.said.travel):
             return 0.0
         walked = self.said.travel / self.boxes[1:, 2:]
         # a step is noise: legs move the mask's centre up and down, and what matters is where the way leads
@@ -139,8 +140,10 @@ def fit_footage(
         name: of the prior.
 
     Returns:
-        A prior with one camera and pose per frame and for its mirror image; `quality` holds mask_iou, mask_iou_flip,
-        facing_margin, facing_margin_flip and more.
+        A prior with one camera and pose per frame and for its mirror image; `quality` holds mask_iou and facing_margin
+        (the lead of the best guess over the best that heads the other way), hops (frames whose camera is far from the
+        others', `steady`) and cost, each with its twin of the mirror image, "<name>_flip"; facing_agreement is the
+        share of frames in which both heads point the same way (`judge.agreement`).
 
     Raises:
         UserError: no mask shows anything.
@@ -196,10 +199,11 @@ def _prior(
         transforms = pose(half.guesses.joint_angles()[0], template.bones[:, 0], PARENTS)
         posed = skin_points(template.vertices, template.weights, transforms)
         halves.append((cameras, transforms, overlap(list(posed), template.faces, cameras, [f.mask for f in frames])))
-    quality = {"mask_iou": halves[0][2], "mask_iou_flip": halves[1][2]}
-    for suffix, half in (("", race), ("_flip", race_flip)):
+    quality = {"facing_agreement": agreement(halves[0][0], halves[1][0])}
+    for suffix, half, (cameras, _, iou) in (("", race, halves[0]), ("_flip", race_flip, halves[1])):
         quality |= {f"{key}{suffix}": value for key, value in half.figures.items()}
-        quality[f"cost{suffix}"] = float(half.costs.min())
+        quality |= {f"mask_iou{suffix}": iou, f"cost{suffix}": float(half.costs.min())}
+        quality[f"hops{suffix}"] = float((~steady(cameras)).sum())
     return seal(
         Prior(
             name=name,
@@ -240,62 +244,3 @@ def _orthonormal(matrix: Tensor) -> Tensor:
     """The nearest rotation: single precision leaves errors of 1e-7."""
     u, _, v = torch.linalg.svd(matrix)
     return u @ v
-
-
-def resized(prior: Prior, width: int, height: int) -> Prior:
-    """The same prior for frames of another size."""
-    cameras, flipped = (
-        tuple(camera.resized(width, height) for camera in each) for each in (prior.cameras, prior.cameras_flip)
-    )
-    return seal(replace(prior, cameras=cameras, cameras_flip=flipped))
-
-
-def in_crops(prior: Prior, clip: Clip) -> Prior:
-    """A prior of whole frames for a clip of square crops of them; rows are those of the clip's frames.
-
-    Raises:
-        UserError: a frame is no crop, or the prior is for frames of another size.
-    """
-    rows, cameras, flipped = [], [], []
-    for frame in clip.frames:
-        row = int((prior.times - frame.time).abs().argmin())
-        plain, crop, size = prior.cameras[row], frame.crop, frame.mask.shape[2]
-        if crop is None or (plain.width, plain.height) != (crop.width, crop.height):
-            held = "a whole frame" if crop is None else f"a crop of {crop.width}x{crop.height} pixels"
-            raise UserError(
-                f"{clip.name}: expected crops of {plain.width}x{plain.height} frames as prior '{prior.name}' knows, "
-                f"got {held}."
-            )
-        rows.append(row)
-        cameras.append(_cropped(plain, crop.left, crop.top, crop.side, size))
-        # in the flipped frame the crop starts as far from the left as it ends from the right
-        flipped.append(_cropped(prior.cameras_flip[row], crop.width - crop.left - crop.side, crop.top, crop.side, size))
-    return seal(
-        replace(
-            prior,
-            times=prior.times[rows],
-            object_to_world=prior.object_to_world[rows],
-            cameras=tuple(cameras),
-            transforms=prior.transforms[rows],
-            cameras_flip=tuple(flipped),
-            transforms_flip=prior.transforms_flip[rows],
-        )  # fmt: skip
-    )
-
-
-def _cropped(camera: Camera, left: float, top: float, side: float, size: int) -> Camera:
-    moved = camera.intrinsics.clone()
-    moved[0, 2] -= left
-    moved[1, 2] -= top
-    moved[:2] *= size / side
-    return replace(camera, intrinsics=moved, width=size, height=size)
-
-
-def with_cameras(clip: Clip, prior: Prior) -> Clip:
-    """The clip with the prior's cameras, in the prior's world, where its own are unknown; frames match by time."""
-    if all(frame.camera is not None for frame in clip.frames):
-        return clip
-    frames = []
-    for frame in clip.frames:
-        frames.append(frame if frame.camera is not None else replace(frame, camera=world_camera(prior, frame.time)))
-    return replace(clip, frames=tuple(frames))

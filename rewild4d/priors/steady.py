@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rewild4d.errors import UserError
 from rewild4d.priors.io import seal
 from rewild4d.transforms import mirror_camera, mirror_matrix
 from rewild4d.types import Camera, Prior
@@ -75,13 +74,17 @@ def steady(cameras: Sequence[Camera]) -> Tensor:
 def without_hops(prior: Prior) -> Filtered:
     """Leave out frames whose camera is not steady, and mend mirrored ones by the mirror image of the plain one.
 
-    Raises:
-        UserError: fewer than two frames are left.
+    A sequence of which less than half of the cameras agree stays as it is, and that is told: nobody knows then which
+    are right.
     """
     plain, flipped = steady(prior.cameras), steady(prior.cameras_flip)
+    count, undecided = len(plain), []
+    for each, what in ((plain, ""), (flipped, "mirrored ")):
+        if 2 * int(each.sum()) < count:
+            share = f"{int(each.sum())} of {count}"
+            undecided.append(f"no {what}camera left out: the largest group that agrees is {share} frames")
+            each[:] = True
     kept = tuple(torch.nonzero(plain)[:, 0].tolist())
-    if len(kept) < 2:
-        raise UserError(f"prior '{prior.name}': expected cameras of at least 2 frames that agree, got {len(kept)}.")
     mended = [row for row in kept if not flipped[row]]
     cameras_flip, transforms_flip = list(prior.cameras_flip), prior.transforms_flip.clone()
     for row in mended:
@@ -97,10 +100,10 @@ def without_hops(prior: Prior) -> Filtered:
         cameras_flip=tuple(cameras_flip[row] for row in kept),
         transforms_flip=transforms_flip[rows],
     )
-    left = [row for row in range(len(plain)) if not plain[row]]
-    notes = [_told(left, len(plain), "left out: the camera is far from those of the other frames")]
-    notes.append(_told(mended, len(plain), "mirrored from the plain frame: the camera of the mirrored one is far off"))
-    return Filtered(seal(smaller), kept, tuple(note for note in notes if note))
+    left = [row for row in range(count) if not plain[row]]
+    notes = [_told(left, count, "left out: the camera is far from those of the other frames")]
+    notes.append(_told(mended, count, "mirrored from the plain frame: the camera of the mirrored one is far off"))
+    return Filtered(seal(smaller), kept, tuple(note for note in (*notes, *undecided) if note))
 
 
 def _told(rows: list[int], count: int, what: str) -> str:
