@@ -45,6 +45,11 @@ class MaskFacts:
     def area(self) -> int:
         return sum(self.parts)
 
+    @property
+    def second(self) -> float:
+        """The second part's area over the largest one's; 0 where there is one part or none."""
+        return self.parts[1] / self.parts[0] if len(self.parts) > 1 else 0.0
+
 
 @dataclass(frozen=True)
 class MaskFiles:

@@ -19,7 +19,7 @@ from rewild4d.datasets.keypoint_files import read_keypoints, told_outside
 from rewild4d.datasets.mask_check import check_videos
 from rewild4d.datasets.mask_makers import Unmasked
 from rewild4d.datasets.masks import MaskFiles, fit_size, list_images, match_masks, open_masks
-from rewild4d.datasets.video_file import SUFFIXES, read_video, video_facts
+from rewild4d.datasets.video_file import ASSUMED_FPS, SUFFIXES, read_video, video_facts
 from rewild4d.datasets.wild import Masks, Moment, Video, files_identity, split_video
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.types import Clip, Keypoints, Truth
@@ -183,7 +183,8 @@ class Online:
                 raise UserError(f"{self.root}: expected a video or a folder of frames, got one image.")
             facts = video_facts(self.root)
             fault = f"ffmpeg complains of the video, {len(facts.times)} frames were read: {facts.faults}"
-            notes = (fault,) if facts.faults else ()
+            order = f"time stamps are missing or out of order: {ASSUMED_FPS:g} frames a second assumed"
+            notes = (*((fault,) if facts.faults else ()), *(() if facts.is_stamped else (order,)))
             return Material((), facts.times, (facts.width, facts.height), facts.has_alpha, notes)
         files = tuple(f for f in list_images(self._frames_root) if f.suffix.lower() in FRAME_SUFFIXES)
         if not files:

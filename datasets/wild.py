@@ -26,6 +26,8 @@ LEAST_FRAMES = 4
 """Usable frames without which nothing is reconstructed: three to learn from and one to test."""
 LEAST_AREA = 64
 """Pixels of mask below which a frame counts as one without the animal."""
+TWIN = 0.5
+"""A second part above this share of the largest may be a second animal."""
 LOST = 0.02
 """Share of the animal outside the crop of a held-out frame above which it is told."""
 _CACHE_VERSION = "2"
@@ -169,6 +171,8 @@ def usable(
     else:
         cut_note = "where the image's border cuts the animal left out"
     notes.append(_told(video, is_cut, cut_note))
+    twins = [i for i in used if (fact := facts[i]) is not None and fact.second > TWIN]
+    notes.append(_told(video, twins, "with two parts of like size (two animals?) taken as one animal"))
     if len(used) < least:
         reasons = [f"{len(missing)} have no mask" if missing else "", f"{len(empty)} an empty one" if empty else ""]
         said = " and ".join(reason for reason in reasons if reason)

@@ -224,9 +224,7 @@ class Job:
             reconstruction, fit_seconds = self._fit(case)
             begin = time.perf_counter()
             progress = Progress(f"{self.title}: evaluate")
-            clip = with_cameras(
-                self.clip, case.prior
-            )  # also the frames that the fit was not shown
+            clip = with_cameras(self.clip, case.prior)  # also the frames that the fit was not shown
             found = evaluate(reconstruction, clip, case.truth, self.plan.protocol, progress, self.plan.device)
             progress.close()
             seconds = time.perf_counter() - begin
