@@ -94,8 +94,8 @@ def open_masks(files: Sequence[Path | None]) -> MaskFiles:
     indexed = False
     for file in files:
         if file is not None:
-            indexed |= _is_indexed(file)
             seen |= set(np.flatnonzero(np.bincount(read_values(file).ravel(), minlength=256)).tolist())
+            indexed |= _is_indexed(file)
     named = sorted(seen - {0})
     if named in ([], [VOID]):
         ids: tuple[int, ...] = ()

@@ -30,8 +30,8 @@ def whole_clip(video: Video) -> Clip:
             continue
         small, matte = reduced(image, LONGEST), reduced(mask, LONGEST)
         meter.add(small, matte)
-        alpha = torch.from_numpy(matte).float()[None] / 255
-        rgb = torch.from_numpy(np.ascontiguousarray(small)).permute(2, 0, 1).float() / 255 * alpha
+        alpha = torch.from_numpy(matte.astype(np.float32))[None] / 255
+        rgb = torch.from_numpy(small.astype(np.float32)).permute(2, 0, 1) / 255 * alpha
         points = _scaled(video.moments[index].keypoints, matte.shape[1] / video.size[0])
         frames.append(Frame(video.moments[index].time, None, rgb, alpha, keypoints=points))
     if len(frames) < len(used):

@@ -57,8 +57,8 @@ def at_times(prior: Prior, times: Sequence[float], clip: Clip) -> Prior:
         UserError: the prior does not span the moments, or knows less than half of them.
     """
     wanted = torch.tensor(times, dtype=torch.float64)
-    apart = (prior.times[:, None] - wanted).abs().min(0).values * clip.fps
-    between = [row for row, distance in enumerate(apart.tolist()) if distance > SAME]
+    apart, rows = (prior.times[:, None] - wanted).abs().min(0)
+    between = [row for row, distance in enumerate((apart * clip.fps).tolist()) if distance > SAME]
     low, high = float(prior.times[0]), float(prior.times[-1])
     outside = (wanted < low - 1 / clip.fps) | (wanted > high + 1 / clip.fps)
     if bool(outside.any()) or 2 * len(between) > len(wanted):
@@ -67,21 +67,35 @@ def at_times(prior: Prior, times: Sequence[float], clip: Clip) -> Prior:
             f"{wanted[-1]:.3f} s, but prior '{prior.name}' has {len(prior.times)} from {low:.3f} to {high:.3f} s, of "
             f"which {len(wanted) - len(between)} are at their times (was it made with another --fps?)."
         )
-    mirrored = replace(prior, cameras=prior.cameras_flip, transforms=prior.transforms_flip)
-    poses = [pose_at(prior, time) for time in times]
     note = f"{len(between)} of {len(wanted)} frames are not in the prior's file: cameras and poses lie between those of"
+    clock = prior.times[rows]
+    clock[between] = wanted[between]
+    roots, transforms, cameras = _sampled(prior, clock)
+    _, transforms_flip, cameras_flip = _sampled(
+        replace(prior, cameras=prior.cameras_flip, transforms=prior.transforms_flip), clock
+    )
     return seal(
         replace(
             prior,
             times=torch.tensor(clip.times, dtype=torch.float64),
-            object_to_world=torch.stack([root for root, _ in poses]),
-            transforms=torch.stack([transforms for _, transforms in poses]),
-            cameras=tuple(camera_at(prior, time) for time in times),
-            cameras_flip=tuple(camera_at(mirrored, time) for time in times),
-            transforms_flip=torch.stack([pose_at(mirrored, time)[1] for time in times]),
+            object_to_world=roots,
+            transforms=transforms,
+            cameras=cameras,
+            cameras_flip=cameras_flip,
+            transforms_flip=transforms_flip,
             notes=(*prior.notes, *([f"{note} its neighbours"] if between else [])),
         )
     )
+
+
+def _sampled(prior: Prior, times: Tensor) -> tuple[Tensor, Tensor, tuple[Camera, ...]]:
+    """object_to_world, transforms and cameras at some moments; its own where it knows them."""
+    own = {float(time): row for row, time in enumerate(prior.times)}
+    poses = [pose_at(prior, float(time)) for time in times]
+    cameras = tuple(
+        prior.cameras[own[float(time)]] if float(time) in own else camera_at(prior, float(time)) for time in times
+    )
+    return torch.stack([root for root, _ in poses]), torch.stack([transforms for _, transforms in poses]), cameras
 
 
 def in_crops(prior: Prior, clip: Clip) -> Prior:
