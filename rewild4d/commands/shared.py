@@ -6,7 +6,7 @@ from typing import Any
 from rewild4d.config import load_preset, preset_names
 from rewild4d.contracts import DatasetReader
 from rewild4d.errors import UserError
-from rewild4d.priors.choose import PriorChoice
+from rewild4d.priors.choose import PriorChoice, Use
 from rewild4d.priors.config import PRESETS, STANDARD
 from rewild4d.priors.landmarks import load_mapping
 from rewild4d.registry import load_builtin, load_dataset, load_method
@@ -71,7 +71,7 @@ def choose_prior(name: str, preset: str, reader: DatasetReader, options: Any = N
         load_mapping(chosen)
     elif use is not None:
         raise UserError(f"--use-keypoints {use}: expected keypoints, but there are none (--keypoints FILE gives some).")
-    default = "all" if file is not None else getattr(reader, "keypoint_use", "none")
+    default: Use = "all" if file is not None else getattr(reader, "keypoint_use", "none")
     return PriorChoice(name, PRESETS.get(preset, STANDARD), chosen, use or default)
 
 
