@@ -177,7 +177,7 @@ def _run_case(plan: Plan, name: str) -> list[RunRecord]:
         return [read_record(job.folder / FILE) for job in jobs]
     try:
         prior = _prior(plan, clip, truth)
-        case = Case(known_frames(with_cameras(clip, prior), prior), prior, truth)
+        case = Case(with_cameras(known_frames(clip, prior), prior), prior, truth)
     except (UserError, FloatingPointError) as error:
         return [job.fail(str(error)) for job in jobs]
     seen = coverage(clip, truth)

@@ -101,6 +101,10 @@ def test_a_run_fits_with_travel_and_with_the_keypoints_of_aptv2(tmp_path: Path) 
     prior = make_prior(choose_prior("template", "quick", reader), clip, truth, tmp_path / "p.npz", silent)
     assert prior.provenance.endswith("cameras unknown, with 170 keypoints, with the animal's travel, seed 0.")
     assert "pck" not in prior.quality  # nothing is left to score
+    assert runner._keypoints(choose_prior("template", "quick", reader), clip) == {
+        "keypoints": "all",
+        "mapping": "aptv2",
+    }
     names = {"mask_iou", "facing_margin", "facing_agreement", "hops"}
     assert names | {f"{name}_flip" for name in names - {"facing_agreement"}} <= set(prior.quality)
     unseen = replace(choose_prior("template", "quick", reader), use="none")
@@ -251,6 +255,8 @@ def test_frames_whose_camera_hops_are_left_out_of_the_fit_and_told(tmp_path: Pat
     shown = known_frames(clip, prior)
     assert [round(time * 24) for time in shown.times] == [0, 1, 2, 3, 5, 6, 7, 8, 9]
     assert shown.travel is not None and shown.travel[:, 0].tolist() == [1, 1, 1, 2, 1, 1, 1, 1]
+    filmed = replace(clip, frames=tuple(replace(f, camera=prior.cameras[0]) for f in clip.frames))
+    assert known_frames(filmed, prior) is filmed
 
 
 def test_what_speaks_against_a_prior_is_said() -> None:

@@ -138,7 +138,9 @@ def with_cameras(clip: Clip, prior: Prior) -> Clip:
 
 
 def known_frames(clip: Clip, prior: Prior) -> Clip:
-    """The frames that the prior has a row for: where it was filtered, the others must not supervise anything."""
+    """The frames with a camera of their own or a row in the prior: others of a filtered one must supervise nothing."""
+    if all(frame.camera is not None for frame in clip.frames):
+        return clip
     distance = (torch.tensor(clip.times, dtype=torch.float64)[:, None] - prior.times).abs().min(1).values
     rows = torch.nonzero(distance * clip.fps <= SAME)[:, 0].tolist()
     if len(rows) == len(clip.frames) or not rows:
