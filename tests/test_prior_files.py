@@ -20,7 +20,7 @@ from rewild4d.priors.config import FOOTAGE
 from rewild4d.priors.fauna import read_fauna
 from rewild4d.priors.fauna_bones import estimate_bones, joint_transforms, skinning_weights
 from rewild4d.priors.io import load_prior, save_prior
-from rewild4d.priors.steady import clusters, steady, without_hops
+from rewild4d.priors.steady import REACH, clusters, steady, without_hops
 from rewild4d.priors.template import quadruped
 from rewild4d.transforms import look_at, skin_points
 from rewild4d.types import Camera, Prior
@@ -131,7 +131,8 @@ def test_a_camera_that_hops_is_left_out_and_a_hop_of_the_mirrored_one_is_mended(
     angles = [0.1 * t for t in range(12)]
     hopping = [a + math.pi * (t == 4) for t, a in enumerate(angles)]
     mirrored = [-a + math.pi * (t == 7) for t, a in enumerate(angles)]
-    assert steady(ring(angles)).all() and steady(ring(hopping)).tolist() == [t != 4 for t in range(12)]
+    times = torch.arange(12).double() / 24
+    assert steady(ring(angles), times).all() and steady(ring(hopping), times).tolist() == [t != 4 for t in range(12)]
     filtered = without_hops(a_prior(hopping, mirrored))
     assert filtered.kept == tuple(t for t in range(12) if t != 4) and len(filtered.prior.cameras) == 11
     # row 7 is the sixth of those kept; its mirrored camera is now the mirror image of the plain one
@@ -140,6 +141,16 @@ def test_a_camera_that_hops_is_left_out_and_a_hop_of_the_mirrored_one_is_mended(
     assert filtered.notes[1].startswith("1 of 12 frames mirrored") and filtered.notes[1].endswith(": 7")
     nothing = without_hops(a_prior(angles, [-a for a in angles]))
     assert nothing.notes == () and len(nothing.kept) == 12
+
+
+def test_a_frame_that_is_held_out_parts_no_smooth_way_but_a_hop_stays_one() -> None:
+    shown = [t for t in range(15) if t % 5 != 2]
+    times, fast = torch.tensor(shown).double() / 24, [0.2 * t for t in shown]
+    assert 2 * math.sin(0.2) > REACH > 2 * math.sin(0.1)  # two steps are too far apart, one is not
+    assert steady(ring(fast), times).all()
+    assert not steady(ring(fast), torch.arange(12).double()).all()
+    turned = [angle + math.pi / 2 * (t > 12) for angle, t in zip(fast, shown, strict=True)]
+    assert steady(ring(turned), times).tolist() == [t < 12 for t in shown]
 
 
 def test_cameras_of_which_few_agree_all_stay_and_that_is_told() -> None:

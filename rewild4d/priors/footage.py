@@ -193,6 +193,7 @@ def _prior(
 ) -> Prior:
     shape = Proportions(race.guesses.shape[0], race.guesses.relief[0])
     template, count = quadruped(shape), len(clip.frames)
+    times = torch.tensor(clip.times, dtype=torch.float64)
     halves = []
     for frames, half in ((clip.frames, race), (flipped, race_flip)):
         cameras = object_cameras(half)
@@ -203,7 +204,7 @@ def _prior(
     for suffix, half, (cameras, _, iou) in (("", race, halves[0]), ("_flip", race_flip, halves[1])):
         quality |= {f"{key}{suffix}": value for key, value in half.figures.items()}
         quality |= {f"mask_iou{suffix}": iou, f"cost{suffix}": float(half.costs.min())}
-        quality[f"hops{suffix}"] = float((~steady(cameras)).sum())
+        quality[f"hops{suffix}"] = float((~steady(cameras, times)).sum())
     return seal(
         Prior(
             name=name,
@@ -215,7 +216,7 @@ def _prior(
             bones=template.bones,
             parents=torch.tensor(PARENTS),
             mirror=torch.tensor(MIRROR),
-            times=torch.tensor(clip.times, dtype=torch.float64),
+            times=times,
             object_to_world=torch.eye(4, dtype=torch.float64).repeat(count, 1, 1),
             cameras=halves[0][0],
             transforms=halves[0][1],

@@ -16,6 +16,8 @@ from rewild4d.types import Camera, Prior
 
 REACH, NEIGHBOURS = 0.25, 3
 """DBSCAN's eps, in units of the feature, and min_samples (a point counts itself)."""
+GAP = 2
+"""Missing frames that a smooth way is drawn over."""
 TRANSLATION_RANGE = 0.11
 """Reach of Fauna's translation along the view over its camera's distance: 1.1 of 10 units."""
 
@@ -59,16 +61,38 @@ def clusters(points: Tensor, reach: float = REACH, neighbours: int = NEIGHBOURS)
     return labels
 
 
-def steady(cameras: Sequence[Camera]) -> Tensor:
-    """Which cameras belong to the largest cluster; all of them where no cluster forms. bool, [T]."""
+def steady(cameras: Sequence[Camera], times: Tensor) -> Tensor:
+    """Which cameras belong to the largest cluster; all of them where no cluster forms. bool, [T].
+
+    Where a few frames lie between two of the sequence because they are held out or were not used, a steady camera has
+    moved on by as many steps: points on the straight way stand in for them.
+
+    Args:
+        cameras: in the object frame.
+        times: of their frames, seconds, ascending, [T].
+    """
     matrices = torch.stack([camera.world_to_camera.double() for camera in cameras])
     centers = -(matrices[:, :3, :3].transpose(1, 2) @ matrices[:, :3, 3:])[..., 0]
     distance = matrices[:, 2, 3].median()
     shifts = (matrices[:, :3, 3] - matrices[:, :3, 3].median(0).values) / (TRANSLATION_RANGE * distance)
-    labels = clusters(torch.cat((torch.nn.functional.normalize(centers, dim=1), shifts), dim=1))
+    features = torch.cat((torch.nn.functional.normalize(centers, dim=1), shifts), dim=1)
+    labels = clusters(torch.cat((features, _between(features, times))))[: len(features)]
     if bool((labels < 0).all()):
         return torch.ones(len(cameras), dtype=torch.bool)
     return labels == labels[labels >= 0].mode().values
+
+
+def _between(features: Tensor, times: Tensor) -> Tensor:
+    """Points for up to `GAP` frames that are missing between neighbours, [m, d]."""
+    gaps = times.diff()
+    missing = (gaps / gaps.median()).round().long() - 1 if len(gaps) else gaps.long()
+    parts = [
+        torch.lerp(features[row], features[row + 1], k / (count + 1))
+        for row, count in enumerate(missing.tolist())
+        if count <= GAP
+        for k in range(1, count + 1)
+    ]
+    return torch.stack(parts) if parts else features[:0]
 
 
 def without_hops(prior: Prior) -> Filtered:
@@ -77,7 +101,7 @@ def without_hops(prior: Prior) -> Filtered:
     A sequence of which less than half of the cameras agree stays as it is, and that is told: nobody knows then which
     are right.
     """
-    plain, flipped = steady(prior.cameras), steady(prior.cameras_flip)
+    plain, flipped = steady(prior.cameras, prior.times), steady(prior.cameras_flip, prior.times)
     count, undecided = len(plain), []
     for each, what in ((plain, ""), (flipped, "mirrored ")):
         if 2 * int(each.sum()) < count:
