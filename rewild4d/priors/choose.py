@@ -16,7 +16,7 @@ from rewild4d.priors.config import FOOTAGE, PriorConfig
 from rewild4d.priors.fit import fit_template
 from rewild4d.priors.footage import Evidence, fit_footage
 from rewild4d.priors.io import load_prior, save_prior, seal
-from rewild4d.priors.judge import doubts, joint_scores
+from rewild4d.priors.judge import doubts, joint_scores, measured
 from rewild4d.priors.landmarks import Marks, load_mapping, marks
 from rewild4d.priors.placing import placed
 from rewild4d.priors.steady import without_hops
@@ -24,6 +24,8 @@ from rewild4d.types import Clip, Prior, Truth
 
 PRIOR_SEED = 0
 """One seed for all: every method and every seed of a case starts from the same prior."""
+
+ELSEWHERE = "made elsewhere: it may have seen the frames that are held out here"
 
 Use = Literal["all", "half", "none"]
 """Frames whose keypoints a fit sees: all; every other one, and the rest is scored; none, and all are scored."""
@@ -103,7 +105,11 @@ def make_prior(choice: PriorChoice, clip: Clip, truth: Truth, path: Path, log: L
     if choice.name != "template" and choice.noise is None:
         prior = load_prior(Path(choice.name))
         if footage:
-            prior = _scored(placed(prior, clip), clip, choice.keypoints(clip)[1])
+            prior = placed(prior, clip)
+            prior = replace(
+                prior, quality=prior.quality | measured(prior, clip.frames), notes=(*prior.notes, ELSEWHERE)
+            )
+            prior = _scored(prior, clip, choice.keypoints(clip)[1])
     else:
         if not path.is_file():
             save_prior(_fitted(choice, clip, truth, log), path)

@@ -16,17 +16,15 @@ from rewild4d.contracts import Log
 from rewild4d.errors import UserError
 from rewild4d.priors.config import PriorConfig, Stage
 from rewild4d.priors.io import seal
-from rewild4d.priors.judge import agreement
+from rewild4d.priors.judge import measured
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.landmarks import Marks
 from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.race import Race
 from rewild4d.priors.search import facings
-from rewild4d.priors.silhouettes import overlap
-from rewild4d.priors.steady import steady
 from rewild4d.priors.template import MIRROR, PARENTS, diagonal, quadruped
 from rewild4d.priors.views import FIELD_OF_VIEW, Views, fauna_camera, windows
-from rewild4d.transforms import rigid, skin_points
+from rewild4d.transforms import rigid
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Prior
 
 
@@ -140,10 +138,8 @@ def fit_footage(
         name: of the prior.
 
     Returns:
-        A prior with one camera and pose per frame and for its mirror image; `quality` holds mask_iou and facing_margin
-        (the lead of the best guess over the best that heads the other way), hops (frames whose camera is far from the
-        others', `steady`) and cost, each with its twin of the mirror image, "<name>_flip"; facing_agreement is the
-        share of frames in which both heads point the same way (`judge.agreement`).
+        A prior with one camera and pose per frame and for its mirror image; `quality` holds the figures of
+        `judge.measured`, cost, and facing_margin: the lead of the best guess over the best that heads the other way.
 
     Raises:
         UserError: no mask shows anything.
@@ -157,7 +153,7 @@ def fit_footage(
     flipped = tuple(replace(f, rgb=f.rgb.flip(-1), mask=f.mask.flip(-1)) for f in clip.frames)
     mirrored = said.mirrored(clip.frames[0].mask.shape[2])
     race_flip = _run(clip, flipped, mirrored, config, seed, log, total, race.guesses)
-    return _prior(clip, flipped, race, race_flip, name, seed)
+    return _prior(clip, race, race_flip, name, seed)
 
 
 def _run(
@@ -188,44 +184,35 @@ def _run(
     return race
 
 
-def _prior(
-    clip: Clip, flipped: tuple[Frame, ...], race: StandingCamera, race_flip: StandingCamera, name: str, seed: int
-) -> Prior:
-    shape = Proportions(race.guesses.shape[0], race.guesses.relief[0])
-    template, count = quadruped(shape), len(clip.frames)
-    times = torch.tensor(clip.times, dtype=torch.float64)
-    halves = []
-    for frames, half in ((clip.frames, race), (flipped, race_flip)):
-        cameras = object_cameras(half)
-        transforms = pose(half.guesses.joint_angles()[0], template.bones[:, 0], PARENTS)
-        posed = skin_points(template.vertices, template.weights, transforms)
-        halves.append((cameras, transforms, overlap(list(posed), template.faces, cameras, [f.mask for f in frames])))
-    quality = {"facing_agreement": agreement(halves[0][0], halves[1][0])}
-    for suffix, half, (cameras, _, iou) in (("", race, halves[0]), ("_flip", race_flip, halves[1])):
-        quality |= {f"{key}{suffix}": value for key, value in half.figures.items()}
-        quality |= {f"mask_iou{suffix}": iou, f"cost{suffix}": float(half.costs.min())}
-        quality[f"hops{suffix}"] = float((~steady(cameras, times)).sum())
-    return seal(
-        Prior(
-            name=name,
-            provenance=f"Template fitted to the {count} masks of the clip and of its mirror image, cameras unknown, "
-            f"{race.said}seed {seed}.",
-            vertices=template.vertices,
-            faces=template.faces,
-            weights=template.weights,
-            bones=template.bones,
-            parents=torch.tensor(PARENTS),
-            mirror=torch.tensor(MIRROR),
-            times=times,
-            object_to_world=torch.eye(4, dtype=torch.float64).repeat(count, 1, 1),
-            cameras=halves[0][0],
-            transforms=halves[0][1],
-            cameras_flip=halves[1][0],
-            transforms_flip=halves[1][1],
-            quality=quality,
-            digest="",
-        )
+def _prior(clip: Clip, race: StandingCamera, race_flip: StandingCamera, name: str, seed: int) -> Prior:
+    template, count = quadruped(Proportions(race.guesses.shape[0], race.guesses.relief[0])), len(clip.frames)
+    transforms, transforms_flip = (
+        pose(half.guesses.joint_angles()[0], template.bones[:, 0], PARENTS) for half in (race, race_flip)
     )
+    quality: dict[str, float] = {}
+    for suffix, half in (("", race), ("_flip", race_flip)):
+        quality |= {f"{key}{suffix}": value for key, value in half.figures.items()}
+        quality[f"cost{suffix}"] = float(half.costs.min())
+    prior = Prior(
+        name=name,
+        provenance=f"Template fitted to the {count} masks of the clip and of its mirror image, cameras unknown, "
+        f"{race.said}seed {seed}.",
+        vertices=template.vertices,
+        faces=template.faces,
+        weights=template.weights,
+        bones=template.bones,
+        parents=torch.tensor(PARENTS),
+        mirror=torch.tensor(MIRROR),
+        times=torch.tensor(clip.times, dtype=torch.float64),
+        object_to_world=torch.eye(4, dtype=torch.float64).repeat(count, 1, 1),
+        cameras=object_cameras(race),
+        transforms=transforms,
+        cameras_flip=object_cameras(race_flip),
+        transforms_flip=transforms_flip,
+        quality=quality,
+        digest="",
+    )
+    return seal(replace(prior, quality=quality | measured(prior, clip.frames)))
 
 
 def object_cameras(race: StandingCamera) -> tuple[Camera, ...]:

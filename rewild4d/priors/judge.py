@@ -6,6 +6,9 @@ import torch
 from torch import Tensor
 
 from rewild4d.priors.landmarks import FRONT, LANDMARKS, REAR, Marks, landmark_pixels
+from rewild4d.priors.silhouettes import overlap
+from rewild4d.priors.steady import steady
+from rewild4d.transforms import skin_points
 from rewild4d.types import Camera, Frame, Prior
 
 CORRECT = 0.2
@@ -17,6 +20,29 @@ UNDECIDED = 0.01
 """Lead in cost below which head and tail are hardly told apart."""
 AGREED = 0.9
 """Share of frames in which the clip and its mirror image must agree about the head."""
+
+
+def measured(prior: Prior, frames: Sequence[Frame]) -> dict[str, float]:
+    """What a prior's masks and cameras say of it.
+
+    Args:
+        prior: one row per frame.
+        frames: with masks, of which one at least shows something.
+
+    Returns:
+        mask_iou: mean intersection over union of template and mask; hops: frames whose camera is far from the others'
+        (`steady`); each with its twin of the mirror image, "<name>_flip"; facing_agreement (`agreement`).
+    """
+    figures = {"facing_agreement": agreement(prior.cameras, prior.cameras_flip)}
+    plain, flipped = [f.mask for f in frames], [f.mask.flip(-1) for f in frames]
+    for suffix, cameras, transforms, masks in (
+        ("", prior.cameras, prior.transforms, plain),
+        ("_flip", prior.cameras_flip, prior.transforms_flip, flipped),
+    ):
+        posed = skin_points(prior.vertices, prior.weights, transforms)
+        figures[f"mask_iou{suffix}"] = overlap(list(posed), prior.faces, cameras, masks)
+        figures[f"hops{suffix}"] = float((~steady(cameras, prior.times)).sum())
+    return figures
 
 
 def agreement(cameras: Sequence[Camera], cameras_flip: Sequence[Camera]) -> float:
