@@ -41,6 +41,7 @@ class AptV2:
     """
 
     options = ("masks",)
+    keypoint_mapping, keypoint_use = "aptv2", "all"
 
     def __init__(self, root: Path, masks: Path | None = None) -> None:
         self.root = root

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from rewild4d.contracts import Finding, Selection
 from rewild4d.datasets.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
+from rewild4d.datasets.keypoint_files import read_keypoints, told_outside
 from rewild4d.datasets.keypoints import read_badja
 from rewild4d.datasets.mask_check import check_videos
 from rewild4d.datasets.masks import MaskFiles, list_images, match_masks, open_masks
@@ -44,16 +45,18 @@ class Davis:
         root: the folder that holds JPEGImages (or a folder DAVIS that does).
         masks: other masks for the frames that methods see, <sequence>/00000.png; held-out frames are judged by DAVIS's
             own where they are there.
+        keypoints: a file of them (`keypoint_files`) in place of BADJA's.
 
     Raises:
         UserError: no such folder, or no frames in it.
     """
 
-    options = ("masks",)
+    options = ("masks", "keypoints")
+    keypoint_mapping, keypoint_use = "badja", "none"
 
-    def __init__(self, root: Path, masks: Path | None = None) -> None:
+    def __init__(self, root: Path, masks: Path | None = None, keypoints: Path | None = None) -> None:
         self.root = root / "DAVIS" if (root / "DAVIS" / "JPEGImages").is_dir() else root
-        self.masks = Path(masks) if masks else None
+        self.masks, self.keypoints = (Path(path) if path else None for path in (masks, keypoints))
         images = self.root / "JPEGImages"
         self.resolution = next((name for name in RESOLUTIONS if (images / name).is_dir()), None)
         if self.resolution is None:
@@ -68,7 +71,8 @@ class Davis:
     @property
     def settings(self) -> dict[str, str]:
         """The options that differ from their defaults, for the record."""
-        return {"masks": str(self.masks.resolve())} if self.masks else {}
+        given = {"masks": self.masks, "keypoints": self.keypoints}
+        return {name: str(path.resolve()) for name, path in given.items() if path is not None}
 
     def cases(self, selection: Selection) -> list[str]:
         """Every sequence with masks; where it has several objects, "<sequence>@<id>" for each of them too."""
@@ -106,9 +110,9 @@ class Davis:
         own = self._own_masks(sequence, files)
         given, note = self._given_masks(sequence, files)
         used, every = given or own, range(len(files))
-        joints = self._joints(sequence, size)
+        joints, outside = self._joints(sequence, files, size)
         facts = known_sequences().get(sequence, {})
-        notes = (note, str(facts.get("note", "")), _odd_animal(facts))
+        notes = (note, outside, str(facts.get("note", "")), _odd_animal(facts))
         return Video(
             title=str(files[0].parent), name=case, species=str(facts.get("species", sequence)), fps=FPS,
             licence=LICENCE, identity=files_identity(*files, *own.files, *used.files) + f" {object_id}", size=size,
@@ -166,9 +170,15 @@ class Davis:
         found, note = match_masks(list_images(folder), [file.stem for file in files], folder)
         return open_masks(found), f"masks of the input from {folder}" + (f"; {note}" if note else "")
 
-    def _joints(self, sequence: str, size: tuple[int, int]) -> dict[str, Keypoints]:
+    def _joints(self, sequence: str, files: list[Path], size: tuple[int, int]) -> tuple[dict[str, Keypoints], str]:
+        """Keypoints by the frame's stem, and a sentence on those that lie outside."""
+        if self.keypoints is not None:
+            stems = [file.stem for file in files]
+            found = read_keypoints(self.keypoints, stems, size)
+            known = {stem: points for stem, points in zip(stems, found, strict=True) if points is not None}
+            return known, told_outside(found, size)
         file = next((f for f in _badja_files(self.root, sequence) if f.is_file()), None)
-        return read_badja(file, size) if file else {}
+        return read_badja(file, size) if file else {}, ""
 
 
 _ANNOTATIONS = ("Annotations", "Annotations_unsupervised")

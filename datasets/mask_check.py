@@ -12,7 +12,7 @@ import numpy as np
 
 from rewild4d.contracts import Finding, Selection
 from rewild4d.datasets.masks import MaskFacts, mask_facts
-from rewild4d.datasets.wild import LEAST_AREA, Video, lay_out
+from rewild4d.datasets.wild import LEAST_AREA, TWIN, Video, lay_out
 from rewild4d.errors import UserError
 from rewild4d.files import atomic
 
@@ -20,8 +20,6 @@ HOLES = 0.01
 """Share of the animal that may be enclosed background."""
 PART = 0.02
 """A second part above this share of the largest is told."""
-TWIN = 0.5
-"""A second part above this share of the largest may be a second animal."""
 JUMP = 0.35
 """The mask jumps where its area changes by more than this share, or its middle moves by as much of its width."""
 SHEET_FRAMES = 24
@@ -116,15 +114,11 @@ def _holed(facts: Sequence[MaskFacts | None]) -> list[int]:
 
 
 def _split(facts: Sequence[MaskFacts | None]) -> list[int]:
-    return [i for i, fact in enumerate(facts) if PART < _second(fact) <= TWIN]
+    return [i for i, fact in enumerate(facts) if fact is not None and PART < fact.second <= TWIN]
 
 
 def _twins(facts: Sequence[MaskFacts | None]) -> list[int]:
-    return [i for i, fact in enumerate(facts) if _second(fact) > TWIN]
-
-
-def _second(fact: MaskFacts | None) -> float:
-    return fact.parts[1] / fact.parts[0] if fact is not None and len(fact.parts) > 1 else 0.0
+    return [i for i, fact in enumerate(facts) if fact is not None and fact.second > TWIN]
 
 
 def _jumps(facts: Sequence[MaskFacts | None]) -> list[int]:

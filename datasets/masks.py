@@ -45,6 +45,11 @@ class MaskFacts:
     def area(self) -> int:
         return sum(self.parts)
 
+    @property
+    def second(self) -> float:
+        """The second part's area over the largest one's; 0 where there is one part or none."""
+        return self.parts[1] / self.parts[0] if len(self.parts) > 1 else 0.0
+
 
 @dataclass(frozen=True)
 class MaskFiles:
@@ -89,8 +94,8 @@ def open_masks(files: Sequence[Path | None]) -> MaskFiles:
     indexed = False
     for file in files:
         if file is not None:
-            indexed |= _is_indexed(file)
             seen |= set(np.flatnonzero(np.bincount(read_values(file).ravel(), minlength=256)).tolist())
+            indexed |= _is_indexed(file)
     named = sorted(seen - {0})
     if named in ([], [VOID]):
         ids: tuple[int, ...] = ()

@@ -15,13 +15,14 @@ import numpy as np
 from rewild4d.contracts import Finding, Selection
 from rewild4d.datasets.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
 from rewild4d.datasets.images import read_picture
+from rewild4d.datasets.keypoint_files import read_keypoints, told_outside
 from rewild4d.datasets.mask_check import check_videos
 from rewild4d.datasets.mask_makers import Unmasked
 from rewild4d.datasets.masks import MaskFiles, fit_size, list_images, match_masks, open_masks
-from rewild4d.datasets.video_file import SUFFIXES, read_video, video_facts
+from rewild4d.datasets.video_file import ASSUMED_FPS, SUFFIXES, read_video, video_facts
 from rewild4d.datasets.wild import Masks, Moment, Video, files_identity, split_video
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.types import Clip, Truth
+from rewild4d.types import Clip, Keypoints, Truth
 
 FOLDER_FPS = 25.0
 """Of a folder of frames where --fps is left out."""
@@ -61,12 +62,13 @@ class Online:
         start: seconds from where on frames are used.
         end: seconds up to which frames are used.
         fps: frames per second that are kept; of a folder also the rate at which it was taken.
+        keypoints: a file of them (`keypoint_files`), which names the frames or counts those of the video from 0.
 
     Raises:
         UserError: no such file, or numbers that make no sense.
     """
 
-    options = ("masks", "start", "end", "fps")
+    options = ("masks", "start", "end", "fps", "keypoints")
     licence = LICENCE
 
     def __init__(
@@ -76,9 +78,10 @@ class Online:
         start: float | str | None = None,
         end: float | str | None = None,
         fps: float | str | None = None,
+        keypoints: Path | str | None = None,
     ) -> None:
         self.root = root
-        self.masks = Path(masks) if masks else None
+        self.masks, self.keypoints = (Path(path) if path else None for path in (masks, keypoints))
         self.start, self.end, self.fps = (None if value is None else float(value) for value in (start, end, fps))
         for path in (self.root, *([self.masks] if self.masks else [])):
             if not path.exists():
@@ -91,7 +94,10 @@ class Online:
     @property
     def settings(self) -> dict[str, str]:
         """The options that differ from their defaults, for the record."""
-        given = {"masks": self.masks and self.masks.resolve(), "start": self.start, "end": self.end, "fps": self.fps}
+        given = {
+            "masks": self.masks and self.masks.resolve(), "start": self.start, "end": self.end, "fps": self.fps,
+            "keypoints": self.keypoints and self.keypoints.resolve(),
+        }  # fmt: skip
         return {name: str(value) for name, value in given.items() if value is not None}
 
     def cases(self, selection: Selection) -> list[str]:
@@ -122,14 +128,16 @@ class Online:
         times = [material.times[i] for i in indices]
         span = times[-1] - times[0]
         masks, note = self._masks(self._table[case])
+        points, outside = self._keypoints
         settings = f"{indices} {self._table[case]} {self.fps}"
         sources = self._mask_sources
         return Video(
             title=str(self.root), name=case, species="animal", fps=(len(times) - 1) / span if span else FOLDER_FPS,
             licence=LICENCE, identity=files_identity(*(material.files or (self.root,)), *sources) + settings,
             size=material.size,
-            moments=tuple(Moment(self._label(i), material.times[i]) for i in indices),
-            images=self._images, masks=masks, notes=(*material.notes, *(text for text in (thinned, note) if text)),
+            moments=tuple(Moment(self._label(i), material.times[i], points[i]) for i in indices),
+            images=self._images, masks=masks,
+            notes=(*material.notes, *(text for text in (thinned, note, outside) if text)),
         )  # fmt: skip
 
     def unmasked(self, case: str) -> Unmasked:
@@ -138,9 +146,21 @@ class Online:
         Raises:
             UserError: as `load`.
         """
-        indices = self._chosen[0]
-        stems = tuple(self._material.files[i].stem if self._material.files else f"{i:05d}" for i in indices)
+        stems = tuple(self._stems[i] for i in self._chosen[0])
         return Unmasked(str(self.root), stems, self._material.size, self._images, {})
+
+    @property
+    def _stems(self) -> list[str]:
+        """Names of all frames; of a video their numbers."""
+        return [f.stem for f in self._material.files] or [f"{i:05d}" for i in range(len(self._material.times))]
+
+    @cached_property
+    def _keypoints(self) -> tuple[list[Keypoints | None], str]:
+        """Of every frame, and a sentence on those that lie outside."""
+        if self.keypoints is None:
+            return [None] * len(self._material.times), ""
+        found = read_keypoints(self.keypoints, self._stems, self._material.size)
+        return found, told_outside(found, self._material.size)
 
     @property
     def name(self) -> str:
@@ -163,7 +183,8 @@ class Online:
                 raise UserError(f"{self.root}: expected a video or a folder of frames, got one image.")
             facts = video_facts(self.root)
             fault = f"ffmpeg complains of the video, {len(facts.times)} frames were read: {facts.faults}"
-            notes = (fault,) if facts.faults else ()
+            order = f"time stamps are missing or out of order: {ASSUMED_FPS:g} frames a second assumed"
+            notes = (*((fault,) if facts.faults else ()), *(() if facts.is_stamped else (order,)))
             return Material((), facts.times, (facts.width, facts.height), facts.has_alpha, notes)
         files = tuple(f for f in list_images(self._frames_root) if f.suffix.lower() in FRAME_SUFFIXES)
         if not files:

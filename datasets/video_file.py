@@ -21,6 +21,8 @@ from rewild4d.errors import UserError
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".gif", ".mpg", ".mpeg", ".wmv", ".ts", ".3gp")
 _TIME = re.compile(r"showinfo.*\bn: *\d+ .*\bpts_time:(\S+)")
 _FAULT = re.compile(r"\[(?:error|fatal)\] (.+)")
+ASSUMED_FPS = 25.0
+"""Of a video without time stamps that ascend."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,8 @@ class VideoFacts:
         height: of the upright frames in pixels.
         has_alpha: whether any frame is transparent anywhere.
         faults: what ffmpeg complained of ("" where of nothing).
+        is_stamped: whether the times are the file's own; where its stamps are missing or out of order, they are those
+            of `ASSUMED_FPS` frames a second.
     """
 
     times: tuple[float, ...]
@@ -40,6 +44,7 @@ class VideoFacts:
     height: int
     has_alpha: bool
     faults: str
+    is_stamped: bool = True
 
 
 def read_video(path: Path) -> Iterator[np.ndarray]:
@@ -76,17 +81,19 @@ def _facts(path: Path, size: int, changed: int) -> VideoFacts:
         said = log.read()
     if not count:
         raise UserError(f"{path}: expected a video that ffmpeg can read, got {_complaint(said) or 'no frame'}.")
-    return VideoFacts(_ascending(re.findall(_TIME, said), count), width, height, has_alpha, _complaint(said))
+    times = ascending(re.findall(_TIME, said), count)
+    assumed = tuple(i / ASSUMED_FPS for i in range(count))
+    return VideoFacts(times or assumed, width, height, has_alpha, _complaint(said), times is not None)
 
 
-def _ascending(stamps: list[str], count: int) -> tuple[float, ...]:
-    """Times from the first frame on; where stamps are missing or do not ascend, frames at 25 a second."""
+def ascending(stamps: list[str], count: int) -> tuple[float, ...] | None:
+    """Times from the first frame on; None where stamps are missing or do not ascend."""
     try:
         times = [float(stamp) for stamp in stamps[:count]]
     except ValueError:
         times = []
     if len(times) < count or any(after <= before for before, after in zip(times, times[1:], strict=False)):
-        return tuple(i / 25 for i in range(count))
+        return None
     return tuple(time - times[0] for time in times)
 
 

@@ -6,7 +6,7 @@ animal, and those where the image's border cuts it, are kept out, and the clip s
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from rewild4d.contracts import Selection
 from rewild4d.datasets.crops import cut, follow, lost_share
 from rewild4d.datasets.keypoints import in_crop
 from rewild4d.datasets.masks import MaskFacts, mask_facts
+from rewild4d.datasets.travel import TravelMeter
 from rewild4d.errors import UserError
 from rewild4d.files import atomic, cache_folder, digest
 from rewild4d.types import Clip, Crop, Frame, Keypoints, Truth
@@ -25,9 +26,11 @@ LEAST_FRAMES = 4
 """Usable frames without which nothing is reconstructed: three to learn from and one to test."""
 LEAST_AREA = 64
 """Pixels of mask below which a frame counts as one without the animal."""
+TWIN = 0.5
+"""A second part above this share of the largest may be a second animal."""
 LOST = 0.02
 """Share of the animal outside the crop of a held-out frame above which it is told."""
-_CACHE_VERSION = "1"
+_CACHE_VERSION = "2"
 
 Masks = Callable[[], Iterator[np.ndarray | None]]
 
@@ -89,12 +92,20 @@ class Layout:
         tested: which of them are held out, bool for each.
         crops: of each.
         notes: what was left out and why, a sentence each.
+        travel: x and y of the animal's motion over the background from each frame that is not held out to the next of
+            them, pixels of the original frames; empty until the frames were looked at.
     """
 
     used: tuple[int, ...]
     tested: tuple[bool, ...]
     crops: tuple[Crop, ...]
     notes: tuple[str, ...]
+    travel: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def shown(self) -> list[int]:
+        """Rows of the frames that are not held out."""
+        return [row for row, tested in enumerate(self.tested) if not tested]
 
 
 def split_video(video: Video, selection: Selection) -> tuple[Clip, Truth]:
@@ -115,12 +126,61 @@ def split_video(video: Video, selection: Selection) -> tuple[Clip, Truth]:
         _fill(video, layout, selection.size, folder)
     layout = _read_layout(folder / "layout.json")
     frames = _Frames(video, layout, np.load(folder / "rgba.npy", mmap_mode="r"))
-    shown = tuple(frames[i] for i, tested in enumerate(layout.tested) if not tested)
+    shown = tuple(frames[i] for i in layout.shown)
     hidden = _Chosen(frames, [i for i, tested in enumerate(layout.tested) if tested])
-    fps = video.fps / selection.stride
-    key = frames.digest([i for i, tested in enumerate(layout.tested) if not tested])
-    clip = Clip(video.name, video.species, shown, fps, video.licence, key, (*video.notes, *layout.notes))
+    travel = _travel_in_crops(layout, selection.size)
+    clip = Clip(
+        video.name, video.species, shown, video.fps / selection.stride, video.licence,
+        digest(frames.digest(layout.shown), travel), (*video.notes, *layout.notes),
+        start=video.moments[layout.used[0]].time, travel=travel,
+    )  # fmt: skip
     return clip, Truth(hidden, None, frames.digest(hidden.indices))
+
+
+def _travel_in_crops(layout: Layout, size: int) -> torch.Tensor:
+    """The travel in pixels of the crop that each step leads to, [T - 1, 2]."""
+    sides = torch.tensor([layout.crops[row].side for row in layout.shown[1:]])
+    return torch.tensor(layout.travel).reshape(-1, 2) * (size / sides)[:, None]
+
+
+def usable(
+    video: Video, facts: Sequence[MaskFacts | None], stride: int = 1, least: int = 1
+) -> tuple[list[int], tuple[str, ...]]:
+    """Indices of the frames that show the whole animal, and what was left out and why, a sentence each.
+
+    Frames that the image's border cuts stay where most are like that.
+
+    Args:
+        video: whose frames.
+        facts: of each moment's mask; None where there is none.
+        stride: every so many frames are looked at.
+        least: how many frames there must be.
+
+    Raises:
+        UserError: there are fewer.
+    """
+    kept = [(i, facts[i]) for i in range(0, len(facts), stride)]
+    missing = [i for i, fact in kept if fact is None]
+    empty = [i for i, fact in kept if fact is not None and (fact.box is None or fact.area < LEAST_AREA)]
+    seen = [i for i, fact in kept if fact is not None and fact.box is not None and fact.area >= LEAST_AREA]
+    is_cut = [i for i in seen if (fact := facts[i]) is not None and fact.is_cut]
+    notes = [_told(video, missing, "without a mask left out"), _told(video, empty, "without the animal left out")]
+    used = [i for i in seen if i not in set(is_cut)]
+    if len(used) < max(LEAST_FRAMES, len(seen) // 4):
+        used, cut_note = seen, "where the image's border cuts the animal kept, because most are like that"
+    else:
+        cut_note = "where the image's border cuts the animal left out"
+    notes.append(_told(video, is_cut, cut_note))
+    twins = [i for i in used if (fact := facts[i]) is not None and fact.second > TWIN]
+    notes.append(_told(video, twins, "with two parts of like size (two animals?) taken as one animal"))
+    if len(used) < least:
+        reasons = [f"{len(missing)} have no mask" if missing else "", f"{len(empty)} an empty one" if empty else ""]
+        said = " and ".join(reason for reason in reasons if reason)
+        raise UserError(
+            f"{video.title}: expected at least {least} frame{'s' * (least > 1)} with a mask of the animal, got "
+            f"{len(used)} of {len(kept)}{f' ({said})' if said else ''}."
+        )
+    return used, tuple(note for note in notes if note)
 
 
 def lay_out(video: Video, facts: Sequence[MaskFacts | None], selection: Selection) -> Layout:
@@ -134,40 +194,18 @@ def lay_out(video: Video, facts: Sequence[MaskFacts | None], selection: Selectio
     Raises:
         UserError: too few usable frames.
     """
-    kept = [(i, facts[i]) for i in range(0, len(facts), selection.stride)]
-    missing = [i for i, fact in kept if fact is None]
-    empty = [i for i, fact in kept if fact is not None and (fact.box is None or fact.area < LEAST_AREA)]
-    seen = [i for i, fact in kept if fact is not None and fact.box is not None and fact.area >= LEAST_AREA]
-    is_cut = [i for i in seen if (fact := facts[i]) is not None and fact.is_cut]
-    notes = [_told(video, missing, "without a mask left out"), _told(video, empty, "without the animal left out")]
-    used = [i for i in seen if i not in set(is_cut)]
-    if len(used) < max(LEAST_FRAMES, len(seen) // 4):
-        used, cut_note = seen, "where the image's border cuts the animal kept, because most are like that"
-    else:
-        cut_note = "where the image's border cuts the animal left out"
-    notes.append(_told(video, is_cut, cut_note))
-    if len(used) < LEAST_FRAMES:
-        raise UserError(
-            f"{video.title}: expected at least {LEAST_FRAMES} frames with a mask of the animal, got {len(used)} of "
-            f"{len(kept)}{_why(missing, empty)}."
-        )
+    used, notes = usable(video, facts, selection.stride, LEAST_FRAMES)
     tested = split_frames(len(used), selection.split or len(used))
     shown = [i for i, test in zip(used, tested, strict=True) if not test]
     times = [video.moments[i].time for i in shown]
     boxes = [fact.box for i in shown if (fact := facts[i]) is not None and fact.box is not None]
     crops = follow(times, boxes, [video.moments[i].time for i in used], video.size)
-    return Layout(tuple(used), tuple(tested), tuple(crops), tuple(note for note in notes if note))
+    return Layout(tuple(used), tuple(tested), tuple(crops), notes)
 
 
 def split_frames(count: int, split: int) -> list[bool]:
     """Which of the usable frames are held out: the middle one of every ``split``, never the first or the last."""
     return [i % split == split // 2 and 0 < i < count - 1 for i in range(count)]
-
-
-def _why(missing: list[int], empty: list[int]) -> str:
-    reasons = [f"{len(missing)} have no mask" if missing else "", f"{len(empty)} an empty one" if empty else ""]
-    said = " and ".join(reason for reason in reasons if reason)
-    return f" ({said})" if said else ""
 
 
 def _told(video: Video, indices: list[int], what: str) -> str:
@@ -191,7 +229,7 @@ def _fill(video: Video, layout: Layout, size: int, folder: Path) -> None:
     """Cut every used frame and write the cache; the images are written last and say that it is complete."""
     place = {index: row for row, index in enumerate(layout.used)}
     lost: list[int] = []
-    written = 0
+    meter, written = TravelMeter(), 0
     truths = video.true_masks() if video.true_masks else iter([None] * len(video.moments))
     header = {"descr": "|u1", "fortran_order": False, "shape": (len(layout.used), size, size, 4)}
     with atomic(folder / "rgba.npy") as temporary, temporary.open("wb") as file:
@@ -204,25 +242,26 @@ def _fill(video: Video, layout: Layout, size: int, folder: Path) -> None:
             crop = layout.crops[row]
             file.write(cut(image, judged, crop, size).tobytes())
             written += 1
-            if layout.tested[row] and lost_share(judged, crop) > LOST:
+            if not layout.tested[row]:
+                meter.add(image, mask)
+            elif lost_share(judged, crop) > LOST:
                 lost.append(index)
         if written < len(layout.used):
             raise UserError(f"{video.title}: expected {len(layout.used)} frames to cut, got {written}: it is cut off.")
         note = _told(video, lost, f"held out reach over their crop with more than {LOST:.0%} of the animal")
-        _write_layout(folder / "layout.json", replace(layout, notes=(*layout.notes, note) if note else layout.notes))
+        notes, travel = (*layout.notes, note) if note else layout.notes, tuple(meter.result().tolist())
+        _write_layout(folder / "layout.json", replace(layout, notes=notes, travel=travel))
 
 
 def _write_layout(path: Path, layout: Layout) -> None:
-    crops = [(crop.left, crop.top, crop.side, crop.width, crop.height) for crop in layout.crops]
-    parts = {"used": layout.used, "tested": layout.tested, "crops": crops, "notes": layout.notes}
     with atomic(path) as temporary:
-        temporary.write_text(json.dumps(parts))
+        temporary.write_text(json.dumps(asdict(layout)))
 
 
 def _read_layout(path: Path) -> Layout:
     parts = json.loads(path.read_text())
-    crops = tuple(Crop(*values) for values in parts["crops"])
-    return Layout(tuple(parts["used"]), tuple(parts["tested"]), crops, tuple(parts["notes"]))
+    crops = tuple(Crop(**values) for values in parts.pop("crops"))
+    return Layout(crops=crops, **{name: tuple(values) for name, values in parts.items()})
 
 
 def _key(video: Video, selection: Selection) -> str:

@@ -30,7 +30,7 @@ from rewild4d.files import write_text
 from rewild4d.leaderboard.records import FILE, SCHEMA, RunRecord, Timing, make_run_id, read_record, write_record
 from rewild4d.machine import code_version, machine, peak_memory_mib
 from rewild4d.priors.choose import PriorChoice, make_prior
-from rewild4d.priors.footage import with_cameras
+from rewild4d.priors.placing import known_frames, with_cameras
 from rewild4d.protocol import Protocol, evaluate
 from rewild4d.rasterizer import pick_rasterizer, set_default
 from rewild4d.registry import load_method
@@ -125,7 +125,11 @@ def execute(plan: Plan) -> list[RunRecord]:
     if jobs <= 1:
         torch.set_num_threads(plan.threads)
         set_default(plan.rasterizer)
-        return [record for name in plan.cases for record in _run_case(plan, name)]
+        records = []
+        for name in plan.cases:
+            _prepare(plan, name)
+            records += _run_case(plan, name)
+        return records
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context, _start_worker, (plan.threads, plan.rasterizer, os.getpid())) as pool:
         # Every fit of a case starts from its prior, so the priors come first.
@@ -153,11 +157,12 @@ def _start_worker(threads: int, rasterizer: str, parent: int) -> None:
 
 
 def _prepare(plan: Plan, name: str) -> None:
-    """Make the prior of a case where a fit still needs it; what is wrong with it is said by those fits."""
+    """Make the prior of a case where a fit still needs it, and tell its notes; faults are told by those fits."""
     clip, truth = plan.reader.load(name, plan.protocol.selection)
     if not all(job.finished() for job in _jobs(plan, name, clip, truth)):
-        with contextlib.suppress(UserError):
-            _prior(plan, clip, truth)
+        with contextlib.suppress(UserError, FloatingPointError):
+            for note in _prior(plan, clip, truth).notes:
+                print(f"{name}: prior: {note}", file=sys.stderr)
 
 
 def _run_part(plan: Plan, name: str, entry: Entry, seed: int) -> RunRecord:
@@ -172,8 +177,8 @@ def _run_case(plan: Plan, name: str) -> list[RunRecord]:
         return [read_record(job.folder / FILE) for job in jobs]
     try:
         prior = _prior(plan, clip, truth)
-        case = Case(with_cameras(clip, prior), prior, truth)
-    except UserError as error:
+        case = Case(with_cameras(known_frames(clip, prior), prior), prior, truth)
+    except (UserError, FloatingPointError) as error:
         return [job.fail(str(error)) for job in jobs]
     seen = coverage(clip, truth)
     return [read_record(job.folder / FILE) if job.finished() else job.run(case, seen) for job in jobs]
@@ -219,10 +224,11 @@ class Job:
             reconstruction, fit_seconds = self._fit(case)
             begin = time.perf_counter()
             progress = Progress(f"{self.title}: evaluate")
-            found = evaluate(reconstruction, case.clip, case.truth, self.plan.protocol, progress, self.plan.device)
+            clip = with_cameras(self.clip, case.prior)  # also the frames that the fit was not shown
+            found = evaluate(reconstruction, clip, case.truth, self.plan.protocol, progress, self.plan.device)
             progress.close()
             seconds = time.perf_counter() - begin
-            pictures = save_pictures(reconstruction, case.clip, case.truth, self.folder)
+            pictures = save_pictures(reconstruction, clip, case.truth, self.folder)
         except UserError as error:
             return self.fail(str(error), case)
         except Exception as error:  # a bug or a diverged fit: the record keeps the message, the terminal the traceback
@@ -271,8 +277,8 @@ class Job:
             "config": msgspec.to_builtins(self.entry.config),
             "data": {"root": str(plan.root), "licence": self.clip.licence, "clip": self.clip.digest,
                      "truth": self.truth.digest, **_said(plan.reader, self.clip)},
-            "prior": {"choice": plan.prior.name, "config": msgspec.to_builtins(plan.prior.config), 
-                      **_describe(case.prior if case else None)},
+            "prior": {"choice": plan.prior.name, "config": msgspec.to_builtins(plan.prior.settings(self.clip)),
+                      **_keypoints(plan.prior, self.clip), **_describe(case.prior if case else None)},
             "protocol": {"digest": plan.protocol.digest, **msgspec.to_builtins(plan.protocol)},
             "code": code_version(), "machine": machine(plan.device, plan.rasterizer),
         }  # fmt: skip
@@ -305,7 +311,15 @@ def _describe(prior: Prior | None) -> dict[str, Any]:
     """What a record says of the prior that was made, if any was."""
     if prior is None:
         return {"name": "none"}
-    return {"name": prior.name, "provenance": prior.provenance, "digest": prior.digest, "quality": prior.quality}
+    said = {"name": prior.name, "provenance": prior.provenance, "digest": prior.digest, "quality": prior.quality}
+    return said | ({"notes": list(prior.notes)} if prior.notes else {})
+
+
+def _keypoints(choice: PriorChoice, clip: Clip) -> dict[str, str]:
+    """Which annotated keypoints the fit of the prior saw, where the clip has any."""
+    if choice.mapping is None or all(frame.keypoints is None for frame in clip.frames):
+        return {}
+    return {"keypoints": choice.use, "mapping": choice.mapping}
 
 
 def _diagnostics(reconstruction: Reconstruction) -> dict[str, Any]:

@@ -148,6 +148,9 @@ class Clip:
         licence: of the data.
         digest: SHA-256 over the pixels, mattes and cameras that the method gets.
         notes: what was left out or assumed when the clip was read, a sentence each.
+        start: seconds from the start of the video to the moment that the clip calls 0.
+        travel: motion of the animal over the background from each frame to the next, in pixels of the latter's image
+            (x to the right, y down), measured in these whole frames alone; None where it is not known, [T - 1, 2].
     """
 
     name: str
@@ -157,6 +160,8 @@ class Clip:
     licence: str
     digest: str
     notes: tuple[str, ...] = ()
+    start: float = 0.0
+    travel: Tensor | None = None
 
     @property
     def times(self) -> tuple[float, ...]:
@@ -207,6 +212,7 @@ class Prior:
         transforms_flip: the same for the horizontally flipped frames, float32, [T, J, 4, 4].
         quality: named figures of the fit (mask_iou, ...), copied into the record.
         digest: SHA-256 of all of the above.
+        notes: what was done to it for a clip and what speaks against it, a sentence each; not in its file.
     """
 
     name: str
@@ -225,6 +231,7 @@ class Prior:
     transforms_flip: Tensor
     quality: dict[str, float]
     digest: str
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

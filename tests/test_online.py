@@ -1,6 +1,7 @@
 """A person's own video, well formed and not: every fault is one sentence or a stated fallback."""
 
 import json
+import re
 from pathlib import Path
 
 import moving
@@ -10,11 +11,12 @@ from PIL import Image
 from test_wild import SELECTION, cache, iou, restored  # noqa: F401
 
 from rewild4d import cli
+from rewild4d.datasets import video_file
 from rewild4d.datasets.aptv2 import AptV2
 from rewild4d.datasets.davis import Davis
 from rewild4d.datasets.mask_check import check_videos
 from rewild4d.datasets.online import Online
-from rewild4d.datasets.video_file import video_facts
+from rewild4d.datasets.video_file import ascending, video_facts
 from rewild4d.errors import UserError
 
 H264 = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-qp", "12")
@@ -173,6 +175,28 @@ def test_two_animals_by_id_are_two_cases(walk: Path) -> None:
     assert both is not None and ((both > 0) == ((moving.mask(0, left=20) | moving.mask(0, left=60)) > 0)).all()
     frame = reader.load("clip@2", SELECTION)[0].frames[0]
     assert iou(restored(frame, moving.SIZE), moving.mask(0, left=60) > 0) > 0.93
+
+
+def test_two_animals_in_one_mask_are_taken_as_one_and_told(walk: Path) -> None:
+    for i in (3, 4):
+        moving.save(walk / "masks" / f"{i:05d}.png", moving.mask(i, left=20) | moving.mask(i, left=60))
+    clip, truth = load(walk)
+    assert len(whole(clip, truth)) == 12
+    told = "2 of 12 frames with two parts of like size (two animals?) taken as one animal: 00003.png to 00004.png"
+    assert told in clip.notes
+
+
+def test_time_stamps_out_of_order_are_replaced_and_told(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert ascending(["0.5", "0.6", "0.8"], 3) == pytest.approx((0, 0.1, 0.3))
+    assert ascending(["0.5", "0.8", "0.6"], 3) is None and ascending(["0.5", "NOPTS"], 2) is None
+    film = moving.film(tmp_path / "walk.mp4", walk / "frames", *H264)
+    shuffled = re.compile(r"showinfo.*\bn: *\d+ .*\bpts_time:\S*?(\d)\b")  # tenths alone: 0 to 9, then 0 again
+    monkeypatch.setattr(video_file, "_TIME", shuffled)
+    clip, truth = load(film, masks=walk / "masks")
+    assert [frame.time for frame in whole(clip, truth)] == pytest.approx([i / 25 for i in range(12)])
+    assert "time stamps are missing or out of order: 25 frames a second assumed" in clip.notes
 
 
 def test_check_tells_what_a_person_should_look_at(walk: Path, tmp_path: Path) -> None:

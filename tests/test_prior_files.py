@@ -13,16 +13,15 @@ import torch
 
 from rewild4d.cli import main
 from rewild4d.commands import prior as command
+from rewild4d.datasets.keypoint_files import read_keypoints, told_outside
+from rewild4d.datasets.travel import TravelMeter
 from rewild4d.errors import UserError
-from rewild4d.priors.annotations import read_keypoints
 from rewild4d.priors.config import FOOTAGE
 from rewild4d.priors.fauna import read_fauna
 from rewild4d.priors.fauna_bones import estimate_bones, joint_transforms, skinning_weights
-from rewild4d.priors.folder import _foreground
 from rewild4d.priors.io import load_prior, save_prior
-from rewild4d.priors.steady import clusters, steady, without_hops
+from rewild4d.priors.steady import REACH, clusters, steady, without_hops
 from rewild4d.priors.template import quadruped
-from rewild4d.priors.travel import TravelMeter, between
 from rewild4d.transforms import look_at, skin_points
 from rewild4d.types import Camera, Prior
 
@@ -37,6 +36,7 @@ def test_badja_is_row_column_at_its_own_size(tmp_path: Path) -> None:
     assert found[1].points[0].tolist() == [960.5 / 2, 540.5 / 2]
     # the third joint lies below the frame
     assert found[1].visible.tolist() == [True, False, False]
+    assert told_outside(found, (960, 540)) == "1 keypoints outside their frame taken as not visible"
 
 
 def test_of_several_coco_animals_the_largest_box_counts(tmp_path: Path) -> None:
@@ -131,7 +131,8 @@ def test_a_camera_that_hops_is_left_out_and_a_hop_of_the_mirrored_one_is_mended(
     angles = [0.1 * t for t in range(12)]
     hopping = [a + math.pi * (t == 4) for t, a in enumerate(angles)]
     mirrored = [-a + math.pi * (t == 7) for t, a in enumerate(angles)]
-    assert steady(ring(angles)).all() and steady(ring(hopping)).tolist() == [t != 4 for t in range(12)]
+    times = torch.arange(12).double() / 24
+    assert steady(ring(angles), times).all() and steady(ring(hopping), times).tolist() == [t != 4 for t in range(12)]
     filtered = without_hops(a_prior(hopping, mirrored))
     assert filtered.kept == tuple(t for t in range(12) if t != 4) and len(filtered.prior.cameras) == 11
     # row 7 is the sixth of those kept; its mirrored camera is now the mirror image of the plain one
@@ -140,6 +141,22 @@ def test_a_camera_that_hops_is_left_out_and_a_hop_of_the_mirrored_one_is_mended(
     assert filtered.notes[1].startswith("1 of 12 frames mirrored") and filtered.notes[1].endswith(": 7")
     nothing = without_hops(a_prior(angles, [-a for a in angles]))
     assert nothing.notes == () and len(nothing.kept) == 12
+
+
+def test_a_frame_that_is_held_out_parts_no_smooth_way_but_a_hop_stays_one() -> None:
+    shown = [t for t in range(15) if t % 5 != 2]
+    times, fast = torch.tensor(shown).double() / 24, [0.2 * t for t in shown]
+    assert 2 * math.sin(0.2) > REACH > 2 * math.sin(0.1)  # two steps are too far apart, one is not
+    assert steady(ring(fast), times).all()
+    assert not steady(ring(fast), torch.arange(12).double()).all()
+    turned = [angle + math.pi / 2 * (t > 12) for angle, t in zip(fast, shown, strict=True)]
+    assert steady(ring(turned), times).tolist() == [t < 12 for t in shown]
+
+
+def test_cameras_of_which_few_agree_all_stay_and_that_is_told() -> None:
+    scattered = without_hops(a_prior([0.1 * t if t < 4 else 1.5 * t for t in range(12)], [-0.1 * t for t in range(12)]))
+    assert len(scattered.kept) == 12
+    assert scattered.notes == ("no camera left out: the largest group that agrees is 4 of 12 frames",)
 
 
 def test_travel_is_measured_against_a_background_that_moves() -> None:
@@ -153,7 +170,13 @@ def test_travel_is_measured_against_a_background_that_moves() -> None:
         meter.add(image, mask)
     steps = meter.result()
     assert torch.allclose(steps, torch.tensor((10.0, 0.0)).expand(3, 2), atol=0.5)
-    assert torch.allclose(between(steps, [0, 3]), torch.tensor(((30.0, 0.0),)), atol=1.0)
+    large = TravelMeter()
+    for t in (0, 1):  # nine times as large as frames are looked at, in pixels of the large ones
+        image = cv2.resize(scene[:, 10 * t : 10 * t + 200], (1800, 1080), interpolation=cv2.INTER_LINEAR)
+        mask = np.zeros((1080, 1800), np.uint8)
+        mask[360:720, 720:1080] = 255
+        large.add(image, mask)
+    assert torch.allclose(large.result(), torch.tensor(((90.0, 0.0),)), atol=3.0)
 
 
 def write_fauna(folder: Path, rest: torch.Tensor, faces: torch.Tensor, angles: torch.Tensor, pose: np.ndarray) -> None:
@@ -216,7 +239,7 @@ def write_frames(folder: Path, count: int) -> None:
         (folder / name).mkdir()
     for t in range(count):
         mask = np.zeros((48, 64), np.uint8)
-        cv2.ellipse(mask, (28 + 2 * t, 20), (16, 7), 0, 0, 360, 255, -1)
+        cv2.ellipse(mask, (26 + 2 * t, 20), (16, 7), 0, 0, 360, 255, -1)
         for x in (18, 36):
             mask[22:38, x + 2 * t : x + 3 + 2 * t] = 255
         cv2.imwrite(str(folder / "frames" / f"{t}.png"), np.full((48, 64, 3), 90, np.uint8))
@@ -235,6 +258,8 @@ def test_the_command_writes_a_prior_and_its_pictures(tmp_path: Path, monkeypatch
         str(tmp_path / "masks"),
         "--out",
         str(tmp_path / "p.npz"),
+        "--fps",
+        "24",
     ]
     entry = {"image_path": "2.jpg", "joints": [[540, 960]] * 34, "visibility": [1] * 34}
     (tmp_path / "k.json").write_text(json.dumps([entry, entry | {"image_path": "10.jpg"}]))
@@ -259,9 +284,15 @@ def test_bad_input_to_the_command_is_one_sentence(tmp_path: Path, capsys) -> Non
     cv2.imwrite(str(tmp_path / "masks" / "1.png"), np.zeros((10, 10), np.uint8))
     (tmp_path / "other").mkdir()
     cases = [
-        (["fit", *frames, *masks, *out], "expected a mask of 64x48 pixels like 1.png, got 10x10"),
-        (["fit", *frames, "--masks", str(tmp_path / "none"), *out], "expected a folder of masks, but there is none"),
-        (["fit", *frames, "--masks", str(tmp_path / "other"), *out], "expected masks as .png, .jpg, .jpeg"),
+        (
+            ["fit", *frames, *masks, *out],
+            "1.png: expected a mask of 64x48 pixels like its frame (or of that shape)",
+        ),
+        (
+            ["fit", *frames, "--masks", str(tmp_path / "none"), *out],
+            "none: expected a video file or a folder of",
+        ),
+        (["fit", *frames, "--masks", str(tmp_path / "other"), *out], "other: expected masks (.png, .jpg, "),
         (["fit", *frames, *masks, *out, "--mapping", "badja"], "--keypoints and --mapping: expected both or neither"),
         (["fitt"], "fit"),
     ]
@@ -271,18 +302,12 @@ def test_bad_input_to_the_command_is_one_sentence(tmp_path: Path, capsys) -> Non
         said = capsys.readouterr().err
         assert stop.value.code == 2 and message in said and said.count("\n") == 1
     (tmp_path / "masks" / "1.png").write_bytes(b"no image")
-    with pytest.raises(UserError, match="expected an image that can be read"):
+    with pytest.raises(UserError, match="1.png: expected a mask image that can be read"):
         command.main(["fit", *frames, *masks, *out])
-
-
-def test_masks_are_read_by_what_they_hold() -> None:
-    grey = np.array([[0, 100, 255]], np.uint8)
-    assert _foreground(grey).tolist() == [[0, 100, 255]]
-    assert _foreground(np.array([[0, 1, 2]], np.uint8)).tolist() == [[0, 255, 255]]
-    colored = np.array([[[0, 0, 0], [0, 0, 128], [128, 0, 0]]], np.uint8)
-    assert _foreground(colored).tolist() == [[0, 255, 255]]
-    alpha = np.concatenate((np.full((1, 3, 3), 9, np.uint8), grey[..., None]), axis=2)
-    assert _foreground(alpha).tolist() == [[0, 100, 255]]
+    for file in (tmp_path / "masks").iterdir():
+        cv2.imwrite(str(file), np.zeros((48, 64), np.uint8))
+    with pytest.raises(UserError, match="expected at least 1 frame with a mask of the animal, got 0 of 2"):
+        command.main(["fit", *frames, *masks, *out])
 
 
 def test_replacing_times_keeps_a_prior_valid(tmp_path: Path) -> None:

@@ -10,12 +10,13 @@ import torch
 
 from rewild4d.errors import UserError
 from rewild4d.priors.config import FOOTAGE, PriorConfig
-from rewild4d.priors.footage import Evidence, fit_footage, in_crops, resized, with_cameras
+from rewild4d.priors.footage import Evidence, fit_footage
 from rewild4d.priors.judge import joint_scores
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.landmarks import LANDMARKS, Marks, landmark_pixels, load_mapping, mapping_names, marks
 from rewild4d.priors.motion import camera_at
 from rewild4d.priors.overlay import save_overlay
+from rewild4d.priors.placing import in_crops, resized, with_cameras
 from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.silhouettes import outline
 from rewild4d.priors.template import MIRROR, PARENTS, quadruped

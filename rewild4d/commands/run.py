@@ -9,15 +9,13 @@ from typing import Any
 import msgspec
 
 from rewild4d.commands import run_table
-from rewild4d.commands.shared import check_numbers, floor_entry, open_dataset, require_writable
+from rewild4d.commands.shared import check_numbers, choose_prior, floor_entry, open_dataset, require_writable
 from rewild4d.config import load_preset, parse_flags, with_method_flags
 from rewild4d.errors import UserError
 from rewild4d.leaderboard.records import RunRecord, to_json
 from rewild4d.leaderboard.tables import markdown
 from rewild4d.machine import pick_device
-from rewild4d.priors.choose import PriorChoice
-from rewild4d.priors.config import PRESETS as PRIOR_PRESETS
-from rewild4d.priors.config import STANDARD
+from rewild4d.priors.choose import Use
 from rewild4d.protocol import find_protocol
 from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_dataset, load_method
@@ -45,7 +43,12 @@ class Options:
         protocol: what is held out and measured (see `list`); the data set's default where it is left out.
         preset: size of the effort: quick, standard or paper.
         seeds: one run for each.
-        prior: "template" (fitted to the clip), "coarse:<noise>" (from the truth plus noise: for studies) or a file.
+        prior: "template" (fitted to the clip), "coarse:<noise>" (from the truth plus noise: for studies) or a file (of
+            real videos: what `prior fit` or `prior import` wrote).
+        keypoints: of a real video (davis, online): BADJA or COCO-like .json, DeepLabCut or SLEAP .csv.
+        mapping: which keypoint is which point of the template: aptv2, badja, superanimal-quadruped or a .toml file.
+        use_keypoints: frames whose keypoints the prior's fit sees: all; half (the rest is scored); none (all are
+            scored). Where it is left out: all of aptv2's and of a file's, none of BADJA's beside davis.
         device: auto, cpu or cuda.
         rasterizer: what renders: auto, numba (CPU), triton or gsplat (CUDA), or reference (small scenes only).
         jobs: cases at a time; 0 is one for each processor core (one in all on a GPU).
@@ -67,6 +70,9 @@ class Options:
     preset: str = "quick"
     seeds: tuple[int, ...] = (0,)
     prior: str = "template"
+    keypoints: Path | None = None
+    mapping: str | None = None
+    use_keypoints: Use | None = None
     device: str = "auto"
     rasterizer: str = "auto"
     jobs: int = 0
@@ -113,7 +119,7 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
     cases = choose_cases(names, options.case or (preferred(protocol.selection) if preferred else ()))
     floors = [floor_entry(name) for name in protocol.floors if name != options.method]
     entry = Entry(options.method, options.preset, config, tuple(dict.fromkeys(options.seeds)))
-    prior = PriorChoice(options.prior, PRIOR_PRESETS.get(options.preset, STANDARD))
+    prior = choose_prior(options.prior, options.preset, reader, options)
     cores = 1 if device.type == "cuda" else len(os.sched_getaffinity(0))
     return Plan(
         dataset=options.dataset,

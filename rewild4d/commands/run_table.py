@@ -10,7 +10,7 @@ import msgspec
 
 from rewild4d import planning
 from rewild4d.commands.choice import cases_of, chosen
-from rewild4d.commands.shared import check_numbers, floor_entry, open_dataset, require_writable
+from rewild4d.commands.shared import check_numbers, choose_prior, floor_entry, open_dataset, require_writable
 from rewild4d.config import parse_flags
 from rewild4d.contracts import DatasetReader
 from rewild4d.leaderboard.formats import markdown
@@ -19,9 +19,6 @@ from rewild4d.leaderboard.records import RunRecord, to_json
 from rewild4d.leaderboard.specs import Spec, find_spec
 from rewild4d.leaderboard.tables import named_table
 from rewild4d.machine import pick_device
-from rewild4d.priors.choose import PriorChoice
-from rewild4d.priors.config import PRESETS as PRIOR_PRESETS
-from rewild4d.priors.config import STANDARD
 from rewild4d.protocol import Protocol
 from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_dataset
@@ -111,7 +108,6 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
     require_writable(options.out)
     root, reader = open_dataset(spec.dataset, options.data, options)
     cores = 1 if device.type == "cuda" else len(os.sched_getaffinity(0))
-    effort = PRIOR_PRESETS.get(spec.preset, STANDARD)
     plans = []
     for (name, prior), patterns in planning.grounds(spec).items():
         protocol = protocols[name]
@@ -121,7 +117,7 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
         plans.append(
             Plan(
                 dataset=spec.dataset, reader=reader, root=root, cases=cases, protocol=protocol,
-                entries=(*floors, *entries), prior=PriorChoice(prior, effort), device=device,
+                entries=(*floors, *entries), prior=choose_prior(prior, spec.preset, reader), device=device,
                 out=options.out.absolute(), jobs=options.jobs or cores, threads=options.threads, rasterizer=rasterizer,
             )
         )  # fmt: skip

@@ -6,10 +6,13 @@ from typing import Any
 from rewild4d.config import load_preset, preset_names
 from rewild4d.contracts import DatasetReader
 from rewild4d.errors import UserError
+from rewild4d.priors.choose import PriorChoice, Use
+from rewild4d.priors.config import PRESETS, STANDARD
+from rewild4d.priors.landmarks import load_mapping
 from rewild4d.registry import load_builtin, load_dataset, load_method
 from rewild4d.runner import Entry, Progress
 
-SOURCE_FLAGS = ("masks", "start", "end", "fps")
+SOURCE_FLAGS = ("masks", "start", "end", "fps", "keypoints")
 """Flags that a reader takes if its `options` name them."""
 
 
@@ -45,6 +48,31 @@ def open_dataset(dataset: str, data: Path | None, options: Any = None) -> tuple[
     root = make_builtin(progress)
     progress.close()
     return root, reader(root)
+
+
+def choose_prior(name: str, preset: str, reader: DatasetReader, options: Any = None) -> PriorChoice:
+    """What `--prior` and the flags beside it say; keypoints as the data set's reader has them where nothing is said.
+
+    Args:
+        name: of the prior, as in `PriorChoice`.
+        preset: of the method; the prior's effort under known cameras goes with it.
+        reader: of the data set.
+        options: of a command, with `keypoints`, `mapping` and `use_keypoints`.
+
+    Raises:
+        UserError: a file of keypoints without a mapping, a mapping without keypoints, or one that is not known.
+    """
+    file, mapping, use = (getattr(options, flag, None) for flag in ("keypoints", "mapping", "use_keypoints"))
+    own = getattr(reader, "keypoint_mapping", None)
+    if (file is not None and mapping is None) or (file is None and mapping is not None and own is None):
+        raise UserError("--keypoints and --mapping: expected both or neither.")
+    chosen = mapping or own
+    if chosen:
+        load_mapping(chosen)
+    elif use is not None:
+        raise UserError(f"--use-keypoints {use}: expected keypoints, but there are none (--keypoints FILE gives some).")
+    default: Use = "all" if file is not None else getattr(reader, "keypoint_use", "none")
+    return PriorChoice(name, PRESETS.get(preset, STANDARD), chosen, use or default)
 
 
 def require_writable(folder: Path) -> None:

@@ -1,9 +1,11 @@
 """Which prior a run starts from: fitted to its clip, made from the truth with noise, or read from a file."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import msgspec
+import torch
 
 from rewild4d.contracts import Log
 from rewild4d.errors import UserError
@@ -12,12 +14,21 @@ from rewild4d.machine import code_version
 from rewild4d.priors.coarse import coarse_prior
 from rewild4d.priors.config import FOOTAGE, PriorConfig
 from rewild4d.priors.fit import fit_template
-from rewild4d.priors.footage import fit_footage
-from rewild4d.priors.io import load_prior, save_prior
+from rewild4d.priors.footage import Evidence, fit_footage
+from rewild4d.priors.io import load_prior, save_prior, seal
+from rewild4d.priors.judge import doubts, joint_scores, measured
+from rewild4d.priors.landmarks import Marks, load_mapping, marks
+from rewild4d.priors.placing import placed
+from rewild4d.priors.steady import without_hops
 from rewild4d.types import Clip, Prior, Truth
 
 PRIOR_SEED = 0
 """One seed for all: every method and every seed of a case starts from the same prior."""
+
+ELSEWHERE = "made elsewhere: it may have seen the frames that are held out here"
+
+Use = Literal["all", "half", "none"]
+"""Frames whose keypoints a fit sees: all; every other one, and the rest is scored; none, and all are scored."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +38,16 @@ class PriorChoice:
     Attributes:
         name: "template" (fitted to the clip alone, with its cameras where it has any), "coarse" or "coarse:<noise>"
             (from the truth, plus noise; for studies of prior quality only) or the path of an npz file.
-        config: settings of the template fit.
+        config: settings of the template fit under known cameras.
+        mapping: which of the frames' keypoints is which point of the template (`landmarks.load_mapping`); None: they
+            are not looked at.
+        use: which of them a fit to real footage sees.
     """
 
     name: str
     config: PriorConfig
+    mapping: str | None = None
+    use: Use = "none"
 
     @property
     def noise(self) -> float | None:
@@ -48,26 +64,78 @@ class PriorChoice:
         """Digest of all that decides the prior, before it is made: sixteen hex digits."""
         parts: list[str | bytes] = [clip.digest, str(code_version())]
         if self.name == "template":
-            parts += ["template", msgspec.json.encode(self.config)]
+            parts += ["template", msgspec.json.encode(self.settings(clip)), repr(self._pairs), self.use]
         elif self.noise is not None:
             parts += [f"coarse {self.noise}", truth.digest, msgspec.json.encode(self.config)]
         else:
-            parts += ["file", load_prior(Path(self.name)).digest]
+            parts += ["file", load_prior(Path(self.name)).digest, repr(self._pairs)]
         return digest(*parts)[:16]
+
+    def settings(self, clip: Clip) -> PriorConfig:
+        """Settings of the fit that this clip asks for: footage without cameras has its own."""
+        return FOOTAGE if self.name == "template" and not _has_cameras(clip) else self.config
+
+    def keypoints(self, clip: Clip) -> tuple[Marks | None, Marks | None]:
+        """The clip's keypoints for the fit and those to score it by; None where there are none."""
+        return split_marks(marks([frame.keypoints for frame in clip.frames], self._pairs), self.use)
+
+    @property
+    def _pairs(self) -> dict[str, str]:
+        return load_mapping(self.mapping) if self.mapping else {}
+
+
+def split_marks(found: Marks, use: Use) -> tuple[Marks | None, Marks | None]:
+    """Marks for the fit and marks to score it by; None for no marks."""
+    moments, step = found.moments.unique(), {"all": 1, "half": 2, "none": 0}[use]
+    seen = torch.isin(found.moments, moments[::step] if step else moments[:0])
+    given, scored = found.chosen(seen), found.chosen(~seen)
+    return given if len(given) else None, scored if len(scored) else None
 
 
 def make_prior(choice: PriorChoice, clip: Clip, truth: Truth, path: Path, log: Log) -> Prior:
-    """The chosen prior; a fitted one is kept at ``path`` and read from there the next time."""
+    """The chosen prior; a fitted one is kept at ``path`` and read from there the next time.
+
+    For a clip without cameras it has a row for each frame whose camera agrees with the others' (`steady`), and `notes`
+    say what was left out and what speaks against it.
+
+    Raises:
+        UserError: a file that cannot be used or is for another clip, or masks that show nothing.
+    """
+    footage = not _has_cameras(clip)
     if choice.name != "template" and choice.noise is None:
-        return load_prior(Path(choice.name))
-    if not path.is_file():
-        if choice.noise is None and any(frame.camera is None for frame in clip.frames):
-            prior = fit_footage(clip, config=FOOTAGE, seed=PRIOR_SEED, log=log)
-        elif choice.noise is None:
-            prior = fit_template(clip, config=choice.config, seed=PRIOR_SEED, log=log)
-        else:
-            prior = coarse_prior(
-                clip, truth.held_out, noise=choice.noise, seed=PRIOR_SEED, config=choice.config, log=log
+        prior = load_prior(Path(choice.name))
+        if footage:
+            prior = placed(prior, clip)
+            prior = replace(
+                prior, quality=prior.quality | measured(prior, clip.frames), notes=(*prior.notes, ELSEWHERE)
             )
-        save_prior(prior, path)
-    return load_prior(path)
+            prior = _scored(prior, clip, choice.keypoints(clip)[1])
+    else:
+        if not path.is_file():
+            save_prior(_fitted(choice, clip, truth, log), path)
+        prior = load_prior(path)
+    if not footage:
+        return prior
+    filtered = without_hops(prior)
+    return replace(filtered.prior, notes=(*prior.notes, *filtered.notes, *doubts(prior.quality)))
+
+
+def _fitted(choice: PriorChoice, clip: Clip, truth: Truth, log: Log) -> Prior:
+    if choice.noise is not None:
+        return coarse_prior(clip, truth.held_out, noise=choice.noise, seed=PRIOR_SEED, config=choice.config, log=log)
+    if _has_cameras(clip):
+        return fit_template(clip, config=choice.config, seed=PRIOR_SEED, log=log)
+    given, scored = choice.keypoints(clip)
+    said = Evidence(given, clip.travel)
+    return _scored(fit_footage(clip, config=FOOTAGE, seed=PRIOR_SEED, log=log, said=said), clip, scored)
+
+
+def _scored(prior: Prior, clip: Clip, found: Marks | None) -> Prior:
+    """With the figures of `joint_scores` on keypoints that the fit did not see."""
+    if found is None:
+        return prior
+    return seal(replace(prior, quality=prior.quality | joint_scores(prior, clip.frames, found)))
+
+
+def _has_cameras(clip: Clip) -> bool:
+    return all(frame.camera is not None for frame in clip.frames)

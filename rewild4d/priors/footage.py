@@ -16,16 +16,15 @@ from rewild4d.contracts import Log
 from rewild4d.errors import UserError
 from rewild4d.priors.config import PriorConfig, Stage
 from rewild4d.priors.io import seal
+from rewild4d.priors.judge import measured
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.landmarks import Marks
-from rewild4d.priors.motion import world_camera
 from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.race import Race
 from rewild4d.priors.search import facings
-from rewild4d.priors.silhouettes import overlap
 from rewild4d.priors.template import MIRROR, PARENTS, diagonal, quadruped
 from rewild4d.priors.views import FIELD_OF_VIEW, Views, fauna_camera, windows
-from rewild4d.transforms import rigid, skin_points
+from rewild4d.transforms import rigid
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Prior
 
 
@@ -35,7 +34,7 @@ class Evidence:
 
     Attributes:
         marks: keypoints in pixels of the clip's frames.
-        travel: motion of the animal against the background between neighbouring frames, pixels, [T - 1, 2].
+        travel: of the animal over the background, pixels (`Clip.travel`), [T - 1, 2].
     """
 
     marks: Marks | None = None
@@ -98,7 +97,7 @@ class StandingCamera(Race):
 
     def _against_travel(self) -> Tensor | float:
         """Whether heads point against (1) or along (-1) the way the animal goes over the ground, [B]."""
-        if self.said.travel is None:
+        if self.said.travel is None or not len(self.said.travel):
             return 0.0
         walked = self.said.travel / self.boxes[1:, 2:]
         # a step is noise: legs move the mask's centre up and down, and what matters is where the way leads
@@ -139,8 +138,8 @@ def fit_footage(
         name: of the prior.
 
     Returns:
-        A prior with one camera and pose per frame and for its mirror image; `quality` holds mask_iou, mask_iou_flip,
-        facing_margin, facing_margin_flip and more.
+        A prior with one camera and pose per frame and for its mirror image; `quality` holds the figures of
+        `judge.measured`, cost, and facing_margin: the lead of the best guess over the best that heads the other way.
 
     Raises:
         UserError: no mask shows anything.
@@ -154,7 +153,7 @@ def fit_footage(
     flipped = tuple(replace(f, rgb=f.rgb.flip(-1), mask=f.mask.flip(-1)) for f in clip.frames)
     mirrored = said.mirrored(clip.frames[0].mask.shape[2])
     race_flip = _run(clip, flipped, mirrored, config, seed, log, total, race.guesses)
-    return _prior(clip, flipped, race, race_flip, name, seed)
+    return _prior(clip, race, race_flip, name, seed)
 
 
 def _run(
@@ -185,42 +184,35 @@ def _run(
     return race
 
 
-def _prior(
-    clip: Clip, flipped: tuple[Frame, ...], race: StandingCamera, race_flip: StandingCamera, name: str, seed: int
-) -> Prior:
-    shape = Proportions(race.guesses.shape[0], race.guesses.relief[0])
-    template, count = quadruped(shape), len(clip.frames)
-    halves = []
-    for frames, half in ((clip.frames, race), (flipped, race_flip)):
-        cameras = object_cameras(half)
-        transforms = pose(half.guesses.joint_angles()[0], template.bones[:, 0], PARENTS)
-        posed = skin_points(template.vertices, template.weights, transforms)
-        halves.append((cameras, transforms, overlap(list(posed), template.faces, cameras, [f.mask for f in frames])))
-    quality = {"mask_iou": halves[0][2], "mask_iou_flip": halves[1][2]}
+def _prior(clip: Clip, race: StandingCamera, race_flip: StandingCamera, name: str, seed: int) -> Prior:
+    template, count = quadruped(Proportions(race.guesses.shape[0], race.guesses.relief[0])), len(clip.frames)
+    transforms, transforms_flip = (
+        pose(half.guesses.joint_angles()[0], template.bones[:, 0], PARENTS) for half in (race, race_flip)
+    )
+    quality: dict[str, float] = {}
     for suffix, half in (("", race), ("_flip", race_flip)):
         quality |= {f"{key}{suffix}": value for key, value in half.figures.items()}
         quality[f"cost{suffix}"] = float(half.costs.min())
-    return seal(
-        Prior(
-            name=name,
-            provenance=f"Template fitted to the {count} masks of the clip and of its mirror image, cameras unknown, "
-            f"{race.said}seed {seed}.",
-            vertices=template.vertices,
-            faces=template.faces,
-            weights=template.weights,
-            bones=template.bones,
-            parents=torch.tensor(PARENTS),
-            mirror=torch.tensor(MIRROR),
-            times=torch.tensor(clip.times, dtype=torch.float64),
-            object_to_world=torch.eye(4, dtype=torch.float64).repeat(count, 1, 1),
-            cameras=halves[0][0],
-            transforms=halves[0][1],
-            cameras_flip=halves[1][0],
-            transforms_flip=halves[1][1],
-            quality=quality,
-            digest="",
-        )
+    prior = Prior(
+        name=name,
+        provenance=f"Template fitted to the {count} masks of the clip and of its mirror image, cameras unknown, "
+        f"{race.said}seed {seed}.",
+        vertices=template.vertices,
+        faces=template.faces,
+        weights=template.weights,
+        bones=template.bones,
+        parents=torch.tensor(PARENTS),
+        mirror=torch.tensor(MIRROR),
+        times=torch.tensor(clip.times, dtype=torch.float64),
+        object_to_world=torch.eye(4, dtype=torch.float64).repeat(count, 1, 1),
+        cameras=object_cameras(race),
+        transforms=transforms,
+        cameras_flip=object_cameras(race_flip),
+        transforms_flip=transforms_flip,
+        quality=quality,
+        digest="",
     )
+    return seal(replace(prior, quality=quality | measured(prior, clip.frames)))
 
 
 def object_cameras(race: StandingCamera) -> tuple[Camera, ...]:
@@ -240,62 +232,3 @@ def _orthonormal(matrix: Tensor) -> Tensor:
     """The nearest rotation: single precision leaves errors of 1e-7."""
     u, _, v = torch.linalg.svd(matrix)
     return u @ v
-
-
-def resized(prior: Prior, width: int, height: int) -> Prior:
-    """The same prior for frames of another size."""
-    cameras, flipped = (
-        tuple(camera.resized(width, height) for camera in each) for each in (prior.cameras, prior.cameras_flip)
-    )
-    return seal(replace(prior, cameras=cameras, cameras_flip=flipped))
-
-
-def in_crops(prior: Prior, clip: Clip) -> Prior:
-    """A prior of whole frames for a clip of square crops of them; rows are those of the clip's frames.
-
-    Raises:
-        UserError: a frame is no crop, or the prior is for frames of another size.
-    """
-    rows, cameras, flipped = [], [], []
-    for frame in clip.frames:
-        row = int((prior.times - frame.time).abs().argmin())
-        plain, crop, size = prior.cameras[row], frame.crop, frame.mask.shape[2]
-        if crop is None or (plain.width, plain.height) != (crop.width, crop.height):
-            held = "a whole frame" if crop is None else f"a crop of {crop.width}x{crop.height} pixels"
-            raise UserError(
-                f"{clip.name}: expected crops of {plain.width}x{plain.height} frames as prior '{prior.name}' knows, "
-                f"got {held}."
-            )
-        rows.append(row)
-        cameras.append(_cropped(plain, crop.left, crop.top, crop.side, size))
-        # in the flipped frame the crop starts as far from the left as it ends from the right
-        flipped.append(_cropped(prior.cameras_flip[row], crop.width - crop.left - crop.side, crop.top, crop.side, size))
-    return seal(
-        replace(
-            prior,
-            times=prior.times[rows],
-            object_to_world=prior.object_to_world[rows],
-            cameras=tuple(cameras),
-            transforms=prior.transforms[rows],
-            cameras_flip=tuple(flipped),
-            transforms_flip=prior.transforms_flip[rows],
-        )  # fmt: skip
-    )
-
-
-def _cropped(camera: Camera, left: float, top: float, side: float, size: int) -> Camera:
-    moved = camera.intrinsics.clone()
-    moved[0, 2] -= left
-    moved[1, 2] -= top
-    moved[:2] *= size / side
-    return replace(camera, intrinsics=moved, width=size, height=size)
-
-
-def with_cameras(clip: Clip, prior: Prior) -> Clip:
-    """The clip with the prior's cameras, in the prior's world, where its own are unknown; frames match by time."""
-    if all(frame.camera is not None for frame in clip.frames):
-        return clip
-    frames = []
-    for frame in clip.frames:
-        frames.append(frame if frame.camera is not None else replace(frame, camera=world_camera(prior, frame.time)))
-    return replace(clip, frames=tuple(frames))

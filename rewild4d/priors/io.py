@@ -123,6 +123,7 @@ def load_prior(path: Path) -> Prior:
             transforms_flip=transforms_flip,
             quality=_quality(path, _text(raw, "quality", "{}")),
             digest="",
+            notes=(),
             **shared,
         )
     )

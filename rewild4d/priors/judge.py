@@ -1,15 +1,74 @@
-"""How well a prior's joints agree with annotated ones, and whether its head is where the animal's is."""
+"""How far a prior can be trusted: its joints beside annotated ones, its head, and what its own figures say."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from rewild4d.priors.landmarks import FRONT, LANDMARKS, REAR, Marks, landmark_pixels
-from rewild4d.types import Frame, Prior
+from rewild4d.priors.silhouettes import overlap
+from rewild4d.priors.steady import steady
+from rewild4d.transforms import skin_points
+from rewild4d.types import Camera, Frame, Prior
 
 CORRECT = 0.2
 """A joint is correct within this share of the longer side of the mask's bounding box."""
+
+POOR = 0.6
+"""Mask IoU below which the template hardly fits."""
+UNDECIDED = 0.01
+"""Lead in cost below which head and tail are hardly told apart."""
+AGREED = 0.9
+"""Share of frames in which the clip and its mirror image must agree about the head."""
+
+
+def measured(prior: Prior, frames: Sequence[Frame]) -> dict[str, float]:
+    """What a prior's masks and cameras say of it.
+
+    Args:
+        prior: one row per frame.
+        frames: with masks, of which one at least shows something.
+
+    Returns:
+        mask_iou: mean intersection over union of template and mask; hops: frames whose camera is far from the others'
+        (`steady`); each with its twin of the mirror image, "<name>_flip"; facing_agreement (`agreement`).
+    """
+    figures = {"facing_agreement": agreement(prior.cameras, prior.cameras_flip)}
+    plain, flipped = [f.mask for f in frames], [f.mask.flip(-1) for f in frames]
+    for suffix, cameras, transforms, masks in (
+        ("", prior.cameras, prior.transforms, plain),
+        ("_flip", prior.cameras_flip, prior.transforms_flip, flipped),
+    ):
+        posed = skin_points(prior.vertices, prior.weights, transforms)
+        figures[f"mask_iou{suffix}"] = overlap(list(posed), prior.faces, cameras, masks)
+        figures[f"hops{suffix}"] = float((~steady(cameras, prior.times)).sum())
+    return figures
+
+
+def agreement(cameras: Sequence[Camera], cameras_flip: Sequence[Camera]) -> float:
+    """Share of frames in which heads of the clip and of its mirror image, fitted on their own, point the same way.
+
+    Ways are those over the ground as the camera sees it, right and away; they agree within 90 degrees.
+    """
+    heads, flipped = (
+        torch.stack([camera.world_to_camera[(0, 2), 2].double() for camera in each]) for each in (cameras, cameras_flip)
+    )
+    mirror = heads.new_tensor((-1.0, 1.0))
+    return float(((heads * flipped * mirror).sum(1) > 0).double().mean())
+
+
+def doubts(quality: Mapping[str, float]) -> tuple[str, ...]:
+    """What a prior's figures say against it, a sentence each."""
+    found = []
+    iou = min(quality.get("mask_iou", 1.0), quality.get("mask_iou_flip", 1.0))
+    if iou < POOR:
+        found.append(f"the template hardly fits these masks (mask IoU {iou:.2f}, below {POOR:g})")
+    agreed, margin = quality.get("facing_agreement", 1.0), quality.get("facing_margin", 1.0)
+    if agreed < AGREED:
+        found.append(f"head and tail are uncertain: the clip and its mirror image agree in {agreed:.0%} of the frames")
+    elif margin < UNDECIDED:
+        found.append(f"head and tail are uncertain: the other way round costs only {margin:.4f} more")
+    return tuple(found)
 
 
 def joint_scores(prior: Prior, frames: Sequence[Frame], found: Marks) -> dict[str, float]:

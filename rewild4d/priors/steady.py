@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rewild4d.errors import UserError
 from rewild4d.priors.io import seal
 from rewild4d.transforms import mirror_camera, mirror_matrix
 from rewild4d.types import Camera, Prior
 
 REACH, NEIGHBOURS = 0.25, 3
 """DBSCAN's eps, in units of the feature, and min_samples (a point counts itself)."""
+GAP = 2
+"""Missing frames that a smooth way is drawn over."""
 TRANSLATION_RANGE = 0.11
 """Reach of Fauna's translation along the view over its camera's distance: 1.1 of 10 units."""
 
@@ -60,28 +61,54 @@ def clusters(points: Tensor, reach: float = REACH, neighbours: int = NEIGHBOURS)
     return labels
 
 
-def steady(cameras: Sequence[Camera]) -> Tensor:
-    """Which cameras belong to the largest cluster; all of them where no cluster forms. bool, [T]."""
+def steady(cameras: Sequence[Camera], times: Tensor) -> Tensor:
+    """Which cameras belong to the largest cluster; all of them where no cluster forms. bool, [T].
+
+    Where a few frames lie between two of the sequence because they are held out or were not used, a steady camera has
+    moved on by as many steps: points on the straight way stand in for them.
+
+    Args:
+        cameras: in the object frame.
+        times: of their frames, seconds, ascending, [T].
+    """
     matrices = torch.stack([camera.world_to_camera.double() for camera in cameras])
     centers = -(matrices[:, :3, :3].transpose(1, 2) @ matrices[:, :3, 3:])[..., 0]
     distance = matrices[:, 2, 3].median()
     shifts = (matrices[:, :3, 3] - matrices[:, :3, 3].median(0).values) / (TRANSLATION_RANGE * distance)
-    labels = clusters(torch.cat((torch.nn.functional.normalize(centers, dim=1), shifts), dim=1))
+    features = torch.cat((torch.nn.functional.normalize(centers, dim=1), shifts), dim=1)
+    labels = clusters(torch.cat((features, _between(features, times))))[: len(features)]
     if bool((labels < 0).all()):
         return torch.ones(len(cameras), dtype=torch.bool)
     return labels == labels[labels >= 0].mode().values
 
 
+def _between(features: Tensor, times: Tensor) -> Tensor:
+    """Points for up to `GAP` frames that are missing between neighbours, [m, d]."""
+    gaps = times.diff()
+    missing = (gaps / gaps.median()).round().long() - 1 if len(gaps) else gaps.long()
+    parts = [
+        torch.lerp(features[row], features[row + 1], k / (count + 1))
+        for row, count in enumerate(missing.tolist())
+        if count <= GAP
+        for k in range(1, count + 1)
+    ]
+    return torch.stack(parts) if parts else features[:0]
+
+
 def without_hops(prior: Prior) -> Filtered:
     """Leave out frames whose camera is not steady, and mend mirrored ones by the mirror image of the plain one.
 
-    Raises:
-        UserError: fewer than two frames are left.
+    A sequence of which less than half of the cameras agree stays as it is, and that is told: nobody knows then which
+    are right.
     """
-    plain, flipped = steady(prior.cameras), steady(prior.cameras_flip)
+    plain, flipped = steady(prior.cameras, prior.times), steady(prior.cameras_flip, prior.times)
+    count, undecided = len(plain), []
+    for each, what in ((plain, ""), (flipped, "mirrored ")):
+        if 2 * int(each.sum()) < count:
+            share = f"{int(each.sum())} of {count}"
+            undecided.append(f"no {what}camera left out: the largest group that agrees is {share} frames")
+            each[:] = True
     kept = tuple(torch.nonzero(plain)[:, 0].tolist())
-    if len(kept) < 2:
-        raise UserError(f"prior '{prior.name}': expected cameras of at least 2 frames that agree, got {len(kept)}.")
     mended = [row for row in kept if not flipped[row]]
     cameras_flip, transforms_flip = list(prior.cameras_flip), prior.transforms_flip.clone()
     for row in mended:
@@ -97,10 +124,10 @@ def without_hops(prior: Prior) -> Filtered:
         cameras_flip=tuple(cameras_flip[row] for row in kept),
         transforms_flip=transforms_flip[rows],
     )
-    left = [row for row in range(len(plain)) if not plain[row]]
-    notes = [_told(left, len(plain), "left out: the camera is far from those of the other frames")]
-    notes.append(_told(mended, len(plain), "mirrored from the plain frame: the camera of the mirrored one is far off"))
-    return Filtered(seal(smaller), kept, tuple(note for note in notes if note))
+    left = [row for row in range(count) if not plain[row]]
+    notes = [_told(left, count, "left out: the camera is far from those of the other frames")]
+    notes.append(_told(mended, count, "mirrored from the plain frame: the camera of the mirrored one is far off"))
+    return Filtered(seal(smaller), kept, tuple(note for note in (*notes, *undecided) if note))
 
 
 def _told(rows: list[int], count: int, what: str) -> str:

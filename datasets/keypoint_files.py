@@ -1,7 +1,7 @@
 """Keypoint files that people have: BADJA, COCO-like (APTv2, APT-36K, AP-10K), DeepLabCut's and SLEAP's CSV.
 
 Every reader gives, for each frame of a folder, the named points in its pixels or None. What a name means on the
-template is said by a mapping file (`landmarks.load_mapping`), never here.
+template is said by a mapping file (`priors.landmarks.load_mapping`), never here.
 """
 
 import csv
@@ -13,11 +13,10 @@ from typing import Any
 
 import torch
 
+from rewild4d.datasets.keypoints import BADJA_SIZE
 from rewild4d.errors import UserError
 from rewild4d.types import Keypoints
 
-BADJA_SIZE = (1920, 1080)
-"""BADJA's joints are (row, column) in frames of this size."""
 LIKELY = 0.6
 """Confidence from which a detected point counts as seen (DeepLabCut's own default cut-off)."""
 
@@ -34,7 +33,7 @@ def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int]) -> l
         size: width and height of the frames in pixels.
 
     Returns:
-        One entry per frame; points outside the frame are not visible.
+        One entry per frame; points outside the frame are not visible (`told_outside`).
 
     Raises:
         UserError: the file is none of these, is broken, or names no frame of the folder.
@@ -57,9 +56,16 @@ def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int]) -> l
     return result
 
 
+def told_outside(found: Sequence[Keypoints | None], size: tuple[int, int]) -> str:
+    """A sentence on the points that a file marks as seen but that lie outside their frame; "" where there are none."""
+    limit = torch.tensor(size)
+    count = sum(int(((k.points < 0) | (k.points > limit)).any(dim=1).sum()) for k in found if k is not None)
+    return f"{count} keypoints outside their frame taken as not visible" if count else ""
+
+
 def _checked(points: Points, size: tuple[int, int]) -> Keypoints:
     inside = [seen and 0 <= x <= size[0] and 0 <= y <= size[1] for _, x, y, seen in points]
-    places = [(x, y) if kept else (0.0, 0.0) for (_, x, y, _), kept in zip(points, inside, strict=True)]
+    places = [(x, y) if seen else (0.0, 0.0) for _, x, y, seen in points]
     return Keypoints(tuple(name for name, *_ in points), torch.tensor(places), torch.tensor(inside))
 
 

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 
 CORNERS = 400
+LONGEST = 960
+"""Larger frames are averaged down to this many pixels on the longer side: the flow needs no more."""
 MARGIN = 15
 """Pixels around the mask that count as neither animal nor background."""
 LEAST = 12
@@ -24,21 +26,22 @@ class TravelMeter:
 
         Args:
             image: the whole frame, uint8, [h, w, 3].
-            mask: uint8 or bool, set inside the animal, [h, w].
+            mask: of the same size, uint8, 255 inside the animal, [h, w].
         """
-        grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
-        solid = (mask > (127 if mask.dtype == np.uint8 else 0)).astype(np.uint8)
+        scale = max(1.0, max(mask.shape) / LONGEST)
+        grey = cv2.cvtColor(reduced(image), cv2.COLOR_RGB2GRAY)
+        solid = (reduced(mask) > 127).astype(np.uint8)
         middle = np.argwhere(solid).mean(0)[::-1] if solid.any() else None
         if self._before is not None:
             earlier, covered, start = self._before
             step = np.zeros(2)
             if start is not None and middle is not None:
                 step = middle - start - _background_shift(earlier, grey, covered)
-            self._steps.append(step)
+            self._steps.append(step * scale)
         self._before = (grey, solid, middle)
 
     def result(self) -> Tensor:
-        """Motion of the mask's centre against the background between neighbouring frames, pixels, [T - 1, 2]."""
+        """Motion of the mask's centre against the background from each frame to the next, their pixels, [T - 1, 2]."""
         return torch.from_numpy(np.array(self._steps, dtype=np.float32).reshape(-1, 2))
 
 
@@ -53,7 +56,10 @@ def _background_shift(before: np.ndarray, after: np.ndarray, covered: np.ndarray
     return np.median(shifts, axis=0) if len(shifts) >= LEAST else np.zeros(2)
 
 
-def between(travel: Tensor, kept: list[int]) -> Tensor:
-    """The travel between some of the frames, [T - 1, 2] -> [k - 1, 2]; ``kept`` are their indices, ascending."""
-    path = torch.cat((torch.zeros(1, 2), travel.cumsum(0)))
-    return path[kept].diff(dim=0)
+def reduced(image: np.ndarray, longest: int = LONGEST) -> np.ndarray:
+    """The image averaged down to at most so many pixels on its longer side, [h, w] or [h, w, 3]."""
+    scale = longest / max(image.shape[:2])
+    if scale >= 1:
+        return np.ascontiguousarray(image)
+    size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
+    return cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA)

@@ -1,0 +1,151 @@
+"""A prior brought to a clip: other sizes, square crops, other moments, and cameras for frames that have none."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from rewild4d.errors import UserError
+from rewild4d.priors.io import seal
+from rewild4d.priors.motion import camera_at, pose_at, world_camera
+from rewild4d.types import Camera, Clip, Prior
+
+SAME = 0.1
+"""Two moments are one where they lie closer than this share of the clip's frame interval."""
+
+
+def resized(prior: Prior, width: int, height: int) -> Prior:
+    """The same prior for frames of another size."""
+    cameras, flipped = (
+        tuple(camera.resized(width, height) for camera in each) for each in (prior.cameras, prior.cameras_flip)
+    )
+    return seal(replace(prior, cameras=cameras, cameras_flip=flipped))
+
+
+def placed(prior: Prior, clip: Clip) -> Prior:
+    """A prior from a file, for the frames of a clip whose cameras nobody knows.
+
+    It may have been made for the clip's own images (then its times are the clip's) or for whole frames of the video
+    that the clip was cut from (then they are the video's). Frames that it does not know lie between two that it does.
+
+    Raises:
+        UserError: it is for images of another size, or for other moments.
+    """
+    first, frame = prior.cameras[0], clip.frames[0]
+    sizes = {(camera.width, camera.height) for camera in (*prior.cameras, *prior.cameras_flip)}
+    size, crop = (frame.mask.shape[2], frame.mask.shape[1]), frame.crop
+    if sizes == {size} and (crop is None or size != (crop.width, crop.height)):
+        return at_times(prior, clip.times, clip)
+    if crop is None:
+        raise UserError(
+            f"{clip.name}: expected a prior for images of {size[0]}x{size[1]} pixels, but prior '{prior.name}' is for "
+            f"{first.width}x{first.height}."
+        )
+    return in_crops(at_times(prior, [time + clip.start for time in clip.times], clip), clip)
+
+
+def at_times(prior: Prior, times: Sequence[float], clip: Clip) -> Prior:
+    """The prior at the clip's moments, rows those of its frames and times the clip's; a note tells which were between.
+
+    Args:
+        prior: to be read.
+        times: of the clip's frames on the prior's clock, seconds.
+        clip: for its frame rate and for messages.
+
+    Raises:
+        UserError: the prior does not span the moments, or knows less than half of them.
+    """
+    wanted = torch.tensor(times, dtype=torch.float64)
+    apart, rows = (prior.times[:, None] - wanted).abs().min(0)
+    between = [row for row, distance in enumerate((apart * clip.fps).tolist()) if distance > SAME]
+    low, high = float(prior.times[0]), float(prior.times[-1])
+    outside = (wanted < low - 1 / clip.fps) | (wanted > high + 1 / clip.fps)
+    if bool(outside.any()) or 2 * len(between) > len(wanted):
+        raise UserError(
+            f"{clip.name}: expected a prior that knows its {len(wanted)} frames from {wanted[0]:.3f} to "
+            f"{wanted[-1]:.3f} s, but prior '{prior.name}' has {len(prior.times)} from {low:.3f} to {high:.3f} s, of "
+            f"which {len(wanted) - len(between)} are at their times (was it made with another --fps?)."
+        )
+    note = f"{len(between)} of {len(wanted)} frames are not in the prior's file: cameras and poses lie between those of"
+    clock = prior.times[rows]
+    clock[between] = wanted[between]
+    roots, transforms, cameras = _sampled(prior, clock)
+    _, transforms_flip, cameras_flip = _sampled(
+        replace(prior, cameras=prior.cameras_flip, transforms=prior.transforms_flip), clock
+    )
+    return seal(
+        replace(
+            prior,
+            times=torch.tensor(clip.times, dtype=torch.float64),
+            object_to_world=roots,
+            transforms=transforms,
+            cameras=cameras,
+            cameras_flip=cameras_flip,
+            transforms_flip=transforms_flip,
+            notes=(*prior.notes, *([f"{note} its neighbours"] if between else [])),
+        )
+    )
+
+
+def _sampled(prior: Prior, times: Tensor) -> tuple[Tensor, Tensor, tuple[Camera, ...]]:
+    """object_to_world, transforms and cameras at some moments; its own where it knows them."""
+    own = {float(time): row for row, time in enumerate(prior.times)}
+    poses = [pose_at(prior, float(time)) for time in times]
+    cameras = tuple(
+        prior.cameras[own[float(time)]] if float(time) in own else camera_at(prior, float(time)) for time in times
+    )
+    return torch.stack([root for root, _ in poses]), torch.stack([transforms for _, transforms in poses]), cameras
+
+
+def in_crops(prior: Prior, clip: Clip) -> Prior:
+    """A prior of whole frames for a clip of square crops of them; it has a row for each of the clip's frames.
+
+    Raises:
+        UserError: a frame is no crop, or the prior is for frames of another size.
+    """
+    cameras, flipped = [], []
+    for row, frame in enumerate(clip.frames):
+        plain, crop, size = prior.cameras[row], frame.crop, frame.mask.shape[2]
+        if crop is None or (plain.width, plain.height) != (crop.width, crop.height):
+            held = "a whole frame" if crop is None else f"a crop of {crop.width}x{crop.height} pixels"
+            raise UserError(
+                f"{clip.name}: expected crops of {plain.width}x{plain.height} frames as prior '{prior.name}' knows, "
+                f"got {held}."
+            )
+        cameras.append(_cropped(plain, crop.left, crop.top, crop.side, size))
+        # in the flipped frame the crop starts as far from the left as it ends from the right
+        flipped.append(_cropped(prior.cameras_flip[row], crop.width - crop.left - crop.side, crop.top, crop.side, size))
+    return seal(replace(prior, cameras=tuple(cameras), cameras_flip=tuple(flipped)))
+
+
+def _cropped(camera: Camera, left: float, top: float, side: float, size: int) -> Camera:
+    moved: Tensor = camera.intrinsics.clone()
+    moved[0, 2] -= left
+    moved[1, 2] -= top
+    moved[:2] *= size / side
+    return replace(camera, intrinsics=moved, width=size, height=size)
+
+
+def with_cameras(clip: Clip, prior: Prior) -> Clip:
+    """The clip with the prior's cameras, in the prior's world, where its own are unknown; frames match by time."""
+    if all(frame.camera is not None for frame in clip.frames):
+        return clip
+    frames = []
+    for frame in clip.frames:
+        frames.append(frame if frame.camera is not None else replace(frame, camera=world_camera(prior, frame.time)))
+    return replace(clip, frames=tuple(frames))
+
+
+def known_frames(clip: Clip, prior: Prior) -> Clip:
+    """The frames with a camera of their own or a row in the prior: others of a filtered one must supervise nothing."""
+    if all(frame.camera is not None for frame in clip.frames):
+        return clip
+    distance = (torch.tensor(clip.times, dtype=torch.float64)[:, None] - prior.times).abs().min(1).values
+    rows = torch.nonzero(distance * clip.fps <= SAME)[:, 0].tolist()
+    if len(rows) == len(clip.frames) or not rows:
+        return clip
+    travel = clip.travel
+    if travel is not None:
+        travel = torch.cat((travel.new_zeros(1, 2), travel.cumsum(0)))[rows].diff(dim=0)
+    return replace(clip, frames=tuple(clip.frames[row] for row in rows), travel=travel)
