@@ -27,6 +27,9 @@ CAPTIONS = {
     "canonical.png": "Canonical Gaussians, coloured by the parts that move them.",
     "input.mp4": "Input beside render, from the input view.",
     "orbit.mp4": "One turn around the moving animal.",
+    "orbit.png": "The animal from four sides.",
+    "original.mp4": "The filmed frame beside the render in its place.",
+    "original.png": "The filmed frame beside the render in its place, at six moments.",
 }
 Found = tuple[Path, RunRecord]
 
