@@ -22,8 +22,12 @@ from rewild4d.metrics.distribution import kid
 from rewild4d.metrics.samples import Conditions, Distance, Features
 from rewild4d.metrics.video import feature_distances
 
-KINDS = {"kid_v": ("KID-V",), "fvd_f": ("FVD-F", "KVD-F"), "fvd_diag": ("FVD-Diag", "KVD-Diag")}
-"""What two sets are called -> the distances between them."""
+KINDS = {
+    "kid_v": {"kid_v": "KID-V"},
+    "fvd_f": {"fvd_f": "FVD-F", "kvd_f": "KVD-F"},
+    "fvd_diag": {"fvd_diag": "FVD-Diag", "kvd_diag": "KVD-Diag"},
+}
+"""What two sets are called -> the scores of them, in the order of `distances`, and what each distance calls itself."""
 FILE = "features.npz"
 _SIDES = ("prediction", "truth")
 
@@ -50,8 +54,12 @@ def distances(compared: Compared) -> list[Distance]:
     x, y, conditions = compared.prediction, compared.truth, compared.conditions
     if compared.kind == "kid_v":
         return [kid(x, y, name="KID-V", conditions=conditions)]
-    suffix = KINDS[compared.kind][0].removeprefix("FVD")
-    return feature_distances(x, y, paired=False, suffix=suffix, conditions=conditions)
+    return feature_distances(x, y, paired=False, suffix=suffix_of(compared.kind), conditions=conditions)
+
+
+def suffix_of(kind: str) -> str:
+    """ "-F" or "-Diag": what stands behind FVD and KVD."""
+    return KINDS[kind][kind].removeprefix("FVD")
 
 
 def pool(parts: Sequence[Compared]) -> Compared:

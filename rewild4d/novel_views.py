@@ -19,7 +19,7 @@ from rewild4d.leaderboard.records import Score
 from rewild4d.metrics.distribution import VIEWS
 from rewild4d.metrics.remembering import Remembering, kept
 from rewild4d.metrics.samples import Conditions, Distance, ImageExtractor, Images, image_features
-from rewild4d.metrics.sets import KINDS, Compared, distances
+from rewild4d.metrics.sets import KINDS, Compared, distances, suffix_of
 from rewild4d.metrics.video import (
     VideoExtractor,
     clip_distances,
@@ -31,9 +31,9 @@ from rewild4d.metrics.video import (
 from rewild4d.orbit import orbit_cameras
 from rewild4d.types import Camera, Clip, Frame, Splats
 
-NAMES = ("kid_v", "fvd_f", "kvd_f", "fvd_diag", "kvd_diag")
-TITLES = {"KID-V": "kid_v", "FVD-F": "fvd_f", "KVD-F": "kvd_f", "FVD-Diag": "fvd_diag", "KVD-Diag": "kvd_diag"}
+TITLES = {title: name for scores in KINDS.values() for name, title in scores.items()}
 """What a distance calls itself -> its name among the scores."""
+NAMES = tuple(TITLES.values())
 
 
 class NovelViews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -109,7 +109,7 @@ def novel_view_distances(
             continue
         clips = [part for window in windows for part in cut(orbit.matrix(window))]
         if unfit([clips], [truths], videos):
-            suffix = KINDS[kind][0].removeprefix("FVD")
+            suffix = suffix_of(kind)
             found += clip_distances([clips], [truths], videos, paired=False, suffix=suffix, conditions=conditions)
             continue
         truth = kept(videos, reference, lambda network: video_features([truths], network), windows)
@@ -155,7 +155,10 @@ class _Orbit:
 
     def image(self, view: int, frame: int) -> Tensor:
         """One render on the background, [3, h, w]."""
-        color, alpha = self.render(self.at(self.times[frame]), self.cameras[view])
+        splats, camera = self.at(self.times[frame]), self.cameras[view]
+        if not len(splats):
+            return torch.full((3, camera.height, camera.width), self.background)
+        color, alpha = self.render(splats, camera)
         return (color + (1 - alpha) * self.background).clamp(0, 1)
 
     def matrix(self, window: Sequence[int]) -> "list[Images]":

@@ -22,6 +22,8 @@ from rewild4d.types import Clip, Crop, Frame
 
 LONGEST = 960
 """Longer sides of original frames are shown reduced to so many pixels."""
+QUALITY = 6
+"""Of the film: frames with their background are large files."""
 SHEET = 6
 """Moments on the contact sheet, two a row."""
 SHEET_WIDTH = 360
@@ -59,7 +61,7 @@ def save_original_view(
                 chosen[moment] = _reduced(image, len(titles) * SHEET_WIDTH)
             yield image
 
-    save_mp4(film(), folder / "original.mp4", film_rate(clip.fps))
+    save_mp4(film(), folder / "original.mp4", film_rate(clip.fps), QUALITY)
     save_png(_sheet([chosen[moment] for moment in shown], titles), folder / "original.png")
     return ["original.mp4", "original.png"]
 

@@ -25,12 +25,12 @@ def save_png(image: Tensor, path: Path) -> None:
         imageio.imwrite(temporary, _bytes(image), format="png")
 
 
-def save_mp4(images: Iterable[Tensor], path: Path, fps: float) -> None:
+def save_mp4(images: Iterable[Tensor], path: Path, fps: float, quality: int = 8) -> None:
     """Write RGB images in [0, 1], each [3, h, w] of one size, as H.264 atomically; odd sizes are padded.
 
-    Images are taken one at a time, so that a long film of large frames need not fit into memory.
+    Images are taken one at a time, so that a long film of large frames need not fit into memory; quality is 1 to 10.
     """
-    settings: Any = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    settings: Any = {"codec": "libx264", "quality": quality, "macro_block_size": 2, "ffmpeg_log_level": "error"}
     with atomic(path) as temporary, imageio.get_writer(temporary, fps=fps, **settings) as writer:
         for image in images:
             writer.append_data(_bytes(image))

@@ -178,11 +178,14 @@ def test_a_ball_against_itself_is_at_distance_zero(case: Case) -> None:
         image = still.image(i, i)
         frames.append(replace(frame, rgb=image, mask=torch.ones_like(image[:1])))
     clip: Clip = replace(case.clip, frames=tuple(frames))
-    (found,) = novel_views.novel_view_distances(
+    (found,), sets = novel_views.novel_view_distances(
         Ball(), clip, NovelViews(frames=4), names=("kid_v",), background=1.0, render=protocol.render,
         images=LinearNetwork(), videos=None, log=quiet,
     )  # fmt: skip
     assert found.value == pytest.approx(0, abs=1e-6) and found.n == 16 * min(4, len(frames))
+    assert [(one.kind, len(one.prediction.values), len(one.truth.values)) for one in sets] == [
+        ("kid_v", found.n, len(frames))
+    ]
 
 
 def test_scores_of_sets_say_how_many_they_are_over() -> None:

@@ -11,7 +11,8 @@ from rewild4d.config import parse_flags
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.leaderboard.formats import FORMATS
 from rewild4d.leaderboard.layout import Table
-from rewild4d.leaderboard.records import RunRecord, read_records
+from rewild4d.leaderboard.pooled import pooled_tables
+from rewild4d.leaderboard.records import RunRecord, find_records, read_records
 from rewild4d.leaderboard.specs import find_spec
 from rewild4d.leaderboard.tables import difference_table, named_table, protocol_tables
 
@@ -32,6 +33,7 @@ class Options:
         protocol: only this protocol's runs; of a table with one condition, that condition.
         preset: of the runs in a named table; the table's own where it is left out.
         case: only these cases.
+        pooled: KID and FVD over all cases at once, from the features kept beside the records; without a name only.
     """
 
     name: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
@@ -41,6 +43,7 @@ class Options:
     protocol: str = ""
     preset: str = ""
     case: tuple[str, ...] = ()
+    pooled: bool = False
 
 
 def main(arguments: list[str]) -> int:
@@ -51,9 +54,16 @@ def main(arguments: list[str]) -> int:
         raise UserError(f"table: expected the name of one table, got {' '.join(options.name)}.")
     if options.against and not options.name:
         raise UserError("--against: expected the name of a table too, as in `table artemis --against ours`.")
-    tables = _named(options) if options.name else _everything(options)
+    if options.pooled and options.name:
+        raise UserError("--pooled: expected no name of a table with it, since it makes a table of every protocol.")
+    tables = _pooled(options) if options.pooled else _named(options) if options.name else _everything(options)
     print("\n\n".join(FORMATS[options.format](table) for table in tables) or "no records")
     return 0
+
+
+def _pooled(options: Options) -> list[Table]:
+    found = [pair for pair in find_records(options.runs) if not options.case or pair[1].case in options.case]
+    return pooled_tables([pair for pair in found if options.protocol in ("", pair[1].protocol["name"])])
 
 
 def _everything(options: Options) -> list[Table]:
