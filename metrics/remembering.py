@@ -27,10 +27,10 @@ class Remembering:
         self.minimum_frames = getattr(network, "minimum_frames", 1)
         self._last: tuple[Tensor, Tensor] | None = None
 
-    def __call__(self, batch: Tensor) -> Tensor:
-        """What the network says of a batch."""
-        if self._last is None or not torch.equal(self._last[0], batch):
-            self._last = batch.clone(), self.network(batch)
+    def __call__(self, images: Tensor, /) -> Tensor:
+        """What the network says of a batch of images or clips."""
+        if self._last is None or not torch.equal(self._last[0], images):
+            self._last = images.clone(), self.network(images)
         return self._last[1]
 
 
@@ -57,7 +57,6 @@ def kept(network: Any, images: Sequence[Tensor], compute: Callable[[Any], Featur
         return Features(values, groups, network.name, network.digest, network.resize, int(frames) or None)
     except (OSError, ValueError, KeyError, EOFError, BadZipFile):  # not there or damaged: made anew
         found = compute(network)
-    arrays = {"values": found.values.numpy(), "groups": found.groups.numpy(), "frames": np.array(found.frames or 0)}
     with suppress(UserError), atomic(path) as temporary, temporary.open("wb") as file:  # it is a cache, no result
-        np.savez(file, **arrays)
+        np.savez(file, values=found.values.numpy(), groups=found.groups.numpy(), frames=np.array(found.frames or 0))
     return found

@@ -128,14 +128,7 @@ def read_features(path: Path, digest: str | None = None) -> dict[str, Compared]:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         about = json.loads(str(arrays["about"]))
-        found = {
-            kind: Compared(
-                kind,
-                *(_features(arrays[f"{kind}.{side}"], said[side]) for side in _SIDES),
-                Conditions(**said["conditions"]),
-            )
-            for kind, said in about.items()
-        }
+        found = {kind: _compared(kind, arrays, said) for kind, said in about.items()}
     except FileNotFoundError as error:
         raise UserError(f"{path}: expected the features of a run, but there is no such file.") from error
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
@@ -143,6 +136,11 @@ def read_features(path: Path, digest: str | None = None) -> dict[str, Compared]:
     if digest is not None and _digest(arrays) != digest:
         raise UserError(f"{path}: expected the features that its record was scored with, but it holds others.")
     return found
+
+
+def _compared(kind: str, arrays: dict[str, np.ndarray], said: dict[str, Any]) -> Compared:
+    prediction, truth = (_features(arrays[f"{kind}.{side}"], said[side]) for side in _SIDES)
+    return Compared(kind, prediction, truth, Conditions(**said["conditions"]))
 
 
 def _about(features: Features) -> dict[str, Any]:

@@ -31,9 +31,11 @@ def save_mp4(images: Iterable[Tensor], path: Path, fps: float, quality: int = 8)
     Images are taken one at a time, so that a long film of large frames need not fit into memory; quality is 1 to 10.
     """
     settings: Any = {"codec": "libx264", "quality": quality, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-    with atomic(path) as temporary, imageio.get_writer(temporary, fps=fps, **settings) as writer:
-        for image in images:
-            writer.append_data(_bytes(image))
+    with atomic(path) as temporary:
+        writer: Any = imageio.get_writer(temporary, fps=fps, **settings)
+        with writer:
+            for image in images:
+                writer.append_data(_bytes(image))
 
 
 def film_rate(fps: float) -> float:

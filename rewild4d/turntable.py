@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
-from scipy.ndimage import gaussian_filter1d
+from scipy.signal import savgol_filter
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -27,8 +27,8 @@ ELEVATIONS = (0.0, math.radians(30))
 """The input cameras' elevation is kept between these: from below or straight above a person sees little."""
 INSIDE = 0.99
 """Share of the solid Gaussians that are inside the picture; the rest are stray."""
-SMOOTH = 2.0
-"""Frames (standard deviation) over which the middle is smoothed, so that a step does not shake the picture."""
+WINDOW = 9
+"""Moments over which the middle is smoothed; odd."""
 
 
 @dataclass(frozen=True)
@@ -73,14 +73,13 @@ def find_stance(reconstruction: Reconstruction, clip: Clip, up: Tensor | None) -
     """
     cameras = [camera for frame in clip.frames if (camera := input_camera(reconstruction, frame)) is not None]
     clouds = [_solid(reconstruction.at(time)) for time in clip.times]
-    if not cameras or not all(map(len, clouds)):
+    if not cameras or not all(len(means) for means, _ in clouds):
         return None
-    raw = torch.stack([cloud.median(0).values for cloud in clouds])
-    # the median lies in the trunk; the middle of the whole, legs and head included, is what a picture is centred on
-    boxes = torch.stack([_box_middle(cloud) for cloud in clouds])
-    middles = torch.from_numpy(gaussian_filter1d(boxes.numpy(), SMOOTH, axis=0, mode="nearest"))
-    axes, known = _axes(reconstruction, clip, cameras, raw, up)
-    radius = max(float(torch.quantile((c - m).norm(dim=1), INSIDE)) for c, m in zip(clouds, middles, strict=True))
+    # the median lies in the trunk; a picture is centred on the middle of the whole, legs and head included
+    middles = _smooth(torch.stack([_box_middle(means) for means, _ in clouds]))
+    axes, known = _axes(reconstruction, clip, cameras, middles, up)
+    reaches = [(means - middle).norm(dim=1) + reach for (means, reach), middle in zip(clouds, middles, strict=True)]
+    radius = max(float(torch.quantile(reach, INSIDE)) for reach in reaches)
     offsets = torch.stack(
         [axes[i] @ (camera.center - middles[i]) for i, camera in enumerate(_per_moment(cameras, clip))]
     )
@@ -154,11 +153,17 @@ def _per_moment(cameras: list[Camera], clip: Clip) -> list[Camera]:
     return cameras if len(cameras) == len(clip.times) else [cameras[0]]
 
 
-def _solid(splats: Splats) -> Tensor:
-    """Centres of the Gaussians that can be seen, float64, [n, 3]; of all where none can."""
-    means = splats.means.detach().double().cpu()
+def _solid(splats: Splats) -> tuple[Tensor, Tensor]:
+    """Centres and reach of the Gaussians that can be seen, float64, [n, 3] and [n]; of all where none can."""
     shown = splats.opacities.detach().cpu() > 0.1
-    return means[shown] if bool(shown.any()) else means
+    means, reach = splats.means.detach().double().cpu(), 2 * splats.scales.detach().double().cpu().amax(-1)
+    return (means[shown], reach[shown]) if bool(shown.any()) else (means, reach)
+
+
+def _smooth(middles: Tensor) -> Tensor:
+    """A straight line through the neighbouring moments of each, so that a stride does not shake the picture, [T, 3]."""
+    window = min(WINDOW, len(middles) - 1 + len(middles) % 2)
+    return middles if window < 3 else torch.from_numpy(savgol_filter(middles.numpy(), window, 1, axis=0))
 
 
 def _box_middle(cloud: Tensor) -> Tensor:
