@@ -14,8 +14,9 @@ from rewild4d.baselines.empty import EmptyReconstruction
 from rewild4d.commands.table import main as table
 from rewild4d.conformance import tiny_case
 from rewild4d.errors import UserError
-from rewild4d.leaderboard.pooled import pooled_tables
+from rewild4d.leaderboard.pooled import pooled_table, pooled_tables
 from rewild4d.leaderboard.records import RunRecord, Score, write_record
+from rewild4d.leaderboard.tables import Entrant, Frame
 from rewild4d.metrics.distribution import frechet, kid, mmd2_unbiased
 from rewild4d.metrics.remembering import Remembering, kept
 from rewild4d.metrics.samples import Conditions, Features, image_features
@@ -164,12 +165,30 @@ def test_a_case_without_features_keeps_the_method_from_being_pooled(tmp_path: Pa
 def test_the_command_prints_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for case in ("a", "bb"):
         run(tmp_path / case, case, 0)
+    assert table(["--runs", str(tmp_path)]) == 0
+    assert "`table --pooled` computes them over all cases at once" in capsys.readouterr().out
     assert table(["--runs", str(tmp_path), "--pooled"]) == 0
     printed = capsys.readouterr().out
-    assert "P: all cases pooled" in printed and "2 cases pooled into one distance: a, bb" in printed
+    assert "P: all cases pooled" in printed and "2 cases: a, bb" in printed
     assert "FVD-F: 2 cases pooled, n = 18, m = 10, T = 16" in printed
-    with pytest.raises(UserError, match="--pooled: expected no name of a table with it"):
-        table(["artemis", "--pooled", "--runs", str(tmp_path)])
+    with pytest.raises(UserError, match="--pooled: expected no --against with it"):
+        table(["artemis", "--pooled", "--against", "ours", "--runs", str(tmp_path)])
+    with pytest.raises(UserError, match="table 'input-view': expected scores of sets to pool"):
+        table(["input-view", "--pooled", "--runs", str(tmp_path)])
+
+
+def test_a_named_table_is_pooled_under_each_condition(tmp_path: Path) -> None:
+    one, other = run(tmp_path / "a", "a", 0), run(tmp_path / "bb", "bb", 0)
+    frame = Frame("t", "T", "", ("x", "y"), ("psnr", "kid_v"))
+    rows = [Entrant("ours", ((one[1], other[1]), (other[1],))), Entrant("new", ((), ()), "not written yet")]
+    made = pooled_table(frame, rows, [one, other])
+    values = [cell.value for cell in made.rows[0].cells]
+    assert values == [
+        distances(pool([read_features(folder / FILE)["kid_v"] for folder in folders]))[0].value
+        for folders in ((tmp_path / "a", tmp_path / "bb"), (tmp_path / "bb",))
+    ]
+    assert [column.group for column in made.columns] == ["x", "y"]
+    assert [(cell.text, cell.note) for cell in made.rows[1].cells] == [("n/a", "not written yet")] * 2
 
 
 class Counting:
