@@ -25,8 +25,12 @@ STEPS = 72
 FIELD_OF_VIEW = math.radians(25)
 ELEVATIONS = (0.0, math.radians(30))
 """The input cameras' elevation is kept between these: from below or straight above a person sees little."""
-INSIDE = 0.99
+INSIDE = 0.998
 """Share of the solid Gaussians that are inside the picture; the rest are stray."""
+MARGIN = 1.03
+"""Of the picture around them."""
+STEADY = 0.8
+"""Share of the moments from which on the camera has a side of its own; less, and it walked around the animal."""
 WINDOW = 9
 """Moments over which the middle is smoothed; odd."""
 
@@ -41,6 +45,7 @@ class Stance:
         known: whether "ahead" is the animal's.
         radius: of a ball around it, world units.
         azimuth: of the input camera about up, from ahead towards left, radians.
+        steady: share of the moments at which the input camera stood on the side where it stood on the whole.
         elevation: of the input camera, within `ELEVATIONS`, radians.
     """
 
@@ -49,6 +54,7 @@ class Stance:
     known: bool
     radius: float
     azimuth: float
+    steady: float
     elevation: float
 
     def camera(self, moment: int, azimuth: float) -> Camera:
@@ -86,7 +92,9 @@ def find_stance(reconstruction: Reconstruction, clip: Clip, up: Tensor | None) -
     offset = normalize(offsets, dim=1).mean(0)
     elevation = math.atan2(float(offset[1]), float(offset[[0, 2]].norm()))
     azimuth = math.atan2(float(offset[0]), float(offset[2]))
-    return Stance(middles, axes, known, max(radius, 1e-6), azimuth, min(max(elevation, ELEVATIONS[0]), ELEVATIONS[1]))
+    steady = float((offsets[:, 0] * offset[0] > 0).double().mean())
+    elevation = min(max(elevation, ELEVATIONS[0]), ELEVATIONS[1])
+    return Stance(middles, axes, known, max(MARGIN * radius, 1e-6), azimuth, steady, elevation)
 
 
 def turn(reconstruction: Reconstruction, clip: Clip, stance: Stance | None) -> Iterator[Tensor]:
@@ -124,7 +132,8 @@ def _sides(stance: Stance) -> dict[str, float]:
     is_left = math.sin(stance.azimuth) > 0
     seen, other = ("left", "right") if is_left else ("right", "left")
     side = quarter if is_left else -quarter
-    return {f"{seen} side (the camera's)": side, "front": 0.0, f"{other} side": -side, "behind": math.pi}
+    said = " (the camera's)" if stance.steady >= STEADY else ""
+    return {f"{seen} side{said}": side, "front": 0.0, f"{other} side": -side, "behind": math.pi}
 
 
 def _axes(

@@ -198,6 +198,7 @@ def test_four_sides_begin_with_the_one_the_camera_saw(toward: tuple[float, float
     other = "right" if seen == "left" else "left"
     titles = list(turntable._sides(stance))
     assert titles == [f"{seen} side (the camera's)", "front", f"{other} side", "behind"]
+    assert next(iter(turntable._sides(replace(stance, steady=0.6)))) == f"{seen} side", "it walked around"
     side, front, far, behind = panels(four_views(Signpost(cameras), clip, stance))
     red = [middle_of(panel, 0) for panel in (side, far)]
     # From its right an animal looks to the right, from its left to the left.
