@@ -10,13 +10,15 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 
+import numpy as np
+
 from rewild4d.contracts import Finding, Selection
 from rewild4d.datasets.apt_files import Annotations, Sighting, Subject, image_places, read_annotations
 from rewild4d.datasets.frame_files import image_size, read_images, read_masks
 from rewild4d.datasets.mask_check import check_videos
 from rewild4d.datasets.mask_makers import Unmasked
 from rewild4d.datasets.masks import open_masks
-from rewild4d.datasets.wild import LEAST_FRAMES, Moment, Video, files_identity, split_video
+from rewild4d.datasets.wild import LEAST_FRAMES, Moment, Video, files_identity, original_images, split_video
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.types import Clip, Truth
 
@@ -84,6 +86,14 @@ class AptV2:
             UserError: no such case, no masks for it, or files that cannot be used.
         """
         return split_video(self.video(case), selection)
+
+    def originals(self, case: str, selection: Selection) -> Iterator[np.ndarray]:
+        """The whole frames that the images of a clip were cut from, uint8 [h, w, 3]; for pictures alone.
+
+        Raises:
+            UserError: as `load`.
+        """
+        return original_images(self.video(case), selection)
 
     def video(self, case: str) -> Video:
         """The frames, masks and keypoints of a case.

@@ -15,13 +15,15 @@ from functools import cached_property, partial
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
+
 from rewild4d.contracts import Finding, Selection
 from rewild4d.datasets.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
 from rewild4d.datasets.keypoint_files import read_keypoints, told_outside
 from rewild4d.datasets.keypoints import read_badja
 from rewild4d.datasets.mask_check import check_videos
 from rewild4d.datasets.masks import MaskFiles, list_images, match_masks, open_masks
-from rewild4d.datasets.wild import Moment, Video, files_identity, split_video
+from rewild4d.datasets.wild import Moment, Video, files_identity, original_images, split_video
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.types import Clip, Keypoints, Truth
 
@@ -95,6 +97,14 @@ class Davis:
             UserError: no such case, or files of it that cannot be used.
         """
         return split_video(self.video(case), selection)
+
+    def originals(self, case: str, selection: Selection) -> Iterator[np.ndarray]:
+        """The whole frames that the images of a clip were cut from, uint8 [h, w, 3]; for pictures alone.
+
+        Raises:
+            UserError: as `load`.
+        """
+        return original_images(self.video(case), selection)
 
     def video(self, case: str) -> Video:
         """The frames and masks of a case.

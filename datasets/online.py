@@ -20,7 +20,7 @@ from rewild4d.datasets.mask_check import check_videos
 from rewild4d.datasets.mask_makers import Unmasked
 from rewild4d.datasets.masks import MaskFiles, fit_size, list_images, match_masks, open_masks
 from rewild4d.datasets.video_file import ASSUMED_FPS, SUFFIXES, read_video, video_facts
-from rewild4d.datasets.wild import Masks, Moment, Video, files_identity, split_video
+from rewild4d.datasets.wild import Masks, Moment, Video, files_identity, original_images, split_video
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.types import Clip, Keypoints, Truth
 
@@ -115,6 +115,14 @@ class Online:
             UserError: no such case, no masks, or files that cannot be used.
         """
         return split_video(self.video(case), selection)
+
+    def originals(self, case: str, selection: Selection) -> Iterator[np.ndarray]:
+        """The whole frames that the images of a clip were cut from, uint8 [h, w, 3]; for pictures alone.
+
+        Raises:
+            UserError: as `load`.
+        """
+        return original_images(self.video(case), selection)
 
     def video(self, case: str) -> Video:
         """The frames and masks of a case.

@@ -120,11 +120,7 @@ def split_video(video: Video, selection: Selection) -> tuple[Clip, Truth]:
         raise UserError(
             f"{video.title}: expected a protocol for videos (cameras = 'unknown', framing = 'crop', split = 2 or more)."
         )
-    folder = cache_folder() / "wild" / _key(video, selection)
-    if not (folder / "rgba.npy").is_file():
-        layout = lay_out(video, [mask_facts(mask) if mask is not None else None for mask in video.masks()], selection)
-        _fill(video, layout, selection.size, folder)
-    layout = _read_layout(folder / "layout.json")
+    layout, folder = _laid_out(video, selection)
     frames = _Frames(video, layout, np.load(folder / "rgba.npy", mmap_mode="r"))
     shown = tuple(frames[i] for i in layout.shown)
     hidden = _Chosen(frames, [i for i, tested in enumerate(layout.tested) if tested])
@@ -181,6 +177,22 @@ def usable(
             f"{len(used)} of {len(kept)}{f' ({said})' if said else ''}."
         )
     return used, tuple(note for note in notes if note)
+
+
+def original_images(video: Video, selection: Selection) -> Iterator[np.ndarray]:
+    """The whole frames that the clip's images were cut from, in its order, uint8 [h, w, 3]; none that is held out."""
+    layout, _ = _laid_out(video, selection)
+    shown = {index for index, tested in zip(layout.used, layout.tested, strict=True) if not tested}
+    return (image for index, image in enumerate(video.images()) if index in shown)
+
+
+def _laid_out(video: Video, selection: Selection) -> tuple[Layout, Path]:
+    """The layout of a video and the folder of its cut frames, made where they are not there yet."""
+    folder = cache_folder() / "wild" / _key(video, selection)
+    if not (folder / "rgba.npy").is_file():
+        layout = lay_out(video, [mask_facts(mask) if mask is not None else None for mask in video.masks()], selection)
+        _fill(video, layout, selection.size, folder)
+    return _read_layout(folder / "layout.json"), folder
 
 
 def lay_out(video: Video, facts: Sequence[MaskFacts | None], selection: Selection) -> Layout:

@@ -60,6 +60,8 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         distances: between sets of novel views and the input video, with all that decides their values.
         alignments: by which shapes were laid on the truth.
         networks: SHA-256 of the weights of the metric networks that scores leaned on.
+        features: SHA-256 of what `metrics.sets.FILE` beside the record holds: the features that ``distances`` were
+            computed from, for scores pooled over cases; "" where there is no such file.
         diagnostics: what the method says of itself (Gaussians, joint motion, ...).
         marks: what a table has to say beside the numbers, such as "upper bound: ..."; such rows compete with nobody.
         pictures: files written beside the record, relative to it.
@@ -91,6 +93,7 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     distances: list[Distance] = []
     alignments: list[dict[str, Any]] = []
     networks: dict[str, str] = {}
+    features: str = ""
 
 
 def make_run_id(**parts: Any) -> str:

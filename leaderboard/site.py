@@ -26,8 +26,11 @@ MARKER = ".rewild4d-leaderboard"
 CAPTIONS = {
     "comparison": "Input, render, and a view that was held out: truth and render. One row a moment.",
     "canonical": "Canonical Gaussians, coloured by the parts that move them.",
-    "input": "Input beside render, from the input view.",
-    "orbit": "One turn around the moving animal.",
+    "input film": "Input beside render, from the input view.",
+    "orbit film": "One turn around the moving animal.",
+    "orbit": "The animal from four sides.",
+    "original film": "The filmed frame beside the render in its place.",
+    "original": "The filmed frame beside the render in its place, at six moments.",
 }
 Found = tuple[Path, RunRecord]
 
@@ -182,7 +185,7 @@ def _curves(record: RunRecord) -> list[Markup]:
 def _copy_pictures(source: Path, record: RunRecord, page: Path) -> Iterator[dict[str, Any]]:
     """Pictures that lie beside the record, held-out comparison first."""
     order = list(CAPTIONS)
-    stems = {Path(name).name: Path(name).stem for name in record.pictures}
+    stems = {Path(name).name: Path(name).stem + " film" * (Path(name).suffix == ".mp4") for name in record.pictures}
     names = sorted(stems, key=lambda name: order.index(stems[name]) if stems[name] in order else len(order))
     for name in names:
         if (source / name).is_file():

@@ -13,9 +13,11 @@ from rewild4d.leaderboard.specs import Reported, ReportedCell
 from rewild4d.leaderboard.statistics import Estimate, estimate, paired, ranks
 from rewild4d.leaderboard.titles import LESS_IS_BETTER, TITLES, digits_of
 from rewild4d.leaderboard.variants import Variant, coverage_text, is_floor, latest, marks, variants
+from rewild4d.metrics.sets import KINDS
 
 Values = dict[str, dict[int, float]]
 """Case -> seed -> value."""
+POOLED = "KID and FVD in rows of the mean are means over cases; `table --pooled` computes them over all cases at once."
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,8 @@ def protocol_tables(records: Sequence[RunRecord]) -> list[Table]:
         ]
         if len(cases) > 1:
             rows += [_timed_row("**mean**", variant, cases, frame.scores) for variant in named]
+            if any(name in scores for scores in KINDS.values() for name in frame.scores):
+                frame = replace(frame, remarks=(*frame.remarks, POOLED))
         tables.append(
             Table(frame.name, frame.title, frame.caption, ("case", "method"), columns, tuple(rows), frame.remarks)
         )
@@ -155,7 +159,7 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
         flags = marks([record for under in entrant.records for record in under])
         if not flags:
             cells = [_leading(cell, column.better) for cell, column in zip(cells, columns, strict=True)]
-        rows.append(Row((entrant.label,), tuple(cells), _kind(entrant), (*entrant.notes, *flags), flags))
+        rows.append(Row((entrant.label,), tuple(cells), kind_of(entrant), (*entrant.notes, *flags), flags))
     return Table(
         f"{frame.name}-difference",
         f"{frame.title}: difference to {reference.label}",
@@ -238,10 +242,11 @@ def _named_row(entrant: Entrant, entrants: Sequence[Entrant], columns: Sequence[
                 cells.append(cell(entrant.records[index], cases, name))
     everything = [record for under in entrant.records for record in under]
     flags = marks(everything)
-    return Row((entrant.label,), tuple(cells), _kind(entrant), (*entrant.notes, *flags), flags)
+    return Row((entrant.label,), tuple(cells), kind_of(entrant), (*entrant.notes, *flags), flags)
 
 
-def _kind(entrant: Entrant) -> str:
+def kind_of(entrant: Entrant) -> str:
+    """Of its row: "method", "unranked" where it had what the others had not, or "floor"."""
     records = [record for under in entrant.records for record in under]
     if marks(records):
         return "unranked"

@@ -35,7 +35,7 @@ class ImageExtractor(Protocol):
     digest: str
     resize: str
 
-    def __call__(self, images: Tensor) -> Tensor:
+    def __call__(self, images: Tensor, /) -> Tensor:
         """[B, 3, H, W] in [0, 1] -> [B, D]."""
 
 

@@ -149,12 +149,32 @@ def clip_distances(
     counts = [sum(map(len, side)) for side in (prediction, truth)]
     x = video_features(prediction, extractor, _shifted(progress, 0, sum(counts)))
     y = video_features(truth, extractor, _shifted(progress, counts[0], sum(counts)))
+    return feature_distances(x, y, paired=paired, suffix=suffix, conditions=conditions, seed=seed)
+
+
+def feature_distances(
+    prediction: Features,
+    truth: Features,
+    *,
+    paired: bool,
+    suffix: str = "",
+    conditions: Conditions = Conditions(),
+    seed: int = 0,
+) -> list[Distance]:
+    """What `clip_distances` gives, from features that are there already.
+
+    Args:
+        prediction: of the clips, [n, D].
+        truth: with ``paired``, row i belongs to row i of the prediction, [m, D].
+        paired, suffix, conditions, seed: see `clip_distances`.
+    """
+    x, y, name = prediction, truth, f"KVD{suffix}"
     found = [
-        frechet(x, y, name=names[0], conditions=conditions),
-        kid(x, y, name=names[1], conditions=conditions, few=FEW_CLIPS, seed=seed),
+        frechet(x, y, name=f"FVD{suffix}", conditions=conditions),
+        kid(x, y, name=name, conditions=conditions, few=FEW_CLIPS, seed=seed),
     ]
     if paired:
-        found.append(kid(x, y, paired=True, name=names[1], conditions=conditions, few=FEW_CLIPS, seed=seed))
+        found.append(kid(x, y, paired=True, name=name, conditions=conditions, few=FEW_CLIPS, seed=seed))
         found.append(i3d_dist(x, y, conditions=conditions))
     return found
 

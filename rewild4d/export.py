@@ -15,11 +15,11 @@ from rewild4d.contracts import Articulated, Reconstruction
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import write_text
 from rewild4d.novel_views import input_camera
+from rewild4d.pictures import film_rate, over, save_mp4
 from rewild4d.ply import write_splats
-from rewild4d.protocol import render
 from rewild4d.skinned_glb import write_glb
+from rewild4d.turntable import find_stance, turn
 from rewild4d.types import Camera, Clip, Frame
-from rewild4d.view import orbit, save_mp4
 
 KINDS = ("ply", "glb", "cameras", "mp4")
 
@@ -122,14 +122,9 @@ def _write_cameras(reconstruction: Reconstruction, clip: Clip, folder: Path) -> 
 
 
 def _write_films(reconstruction: Reconstruction, clip: Clip, folder: Path) -> list[Path]:
-    fps = max(5.0, min(clip.fps, 30.0))
-    images = []
-    for frame in clip.frames:
-        camera = input_camera(reconstruction, frame)
-        if camera is not None:
-            color, alpha = render(reconstruction.at(frame.time), camera)
-            images.append((color + 1 - alpha).clamp(0, 1))
+    shown = [(frame, camera) for frame in clip.frames if (camera := input_camera(reconstruction, frame)) is not None]
+    fps, stance = film_rate(clip.fps), find_stance(reconstruction, clip, None)
     paths = [folder / "input_view.mp4", folder / "orbit.mp4"]
-    save_mp4(images, paths[0], fps)
-    save_mp4(orbit(reconstruction, clip), paths[1], fps)
+    save_mp4((over(reconstruction.at(frame.time), camera) for frame, camera in shown), paths[0], fps)
+    save_mp4(turn(reconstruction, clip, stance), paths[1], fps)
     return paths

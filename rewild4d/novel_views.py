@@ -16,15 +16,24 @@ from torch import Tensor
 from rewild4d.contracts import Log, Reconstruction
 from rewild4d.errors import UserError
 from rewild4d.leaderboard.records import Score
-from rewild4d.metrics.distribution import VIEWS, kid_v
-from rewild4d.metrics.samples import Conditions, Distance, ImageExtractor, Images
-from rewild4d.metrics.video import VideoExtractor, clip_distances, diagonal_clips, frame_clips
+from rewild4d.metrics.distribution import VIEWS
+from rewild4d.metrics.remembering import Remembering, kept
+from rewild4d.metrics.samples import Conditions, Distance, ImageExtractor, Images, image_features
+from rewild4d.metrics.sets import KINDS, Compared, distances, suffix_of
+from rewild4d.metrics.video import (
+    VideoExtractor,
+    clip_distances,
+    diagonal_clips,
+    frame_clips,
+    unfit,
+    video_features,
+)
 from rewild4d.orbit import orbit_cameras
 from rewild4d.types import Camera, Clip, Frame, Splats
 
-NAMES = ("kid_v", "fvd_f", "kvd_f", "fvd_diag", "kvd_diag")
-TITLES = {"KID-V": "kid_v", "FVD-F": "fvd_f", "KVD-F": "kvd_f", "FVD-Diag": "fvd_diag", "KVD-Diag": "kvd_diag"}
+TITLES = {title: name for scores in KINDS.values() for name, title in scores.items()}
 """What a distance calls itself -> its name among the scores."""
+NAMES = tuple(TITLES.values())
 
 
 class NovelViews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -56,7 +65,7 @@ def novel_view_distances(
     images: ImageExtractor | None,
     videos: VideoExtractor | None,
     log: Log,
-) -> list[Distance]:
+) -> tuple[list[Distance], list[Compared]]:
     """Compare sixteen novel views with the input video.
 
     The orbit's middle is the median Gaussian over the clip, its radius and elevation are the medians of the input
@@ -73,6 +82,9 @@ def novel_view_distances(
         videos: network of FVD and KVD; None leaves them out.
         log: progress.
 
+    Returns:
+        The distances, and the sets of features that they were computed from: what pooling over sequences needs.
+
     Raises:
         UserError: neither the clip nor the reconstruction has a camera.
     """
@@ -80,6 +92,7 @@ def novel_view_distances(
     reference = [frame.over(background).clamp(0, 1) for frame in clip.frames]
     conditions = Conditions(f"grey {background:g}", "full frame", clip.fps)
     found: list[Distance] = []
+    sets: list[Compared] = []
 
     def progress(done: int, total: int) -> None:
         log(done, total, {})
@@ -87,22 +100,28 @@ def novel_view_distances(
     if "kid_v" in names and images is not None:
         chosen = _spread(len(clip.frames), settings.frames)
         shown = _Lazy(len(chosen) * VIEWS, lambda i: orbit.image(i % VIEWS, chosen[i // VIEWS]))
-        found.append(kid_v([shown], [reference], images, conditions=conditions))
+        truth = kept(images, reference, lambda network: image_features([reference], network))
+        sets.append(Compared("kid_v", image_features([shown], Remembering(images)), truth, conditions))
     windows = _windows(len(clip.frames), settings)
-    for suffix, cut in (("-F", frame_clips), ("-Diag", diagonal_clips)):
-        if videos is None or not any(name.endswith(suffix.lower().replace("-", "_")) for name in names):
+    truths = [[reference[i] for i in window] for window in windows]
+    for kind, cut in (("fvd_f", frame_clips), ("fvd_diag", diagonal_clips)):
+        if videos is None or not any(name.endswith(kind.removeprefix("fvd")) for name in names):
             continue
         clips = [part for window in windows for part in cut(orbit.matrix(window))]
-        truths = [[reference[i] for i in window] for window in windows]
-        found += clip_distances(
-            [clips], [truths], videos, paired=False, suffix=suffix, conditions=conditions, progress=progress
-        )
-    return [distance for distance in found if TITLES.get(distance.name.split(" [")[0]) in names]
+        if unfit([clips], [truths], videos):
+            suffix = suffix_of(kind)
+            found += clip_distances([clips], [truths], videos, paired=False, suffix=suffix, conditions=conditions)
+            continue
+        truth = kept(videos, reference, lambda network: video_features([truths], network), windows)
+        made = video_features([clips], Remembering(videos), progress)
+        sets.append(Compared(kind, made, truth, conditions))
+    found += [distance for compared in sets for distance in distances(compared)]
+    return [distance for distance in found if TITLES.get(distance.name.split(" [")[0]) in names], sets
 
 
-def as_scores(distances: Sequence[Distance], names: Sequence[str], missing: dict[str, str]) -> dict[str, Score]:
+def as_scores(found: Sequence[Distance], names: Sequence[str], missing: dict[str, str]) -> dict[str, Score]:
     """The distances as scores of a record; those that are missing say why, by family ("kid", "fvd")."""
-    by_name = {TITLES[distance.name.split(" [")[0]]: distance for distance in distances}
+    by_name = {TITLES[distance.name.split(" [")[0]]: distance for distance in found}
     scores = {}
     for name in names:
         distance = by_name.get(name)
@@ -136,7 +155,10 @@ class _Orbit:
 
     def image(self, view: int, frame: int) -> Tensor:
         """One render on the background, [3, h, w]."""
-        color, alpha = self.render(self.at(self.times[frame]), self.cameras[view])
+        splats, camera = self.at(self.times[frame]), self.cameras[view]
+        if not len(splats):
+            return torch.full((3, camera.height, camera.width), self.background)
+        color, alpha = self.render(splats, camera)
         return (color + (1 - alpha) * self.background).clamp(0, 1)
 
     def matrix(self, window: Sequence[int]) -> "list[Images]":

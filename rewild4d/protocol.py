@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from importlib import resources
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
@@ -15,6 +16,7 @@ from rewild4d.files import digest
 from rewild4d.harmonics import seen_colors
 from rewild4d.leaderboard.records import Score
 from rewild4d.metrics.samples import Distance
+from rewild4d.metrics.sets import FILE, Compared, write_features
 from rewild4d.novel_views import NovelViews, input_camera
 from rewild4d.rasterizer import rasterize
 from rewild4d.scoring import Networks, load_networks
@@ -84,6 +86,7 @@ class Evaluation(NamedTuple):
         distances: between sets of images or clips, with all that decides their values.
         alignments: by which shapes were laid on the truth.
         networks: SHA-256 of the weights that scores leaned on.
+        sets: the features that ``distances`` were computed from.
     """
 
     scores: dict[str, Score]
@@ -91,6 +94,13 @@ class Evaluation(NamedTuple):
     distances: list[Distance]
     alignments: list[dict[str, Any]]
     networks: dict[str, str]
+    sets: list[Compared]
+
+    def keep(self, folder: Path) -> dict[str, Any]:
+        """The fields of a record; features of sets are written into its folder, for scores pooled over cases."""
+        fields = self._asdict()
+        sets = fields.pop("sets")
+        return fields | {"features": write_features(sets, folder / FILE) if sets else ""}
 
 
 def load_protocols() -> dict[str, Protocol]:
@@ -165,15 +175,16 @@ def evaluate(
     scores |= found
     sets = [name for name in protocol.scores if name in novel_views.NAMES]
     distances: list[Distance] = []
+    compared: list[Compared] = []
     if protocol.novel is not None and sets:
-        distances = novel_views.novel_view_distances(
+        distances, compared = novel_views.novel_view_distances(
             reconstruction, clip, protocol.novel, names=sets, background=protocol.background, render=render,
             images=networks.images, videos=networks.videos, log=log,
         )  # fmt: skip
         scores |= novel_views.as_scores(distances, sets, dict(networks.missing))
     used = {name: network.digest for name, network in networks.lpips.items()}
     used |= {distance.extractor: distance.digest for distance in distances}
-    return Evaluation({name: scores[name] for name in protocol.scores}, items, distances, alignments, used)
+    return Evaluation({name: scores[name] for name in protocol.scores}, items, distances, alignments, used, compared)
 
 
 def _families(scores: Iterable[str]) -> list[str]:

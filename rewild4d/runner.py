@@ -29,6 +29,7 @@ from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import write_text
 from rewild4d.leaderboard.records import FILE, SCHEMA, RunRecord, Timing, make_run_id, read_record, write_record
 from rewild4d.machine import code_version, machine, peak_memory_mib
+from rewild4d.original_view import original_frames
 from rewild4d.priors.choose import PriorChoice, make_prior
 from rewild4d.priors.placing import known_frames, with_cameras
 from rewild4d.protocol import Protocol, evaluate
@@ -228,13 +229,16 @@ class Job:
             found = evaluate(reconstruction, clip, case.truth, self.plan.protocol, progress, self.plan.device)
             progress.close()
             seconds = time.perf_counter() - begin
-            pictures = save_pictures(reconstruction, clip, case.truth, self.folder)
+            pictures = save_pictures(
+                reconstruction, clip, case.truth, self.folder,
+                original_frames(self.plan.reader, clip, self.plan.protocol.selection),
+            )  # fmt: skip
         except UserError as error:
             return self.fail(str(error), case)
         except Exception as error:  # a bug or a diverged fit: the record keeps the message, the terminal the traceback
             traceback.print_exc(file=sys.stderr)
             return self.fail(f"{type(error).__name__}: {error}", case)
-        record = self._record(case, "ok", "", **found._asdict(), coverage=seen, pictures=pictures,
+        record = self._record(case, "ok", "", **found.keep(self.folder), coverage=seen, pictures=pictures,
                               diagnostics=_diagnostics(reconstruction), marks=_marks(self.entry.method, reconstruction),
                               timing=self._timing(fit_seconds, seconds))  # fmt: skip
         path = write_record(record, self.folder)

@@ -15,6 +15,7 @@ from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig
 from rewild4d.conformance import tiny_case
 from rewild4d.contracts import Reconstruction
 from rewild4d.leaderboard.records import Score
+from rewild4d.metrics.sets import FILE, KINDS, distances, read_features
 from rewild4d.novel_views import NovelViews
 from rewild4d.protocol import Protocol, evaluate, find_protocol, load_protocols
 from rewild4d.scoring import Networks
@@ -122,6 +123,23 @@ def test_learned_metrics_use_the_networks_and_record_them(
     assert fvd.value is None and "at least 2 samples a side are needed, got 16 and 1" in fvd.note
 
 
+def test_what_is_kept_beside_a_record_gives_its_distances_again(
+    case: Case, exact: Reconstruction, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    networks = Networks({}, LinearNetwork(), LinearVideoNetwork())
+    monkeypatch.setattr(protocol, "load_networks", lambda families, device: networks)
+    wanted = asking(*novel_views.NAMES)
+    assert wanted.novel is not None
+    wanted = msgspec.structs.replace(wanted, novel=msgspec.structs.replace(wanted.novel, clip=9, stride=1))
+    found = evaluate(exact, case.clip, case.truth, wanted, quiet, CPU)
+    fields = found.keep(tmp_path)
+    assert "sets" not in fields and fields["scores"] == found.scores
+    back = read_features(tmp_path / FILE, fields["features"])
+    assert [one for kind in KINDS if kind in back for one in distances(back[kind])] == found.distances
+    none = evaluate(exact, case.clip, case.truth, asking("psnr"), quiet, CPU).keep(tmp_path / "none")
+    assert none["features"] == "" and not (tmp_path / "none").exists()
+
+
 def test_without_weights_every_learned_score_tells_the_command(
     case: Case, exact: Reconstruction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -178,11 +196,14 @@ def test_a_ball_against_itself_is_at_distance_zero(case: Case) -> None:
         image = still.image(i, i)
         frames.append(replace(frame, rgb=image, mask=torch.ones_like(image[:1])))
     clip: Clip = replace(case.clip, frames=tuple(frames))
-    (found,) = novel_views.novel_view_distances(
+    (found,), sets = novel_views.novel_view_distances(
         Ball(), clip, NovelViews(frames=4), names=("kid_v",), background=1.0, render=protocol.render,
         images=LinearNetwork(), videos=None, log=quiet,
     )  # fmt: skip
     assert found.value == pytest.approx(0, abs=1e-6) and found.n == 16 * min(4, len(frames))
+    assert [(one.kind, len(one.prediction.values), len(one.truth.values)) for one in sets] == [
+        ("kid_v", found.n, len(frames))
+    ]
 
 
 def test_scores_of_sets_say_how_many_they_are_over() -> None:

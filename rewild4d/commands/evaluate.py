@@ -12,6 +12,7 @@ from rewild4d.errors import UserError
 from rewild4d.leaderboard.records import FILE, RunRecord, read_record, to_json, write_record
 from rewild4d.leaderboard.tables import markdown
 from rewild4d.machine import code_version, machine, pick_device
+from rewild4d.original_view import original_frames
 from rewild4d.protocol import evaluate, find_protocol
 from rewild4d.rasterizer import pick_rasterizer, set_default
 from rewild4d.registry import load_dataset, load_method
@@ -65,7 +66,8 @@ def score_again(folder: Path, options: Options) -> RunRecord:
     protocol = find_protocol(record.dataset, record.protocol["name"])
     root = options.data or Path(record.data["root"])
     settings = json.loads(record.data.get("settings", "{}"))
-    clip, truth = load_dataset(record.dataset)(root, **settings).load(record.case, protocol.selection)
+    reader = load_dataset(record.dataset)(root, **settings)
+    clip, truth = reader.load(record.case, protocol.selection)
     for name, now in (("clip", clip.digest), ("truth", truth.digest)):
         if now != record.data[name]:
             raise UserError(f"{root}: the {name} of {record.case} is not the one that {folder} was fitted to.")
@@ -74,10 +76,11 @@ def score_again(folder: Path, options: Options) -> RunRecord:
     progress = Progress(f"{record.case}: evaluate")
     found = evaluate(reconstruction, clip, truth, protocol, progress, device)
     progress.close()
-    pictures = save_pictures(reconstruction, clip, truth, folder)
+    whole = original_frames(reader, clip, protocol.selection)
+    pictures = save_pictures(reconstruction, clip, truth, folder, whole)
     described = {"digest": protocol.digest, **msgspec.to_builtins(protocol)}
     renewed = msgspec.structs.replace(
-        record, status="ok", error="", **found._asdict(), pictures=pictures, protocol=described,
+        record, status="ok", error="", **found.keep(folder), pictures=pictures, protocol=described,
         code=code_version(), machine=machine(device, rasterizer),
     )  # fmt: skip
     return read_record(write_record(renewed, folder))

@@ -12,7 +12,8 @@ from rewild4d.config import parse_flags
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.leaderboard.formats import FORMATS
 from rewild4d.leaderboard.layout import Table
-from rewild4d.leaderboard.records import RunRecord, read_records
+from rewild4d.leaderboard.pooled import pooled_table, pooled_tables
+from rewild4d.leaderboard.records import RunRecord, find_records
 from rewild4d.leaderboard.specs import find_spec
 from rewild4d.leaderboard.tables import difference_table, named_table, protocol_tables
 
@@ -33,6 +34,7 @@ class Options:
         protocol: only this protocol's runs; of a table with one condition, that condition.
         preset: of the runs in a named table; the table's own where it is left out.
         case: only these cases.
+        pooled: KID and FVD over all cases at once, from the features kept beside the records.
     """
 
     name: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
@@ -42,6 +44,7 @@ class Options:
     protocol: str = ""
     preset: str = ""
     case: tuple[str, ...] = ()
+    pooled: bool = False
 
 
 def main(arguments: list[str]) -> int:
@@ -52,21 +55,24 @@ def main(arguments: list[str]) -> int:
         raise UserError(f"table: expected the name of one table, got {' '.join(options.name)}.")
     if options.against and not options.name:
         raise UserError("--against: expected the name of a table too, as in `table artemis --against ours`.")
+    if options.pooled and options.against:
+        raise UserError("--pooled: expected no --against with it: a pooled distance has no differences case by case.")
     tables = _named(options) if options.name else _everything(options)
     print("\n\n".join(FORMATS[options.format](table) for table in tables) or "no records")
     return 0
 
 
 def _everything(options: Options) -> list[Table]:
-    records = _records(options)
-    return protocol_tables([r for r in records if options.protocol in ("", r.protocol["name"])])
+    found = [pair for pair in _found(options) if options.protocol in ("", pair[1].protocol["name"])]
+    return pooled_tables(found) if options.pooled else protocol_tables([record for _, record in found])
 
 
 def _named(options: Options) -> list[Table]:
     name = options.name[0]
     choice = planning.Choice(options.preset, options.protocol)
     spec = chosen(name, find_spec(name), choice)
-    entrants, remarks = planning.entrants(name, spec, _records(options))
+    found = _found(options)
+    entrants, remarks = planning.entrants(name, spec, [record for _, record in found])
     frame = planning.frame(name, spec)
     gaps = [entrant.label for entrant in entrants if not entrant.absent and not all(entrant.records)]
     if gaps:
@@ -74,9 +80,12 @@ def _named(options: Options) -> list[Table]:
         command = f"rewild4d-bench run --table {name} --preset {spec.preset}{other}"
         remarks = [*remarks, f"Without records: {', '.join(gaps)}; `{command}` makes what is missing."]
     frame = replace(frame, remarks=tuple(remarks))
+    if options.pooled:
+        return [pooled_table(frame, entrants, found)]
     tables = [named_table(frame, entrants, planning.reported(spec))]
     return [*tables, difference_table(frame, entrants, options.against)] if options.against else tables
 
 
-def _records(options: Options) -> list[RunRecord]:
-    return [record for record in read_records(options.runs) if not options.case or record.case in options.case]
+def _found(options: Options) -> list[tuple[Path, RunRecord]]:
+    """The records, each with its folder."""
+    return [pair for pair in find_records(options.runs) if not options.case or pair[1].case in options.case]
