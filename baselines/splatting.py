@@ -124,7 +124,6 @@ class SplatTraining(ABC):
         )
         self.others = torch.optim.Adam([{"params": group} for group in groups.values()], eps=1e-8, fused=True)
         self.density = DensityControl(config.density, len(own), own.means.device)
-        own.blur.fill_(config.canonical.blur_pixels * supervision.pixel())
 
     @property
     def gaussians(self) -> Gaussians:
@@ -252,6 +251,7 @@ def run_steps(training: SplatTraining, identity: str, log: Log, workdir: Path | 
             log(done, training.total, figures)
         if workdir is not None and done % training.settings.checkpoint_every == 0 and done < training.total:
             save_checkpoint(workdir, identity, {"step": done, "training": training.state()})
+    training.gaussians.blur.fill_(training.supervision.missing_blur())
 
 
 @torch.no_grad()

@@ -150,12 +150,8 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
     for entrant in entrants:
         if entrant is reference:
             continue
-        pairs = [
-            (entrant.records[index], reference.records[index], name)
-            for index in range(len(frame.conditions))
-            for name in frame.scores
-        ]
-        cells = [_difference(*pair) for pair in pairs]
+        pairs = zip(entrant.records, reference.records, strict=True)
+        cells = [_difference(*pair, name) for pair in pairs for name in frame.scores]
         flags = marks([record for under in entrant.records for record in under])
         if not flags:
             cells = [_leading(cell, column.better) for cell, column in zip(cells, columns, strict=True)]

@@ -145,6 +145,9 @@ def test_the_mirrored_groups(toy: tuple[Clip, Prior]) -> None:
     generator = torch.Generator().manual_seed(0)
     drawn = {supervision.draw(generator)[:2] for _ in range(60)}
     assert drawn == set(SIGNS)
+    views = [supervision.draw(generator, mirrored=1 / 4).view for _ in range(400)]
+    assert views.count(-1) / 400 == pytest.approx(1 / 4, abs=0.07)
+    assert {supervision.draw(generator, mirrored=0.0).view for _ in range(60)} == {1}
 
 
 def test_zero_networks_give_the_skinned_canonical(toy: tuple[Clip, Prior]) -> None:
@@ -249,15 +252,20 @@ def test_harmonics_mean_the_same_in_training_and_in_the_world(toy: tuple[Clip, P
     torch.testing.assert_close(actual, expected, atol=1e-4, rtol=0)
 
 
-def test_no_gaussian_is_narrower_than_half_a_pixel(toy: tuple[Clip, Prior]) -> None:
-    made = Ours().fit(*toy, config=TINY, seed=0, device=CPU, log=quiet, workdir=None)
-    # Every camera is sqrt(12^2 + 3^2) from the origin.
+def test_what_was_trained_on_reduced_images_is_as_wide_in_finer_ones(toy: tuple[Clip, Prior]) -> None:
+    half = msgspec.structs.replace(TINY, image_size=max(toy[0].frames[0].mask.shape) // 2)
+    whole, made = (
+        Ours().fit(*toy, config=config, seed=0, device=CPU, log=quiet, workdir=None) for config in (TINY, half)
+    )
+    assert float(whole.model.gaussians.blur) == 0
+    # Every camera is sqrt(12^2 + 3^2) from the origin; 0.3 square pixels of twice the side, less 0.3 of the clip's own.
     pixel = math.hypot(12, 3) / (2.2 * HEIGHT)
-    assert float(made.model.gaussians.blur) == pytest.approx(0.5 * pixel, rel=1e-5)
+    missing = math.sqrt(0.3 * (2 * pixel) ** 2 - 0.3 * pixel**2)
+    assert float(made.model.gaussians.blur) == pytest.approx(missing, rel=1e-5)
     with torch.no_grad():
         made.model.gaussians.log_scales.fill_(-9.0)
     for splats in (made.canonical(), made.at(0.15)):
-        assert splats.scales.min() >= 0.5 * pixel * 0.999
+        assert splats.scales.min() >= missing * 0.999
 
 
 def test_a_short_fit_improves_the_silhouette(toy: tuple[Clip, Prior]) -> None:

@@ -30,7 +30,7 @@ class Gaussians(nn.Module):
         logit_opacities: [n].
         colors: RGB, then `REST_GAIN` times the harmonics' coefficients above degree 0 in the canonical frame,
             [n, (degree + 1)^2, 3].
-        blur: standard deviation added to every Gaussian, scalar.
+        blur: standard deviation added to every Gaussian: none in training, then `Supervision.missing_blur`, scalar.
     """
 
     means: nn.Parameter

@@ -63,7 +63,7 @@ class Training:
         """One iteration; returns the figures for the log."""
         progress = index / self.config.iterations
         self._set_rates(progress)
-        key = self.supervision.draw(self.generator)
+        key = self.supervision.draw(self.generator, self.config.mirrored)
         target = self.supervision.target(key)
         losses, info = self.losses(key, target, index)
         loss = torch.stack(list(losses.values())).sum()
@@ -266,7 +266,6 @@ def train(
     supervision = Supervision(clip, prior, config.image_size, device)
     small = Supervision(clip, prior, min(config.image_size, config.warmup.size), device)
     model = build_model(config, prior, generator).to(device)
-    model.gaussians.blur.fill_(config.canonical.blur_pixels * supervision.pixel())
     warmup = WarmUp(model, small, prior, config, generator)
     main = Training(model, supervision, config, generator)
     identity = fit_digest(config, clip, prior, seed)
@@ -282,6 +281,7 @@ def train(
             _iterate(index, warmup, main, log)
             if workdir is not None and (index + 1) % config.checkpoint_every == 0:
                 _save(workdir, identity, index + 1, warmup, main)
+    model.gaussians.blur.fill_(supervision.missing_blur())
     return model
 
 

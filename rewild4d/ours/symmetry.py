@@ -1,5 +1,6 @@
 """The two mirrored supervision groups: which image, camera and prior pose go with (m, v, t) (METHOD section 6)."""
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -8,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from rewild4d.errors import UserError
+from rewild4d.rasterizer.conventions import EPS2D
 from rewild4d.transforms import matrix_to_quat, mirror_camera
 from rewild4d.types import Camera, Clip, Prior
 
@@ -46,6 +48,7 @@ class Supervision:
 
     Attributes:
         frames: number of frames T.
+        reduction: how many of the clip's pixels one of the training's is wide.
         prior_quats: rotation of each joint, for v = +1 and v = -1, [2, T, J, 4].
         prior_shifts: translation about the rest pivot, [2, T, J, 3].
     """
@@ -53,6 +56,8 @@ class Supervision:
     def __init__(self, clip: Clip, prior: Prior, size: int, device: torch.device) -> None:
         rows = match_times(clip, prior)
         self.frames = len(clip.frames)
+        longest = max(clip.frames[0].mask.shape[-2:])
+        self.reduction = max(1.0, longest / size)
         self._targets: dict[Key, Target] = {}
         for index, (frame, row) in enumerate(zip(clip.frames, rows, strict=True)):
             rgb, mask = (_reduced(image, size).to(device) for image in (frame.rgb, frame.mask))
@@ -89,10 +94,19 @@ class Supervision:
         cameras = [self._targets[Key(1, 1, index)].camera for index in range(self.frames)]
         return float(torch.stack([each.world_to_camera[2, 3] / each.intrinsics[0, 0] for each in cameras]).median())
 
-    def draw(self, generator: torch.Generator) -> Key:
-        """One view: the group first, then a frame of it, then one of its two images, each uniformly."""
-        group, frame, view = (int(torch.randint(count, (), generator=generator)) for count in (2, self.frames, 2))
-        return Key(1 - 2 * group, 1 - 2 * view, frame)
+    def missing_blur(self) -> float:
+        """Standard deviation in space that the clip's own images lack against those of the training, in its units.
+
+        The rasterizer widens every Gaussian by a share of a pixel. Trained on reduced images, an animal would be thin
+        and full of holes in finer ones, whose pixels are smaller. 0 where nothing was reduced.
+        """
+        return self.pixel() * math.sqrt(EPS2D * (1 - 1 / self.reduction**2))
+
+    def draw(self, generator: torch.Generator, mirrored: float = 0.5) -> Key:
+        """One view: group and frame uniformly, then the frame's image or, in a share of the draws, its mirror image."""
+        group, frame = (int(torch.randint(count, (), generator=generator)) for count in (2, self.frames))
+        view = -1 if float(torch.rand((), generator=generator)) < mirrored else 1
+        return Key(1 - 2 * group, view, frame)
 
 
 def match_times(clip: Clip, prior: Prior) -> list[int]:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.rasterizer import backends
-from rewild4d.rasterizer.conventions import RasterInfo
+from rewild4d.rasterizer.conventions import EPS2D, RasterInfo
 
 
 def rasterize(
@@ -22,7 +22,7 @@ def rasterize(
     height: int,
     *,
     background: Tensor | None = None,
-    eps2d: float = 0.3,
+    eps2d: float = EPS2D,
     antialias: bool = False,
     near: float = 0.01,
     backend: str = "auto",

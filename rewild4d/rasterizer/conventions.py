@@ -13,6 +13,8 @@ MAX_ALPHA = 0.99
 MIN_TRANSMITTANCE = 1e-4
 """A pixel is closed before the Gaussian that would push its transmittance to this value or below."""
 
+EPS2D = 0.3
+"""Variance in square pixels that is added to every projected Gaussian (3DGS)."""
 FRUSTUM_MARGIN = 0.3
 """The projection's Jacobian is taken at most this share of the half image outside the frame."""
 
