@@ -45,7 +45,7 @@ from rewild4d.contracts import Log, MethodInfo
 from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.checkpoint import fit_digest
 from rewild4d.ours.config import Canonical, Density
-from rewild4d.ours.schedule import exponential, fade
+from rewild4d.ours.schedule import exponential, fade, for_clip
 from rewild4d.ours.symmetry import Key, Supervision, Target, match_times
 from rewild4d.rasterizer import RasterInfo
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Prior, Splats
@@ -231,6 +231,7 @@ class D3dgs:
         workdir: Path | None,
     ) -> D3dgsReconstruction:
         """Reconstruct from the clip; see contracts.Method."""
+        config = for_clip(config, len(clip.frames))
         generator = torch.Generator().manual_seed(seed)
         frame, values, flips = self._start(clip, prior, config, generator)
         supervision = Supervision(clip, frame, config.image_size, device)

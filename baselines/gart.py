@@ -46,7 +46,7 @@ from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.checkpoint import fit_digest
 from rewild4d.ours.fused.skinning import skin_both
 from rewild4d.ours.geometry_losses import neighbours
-from rewild4d.ours.schedule import exponential
+from rewild4d.ours.schedule import exponential, for_clip
 from rewild4d.ours.symmetry import Key, Supervision, Target, match_times
 from rewild4d.rasterizer import RasterInfo
 from rewild4d.transforms import skin_points, skin_quats
@@ -251,6 +251,7 @@ class Gart:
         workdir: Path | None,
     ) -> GartReconstruction:
         """Reconstruct from the clip and the prior; see contracts.Method."""
+        config = for_clip(config, len(clip.frames))
         generator = torch.Generator().manual_seed(seed)
         supervision = Supervision(clip, prior, config.image_size, device)
         template = template_prior(Path(config.template), prior) if config.template else prior

@@ -77,6 +77,8 @@ class SplatConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """Longest image side it trains at; larger clips are reduced."""
     iterations: int = 20_000
     """Steps."""
+    steps_per_frame: int = 0
+    """At least so many steps for every frame of the clip; 0 leaves it at `iterations`."""
     checkpoint_every: int = 500
     """Steps between checkpoints, where a work folder is given."""
     canonical: Canonical = Canonical()

@@ -16,6 +16,7 @@ from rewild4d.ours.fit import Training, train
 from rewild4d.ours.method import Ours
 from rewild4d.ours.model import build_model
 from rewild4d.ours.reconstruction import OursReconstruction
+from rewild4d.ours.schedule import for_clip
 from rewild4d.ours.symmetry import SIGNS, Key, Supervision
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.motion import quats_from_normals, sample_surface
@@ -319,3 +320,14 @@ def test_a_loss_that_is_not_finite_stops_the_fit_with_its_name(toy: tuple[Clip, 
         training.model.field.logits[:, 0] = float("nan")
     with pytest.raises((FloatingPointError, ValueError), match="not finite|expected finite values"):
         training.step(0)
+
+
+def test_a_long_clip_gets_more_steps(toy: tuple[Clip, Prior]) -> None:
+    config = msgspec.structs.replace(TINY, iterations=2, steps_per_frame=1)
+    totals: set[int] = set()
+    made = Ours().fit(
+        *toy, config=config, seed=0, device=CPU, log=lambda step, total, values: totals.add(total), workdir=None
+    )
+    assert totals == {config.warmup.regress + config.warmup.iterations + 1 * FRAMES}
+    assert made.config.iterations == FRAMES
+    assert for_clip(msgspec.structs.replace(config, iterations=50), FRAMES).iterations == 50

@@ -252,6 +252,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """Longest image side it trains at; larger clips are reduced."""
     iterations: int = 20_000
     """Steps of the main stage (paper)."""
+    steps_per_frame: int = 0
+    """At least so many steps for every frame of the clip; 0 leaves it at `iterations`."""
     mirrored: float = 0.5
     """Share of the steps that see a mirror image (paper: half). Mirror images teach the side that no camera saw; what
     cameras did see they pull towards its mirror image. .125 for .5 (preset standard, one seed each, sweep camera, held-

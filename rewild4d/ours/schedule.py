@@ -1,4 +1,21 @@
-"""Schedules as pure functions of the training's progress in [0, 1]."""
+"""How long a fit is, and schedules as pure functions of its progress in [0, 1]."""
+
+from typing import Any, TypeVar
+
+import msgspec
+
+C = TypeVar("C", bound=msgspec.Struct)
+
+
+def for_clip(config: C, frames: int) -> C:
+    """The config with enough steps for a clip.
+
+    Args:
+        config: with ``iterations`` and ``steps_per_frame``, of any method.
+        frames: of the clip.
+    """
+    own: Any = config
+    return msgspec.structs.replace(config, iterations=max(own.iterations, own.steps_per_frame * frames))
 
 
 def exponential(first: float, last: float, progress: float) -> float:
