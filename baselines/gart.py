@@ -16,8 +16,8 @@ it, because in an input-view score the fitted image is the scored one.
 What differs from the original: positions get no gradient through the skinning grid, a Gaussian turns with the blended
 quaternion of its joints instead of the blended matrix (which would shrink it), the grid is a cube, neighbours are
 looked up when the Gaussians change instead of in every step, colours start from the frames, scales are logarithms with
-a cap, the number of Gaussians is capped. A unit of
-length of the original is the template's diagonal. The schedule is given in fractions of the original's 10k steps.
+a cap, the number of Gaussians is capped. A unit of length of the original is the template's diagonal. The schedule is
+given in fractions of the original's 10k steps.
 """
 
 from collections.abc import Mapping

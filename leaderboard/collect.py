@@ -1,7 +1,6 @@
 """Records as data for a repository: small, without paths, with the few pictures that a page needs."""
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -15,6 +14,7 @@ import msgspec
 from PIL import Image
 
 from rewild4d.errors import UserError
+from rewild4d.files import replaced_folder
 from rewild4d.leaderboard.curves import MOMENT, moments
 from rewild4d.leaderboard.privacy import without_paths
 from rewild4d.leaderboard.records import FILE, RunRecord, Score
@@ -68,12 +68,8 @@ def collect(found: Sequence[Found], out: Path, *, title: str, pictures: str = "o
     Raises:
         UserError: the folder holds something else or cannot be written, or the files are too large in all.
     """
-    if out.exists() and not (out.is_dir() and ((out / MARKER).is_file() or not any(out.iterdir()))):
-        raise UserError(f"{out}: expected an empty folder or an earlier collection, but it holds something else.")
     made = Collection(out)
-    building = out.with_name(f".{out.name}.{os.getpid()}")
-    try:
-        building.mkdir(parents=True)
+    with replaced_folder(out, MARKER, "an earlier collection") as building:
         _write(found, building, pictures, made)
         about = {"title": title, "runs": made.runs, "with_pictures": made.pictured, "note": NOTE}
         (building / MARKER).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
@@ -83,13 +79,6 @@ def collect(found: Sequence[Found], out: Path, *, title: str, pictures: str = "o
                 f"{out}: expected at most {limit / 1e6:.1f} MB in all, got {made.size / 1e6:.1f} MB of {made.runs} "
                 "runs; raise --limit-mb, or leave pictures out with --pictures none."
             )
-        if out.exists():
-            shutil.rmtree(out)
-        building.rename(out)
-    except OSError as error:
-        raise UserError(f"{out}: the records could not be collected: {error.strerror or error}.") from error
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
     return made
 
 

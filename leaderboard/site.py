@@ -1,6 +1,5 @@
 """The leaderboard as a static page: records in, a folder of HTML out that needs no server and no network."""
 
-import os
 import re
 import shutil
 from collections.abc import Iterator, Sequence
@@ -13,6 +12,7 @@ import jinja2
 from markupsafe import Markup
 
 from rewild4d.errors import UserError
+from rewild4d.files import replaced_folder
 from rewild4d.leaderboard.curves import curve, moments
 from rewild4d.leaderboard.formats import ARROWS, html
 from rewild4d.leaderboard.layout import Table
@@ -63,19 +63,8 @@ def build_site(parts: Sequence[Part], out: Path) -> Path:
     Raises:
         UserError: the folder holds something else, or cannot be written.
     """
-    if out.exists() and not (out.is_dir() and ((out / MARKER).is_file() or not any(out.iterdir()))):
-        raise UserError(f"{out}: expected an empty folder or an earlier leaderboard, but it holds something else.")
-    building = out.with_name(f".{out.name}.{os.getpid()}")
-    try:
-        building.mkdir(parents=True)
+    with replaced_folder(out, MARKER, "an earlier leaderboard") as building:
         _write(parts, building)
-        if out.exists():
-            shutil.rmtree(out)
-        building.rename(out)
-    except OSError as error:
-        raise UserError(f"{out}: the leaderboard could not be written: {error.strerror or error}.") from error
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
     return out / "index.html"
 
 

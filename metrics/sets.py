@@ -8,7 +8,6 @@ import json
 import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.errors import UserError
-from rewild4d.files import atomic
+from rewild4d.files import atomic, digest
 from rewild4d.metrics.distribution import kid
 from rewild4d.metrics.samples import Conditions, Distance, Features
 from rewild4d.metrics.video import feature_distances
@@ -114,12 +113,12 @@ def write_features(sets: Sequence[Compared], path: Path) -> str:
     return _digest(arrays)
 
 
-def read_features(path: Path, digest: str | None = None) -> dict[str, Compared]:
+def read_features(path: Path, expected: str | None = None) -> dict[str, Compared]:
     """What `write_features` wrote, by kind; every part is one sequence.
 
     Args:
         path: of the file.
-        digest: what `write_features` returned; None takes what is there.
+        expected: what `write_features` returned; None takes what is there.
 
     Raises:
         UserError: no such file, not one of ours, or not the one with that digest.
@@ -133,7 +132,7 @@ def read_features(path: Path, digest: str | None = None) -> dict[str, Compared]:
         raise UserError(f"{path}: expected the features of a run, but there is no such file.") from error
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise UserError(f"{path}: expected the features of a run (.npz), but it cannot be read ({error}).") from error
-    if digest is not None and _digest(arrays) != digest:
+    if expected is not None and _digest(arrays) != expected:
         raise UserError(f"{path}: expected the features that its record was scored with, but it holds others.")
     return found
 
@@ -167,8 +166,4 @@ def _stack(parts: Sequence[Features]) -> Features:
 
 def _digest(arrays: dict[str, np.ndarray]) -> str:
     """SHA-256 over names, shapes, types and bytes; the container's time stamps do not count."""
-    sha = sha256()
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        sha.update(f"{name} {array.dtype} {array.shape} ".encode() + array.tobytes())
-    return sha.hexdigest()
+    return digest(*(part for name in sorted(arrays) for part in (name, arrays[name])))

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -42,6 +43,33 @@ def _umask() -> int:
     current = os.umask(0)
     os.umask(current)
     return current
+
+
+@contextmanager
+def replaced_folder(folder: Path, marker: str, earlier: str) -> Iterator[Path]:
+    """Give a new folder that takes the place of ``folder`` when the block ends well; else nothing has changed.
+
+    Args:
+        folder: not there, empty, or one that holds ``marker``: anything else is somebody's own.
+        marker: name of the file that the block has to write.
+        earlier: what a folder with the marker is called ("an earlier collection").
+
+    Raises:
+        UserError: the folder holds something else, or cannot be written.
+    """
+    if folder.exists() and not (folder.is_dir() and ((folder / marker).is_file() or not any(folder.iterdir()))):
+        raise UserError(f"{folder}: expected an empty folder or {earlier}, but it holds something else.")
+    building = folder.with_name(f".{folder.name}.{os.getpid()}")
+    try:
+        building.mkdir(parents=True)
+        yield building
+        if folder.exists():
+            shutil.rmtree(folder)
+        building.rename(folder)
+    except OSError as error:
+        raise UserError(f"{folder}: could not be written: {error.strerror or error}.") from error
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -1,0 +1,54 @@
+"""APTv2-like annotations that are wrong or lack something: one sentence or a stated fallback."""
+
+import json
+from pathlib import Path
+
+import moving
+import pytest
+from test_wild import SELECTION, cache  # noqa: F401
+
+from rewild4d.datasets.aptv2 import AptV2
+from rewild4d.errors import UserError
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"image_id": 5000}, "12 of 12 annotations name an image that is not listed"),
+        ({"bbox": [200, 200, 5, 5]}, "12 of 12 annotations have no box inside their image"),
+        ({"keypoints": [1, 2]}, "expected COCO-like annotations, but an entry does not fit"),
+        ({"bbox": None}, "expected COCO-like annotations, but an entry does not fit"),
+    ],
+)
+def test_wrong_annotations(change: dict[str, object], sentence: str, tmp_path: Path) -> None:
+    reader = AptV2(moving.apt(tmp_path, **change))
+    with pytest.raises(UserError) as error:
+        reader.cases(SELECTION)
+    assert sentence in str(error.value)
+
+
+def test_annotations_without_tracks(tmp_path: Path) -> None:
+    """AP-10K looks the same but has no videos."""
+    moving.apt(tmp_path)
+    file = tmp_path / "annotations" / "train_annotations.json"
+    table = json.loads(file.read_text())
+    for entry in table["annotations"]:
+        del entry["track_id"]
+    file.write_text(json.dumps(table))
+    with pytest.raises(UserError, match="expected annotations with video_id and track_id, got none with track_id"):
+        AptV2(tmp_path).cases(SELECTION)
+    file.write_text(file.read_text()[:100])
+    with pytest.raises(UserError, match="expected JSON, but it cannot be parsed"):
+        AptV2(tmp_path).cases(SELECTION)
+
+
+def test_keypoints_outside_the_frame_are_not_visible(tmp_path: Path) -> None:
+    points = [500, 30, 2] + [0, 0, 0] * 15 + [20, 30, 2]
+    clip, _ = AptV2(moving.apt(tmp_path, keypoints=points)).load("easy/29wolf/v1C1@3", SELECTION)
+    assert clip.frames[0].keypoints is not None and clip.frames[0].keypoints.visible.sum() == 1
+    assert "12 keypoints outside their image taken as not visible" in clip.notes
+
+
+def test_an_apt_clip_without_masks(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="expected masks of easy/29wolf/v1C1@3 .*`rewild4d-bench masks` makes some"):
+        AptV2(moving.apt(tmp_path, with_masks=False)).load("easy/29wolf/v1C1@3", SELECTION)
