@@ -1,6 +1,7 @@
 """The training loop: warm-up, then the stage-aware losses of METHOD section 6; one object holds all state."""
 
 import logging
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 
 from rewild4d.contracts import Log
 from rewild4d.kernels.threads import torch_on_one
+from rewild4d.ours.adam import Adam
 from rewild4d.ours.canonical import NAMES
 from rewild4d.ours.checkpoint import fit_digest, load_checkpoint, save_checkpoint
 from rewild4d.ours.coloring import initial_colors
@@ -17,7 +19,7 @@ from rewild4d.ours.config import Config, Rates
 from rewild4d.ours.deform import Posed
 from rewild4d.ours.density import DensityControl
 from rewild4d.ours.geometry_losses import compact_loss, neighbours, rigid_loss, smooth_loss
-from rewild4d.ours.gradients import clip_gradients
+from rewild4d.ours.gradients import all_finite, clip_gradients
 from rewild4d.ours.losses import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.pose import blend_poses, pose_distance
@@ -44,8 +46,8 @@ class Training:
     def __init__(self, model: Model, supervision: Supervision, config: Config, generator: torch.Generator) -> None:
         self.model, self.supervision, self.config, self.generator = model, supervision, config, generator
         own, rates = model.gaussians, config.rates
-        self.gaussian_optimizer = torch.optim.Adam(
-            [{"params": [getattr(own, name)], "lr": _fixed_rate(rates, name)} for name in NAMES], eps=1e-15, fused=True
+        self.gaussian_optimizer = Adam(
+            [{"params": [getattr(own, name)], "lr": _fixed_rate(rates, name)} for name in NAMES], eps=1e-15
         )
         self.groups = {
             "skinning": list(model.field.parameters()),
@@ -53,9 +55,7 @@ class Training:
             "deform": list(model.deform.parameters()),
         }
         model.field.logits.requires_grad_(config.skinning.learn)
-        self.network_optimizer = torch.optim.Adam(
-            [{"params": group} for group in self.groups.values()], eps=1e-8, fused=True
-        )
+        self.network_optimizer = Adam([{"params": group} for group in self.groups.values()], eps=1e-8)
         self.density = DensityControl(config.density, len(own), own.means.device)
         self.near: Tensor | None = None
 
@@ -66,22 +66,21 @@ class Training:
         key = self.supervision.draw(self.generator, self.config.mirrored)
         target = self.supervision.target(key)
         losses, info = self.losses(key, target, index)
-        loss = torch.stack(list(losses.values())).sum()
-        if not torch.isfinite(loss):
-            bad = next(name for name, value in losses.items() if not torch.isfinite(value))
-            raise FloatingPointError(f"iteration {index}: loss '{bad}' is not finite")
+        values = torch.stack(list(losses.values()))
+        figures = dict(zip(losses, values.tolist(), strict=True))
+        for name, value in figures.items():
+            if not math.isfinite(value):
+                raise FloatingPointError(f"iteration {index}: loss '{name}' is not finite")
         self.gaussian_optimizer.zero_grad(set_to_none=True)
         self.network_optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        values.sum().backward()
         self._check_gradients(index)
         if info is not None and progress < self.config.density.end:
             self.density.observe(info, target.side, max(target.camera.width, target.camera.height))
         self.gaussian_optimizer.step()
         self.network_optimizer.step()
         self._densify(index)
-        return {"loss": float(loss.detach()), "gaussians": len(self.model.gaussians)} | {
-            name: float(value.detach()) for name, value in losses.items()
-        }
+        return {"loss": sum(figures.values()), "gaussians": len(self.model.gaussians)} | figures
 
     def losses(self, key: Key, target: Target, index: int) -> tuple[dict[str, Tensor], RasterInfo | None]:
         """All weighted losses of one view.
@@ -201,8 +200,7 @@ class Training:
     def _check_gradients(self, index: int) -> None:
         """Bound the networks' gradients; a value that is not finite stops the fit with its name."""
         norms = [clip_gradients(self.groups[name], self.config.rates.clip) for name in ("pose", "deform")]
-        sums = [parameter.grad.sum() for parameter in self.model.gaussians.parameters() if parameter.grad is not None]
-        if torch.isfinite(torch.stack(norms + sums)).all():
+        if all(map(math.isfinite, norms)) and all_finite(list(self.model.gaussians.parameters())):
             return
         for name, parameter in self.model.named_parameters():
             if parameter.grad is not None and not torch.isfinite(parameter.grad).all():

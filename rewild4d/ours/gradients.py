@@ -3,18 +3,35 @@
 import torch
 from torch import Tensor, nn
 
+from rewild4d.kernels.pointers import packed
+from rewild4d.ours.fused.gradients import measure, scale
 
-def clip_gradients(parameters: list[nn.Parameter], limit: float) -> Tensor:
-    """Scale gradients down to a norm of at most ``limit``; gives the norm before, scalar.
+
+def clip_gradients(parameters: list[nn.Parameter], limit: float) -> float:
+    """Scale gradients down to a norm of at most ``limit``; gives the norm before, not finite where a gradient is not.
 
     As `torch.nn.utils.clip_grad_norm_`, whose norms of many small tensors are slow on a CPU.
     """
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
-    if not gradients:
-        return torch.zeros(())
-    flat = torch.cat([gradient.flatten() for gradient in gradients])
-    norm = flat.dot(flat).sqrt()
+    fused = all(packed(gradient) for gradient in gradients)
+    norm = measure(gradients)[0] if fused else _norm(gradients)
     if norm > limit:
-        for gradient in gradients:
-            gradient.mul_(limit / (norm + 1e-6))
+        factor = limit / (norm + 1e-6)
+        if fused:
+            scale(gradients, factor)
+        else:
+            torch._foreach_mul_(gradients, factor)
     return norm
+
+
+def all_finite(parameters: list[nn.Parameter]) -> bool:
+    """Whether no gradient holds an infinity or a NaN."""
+    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    if all(packed(gradient) for gradient in gradients):
+        return measure(gradients)[1]
+    return all(bool(torch.isfinite(gradient).all()) for gradient in gradients)
+
+
+def _norm(gradients: list[Tensor]) -> float:
+    flat = torch.cat([gradient.flatten() for gradient in gradients])
+    return float(flat.dot(flat).sqrt())

@@ -8,6 +8,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from rewild4d.ours.adam import Adam
 from rewild4d.ours.config import Config
 from rewild4d.ours.losses import blurred
 from rewild4d.ours.model import Model
@@ -37,7 +38,7 @@ class WarmUp:
         self.generator = generator
         stage = config.warmup
         self.total = stage.regress + stage.iterations
-        self.optimizer = torch.optim.Adam(model.network.parameters(), lr=stage.rate, fused=True)
+        self.optimizer = Adam(model.network.parameters(), lr=stage.rate)
         surface = sample_surface(prior, stage.samples, generator)
         self.points, self.scale = surface.points.to(model.pivots.device), surface.radius
         with torch.no_grad():
