@@ -129,7 +129,7 @@ def test_gradients_are_clipped_as_torch_does(limit: float) -> None:
         for parameter in layers.parameters():
             parameter.grad = torch.randn(parameter.shape, generator=generator)
         norm = clip(list(layers.parameters()), limit)
-        found.append([norm, *(parameter.grad for parameter in layers.parameters())])
+        found.append([torch.as_tensor(norm), *(parameter.grad for parameter in layers.parameters())])
     for own, wanted in zip(*found, strict=True):
         torch.testing.assert_close(own, wanted)
     assert clip_gradients([nn.Parameter(torch.zeros(2))], limit) == 0

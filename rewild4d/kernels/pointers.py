@@ -1,13 +1,13 @@
-"""Many tensors in one call: kernels that take a table of addresses, since an array for each would cost a microsecond."""
+"""Many tensors in one call: kernels that take addresses, since an array for each tensor would cost a microsecond."""
 
 from typing import Any
 
 import numba
 import numpy as np
+import torch
 from llvmlite import ir
 from numba.core import types
 from numba.core.typing import signature
-import torch
 from torch import Tensor
 
 from rewild4d.kernels.compiling import inlined

@@ -11,7 +11,7 @@ from rewild4d.ours.fused.adam import adam_step
 
 
 class Adam(torch.optim.Adam):
-    """`torch.optim.Adam` without weight decay, AMSGrad and the like; its state is torch's, so either continues the other.
+    """`torch.optim.Adam` without weight decay and AMSGrad; its state is torch's, so either continues the other.
 
     Tensors that the kernel does not take (another device or precision) go through torch's fused step.
     """

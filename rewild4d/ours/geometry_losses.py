@@ -11,6 +11,7 @@ from torch.nn.functional import huber_loss
 from rewild4d.kernels.arrays import fits
 from rewild4d.ours.deform import Posed
 from rewild4d.ours.fused.compactness import compactness
+from rewild4d.ours.fused.normals import disagreement, smallest_axes
 from rewild4d.ours.pose import Pose, aligned
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import look_at, quat_multiply, quat_to_matrix
@@ -74,7 +75,7 @@ def smooth_loss(posed: Posed, opacities: Tensor, size: int, generator: torch.Gen
         size: side of the image, pixels.
         generator: draws azimuth in [0, 360) and elevation in [-10, 60) degrees.
     """
-    means = posed.means.detach()
+    means, log_scales = posed.means.detach(), posed.log_scales.detach()
     azimuth, elevation = torch.rand(2, generator=generator).tolist()
     azimuth, elevation = 2 * math.pi * azimuth, math.radians(-10 + 70 * elevation)
     direction = (math.cos(elevation) * math.sin(azimuth), math.sin(elevation), math.cos(elevation) * math.cos(azimuth))
@@ -83,20 +84,32 @@ def smooth_loss(posed: Posed, opacities: Tensor, size: int, generator: torch.Gen
     eye = center + 2.4 * OBJECT_DIAGONAL * means.new_tensor(direction)
     world_to_camera = look_at(eye, center, means.new_tensor((0.0, 1.0, 0.0)))
     focal = means.new_tensor(((2.0 * size, 0, size / 2), (0, 2.0 * size, size / 2), (0, 0, 1)))
-    normals = quat_to_matrix(posed.quats).gather(
-        -1, posed.log_scales.detach().argmin(-1)[:, None, None].expand(-1, 3, 1)
-    )[..., 0]
-    towards = ((eye - means) * normals.detach()).sum(-1, keepdim=True)
-    normals = torch.where(towards < 0, -normals, normals)
     image, alpha, _ = rasterize(
-        means, posed.quats.detach(), posed.log_scales.detach().exp(), opacities.detach(), normals,
-        world_to_camera[None], focal[None], size, size,
+        means, posed.quats.detach(), log_scales.exp(), opacities.detach(),
+        _normals(posed.quats, log_scales, means, eye), world_to_camera[None], focal[None], size, size,
     )  # fmt: skip
+    return _disagreement(image[0], alpha[0, 0].detach())
+
+
+def _normals(quats: Tensor, log_scales: Tensor, means: Tensor, eye: Tensor) -> Tensor:
+    """The axis of each Gaussian's smallest scale, turned towards ``eye`` [3], [n, 3]."""
+    if fits(quats):
+        return smallest_axes(quats, log_scales, means, eye)
+    axis = log_scales.argmin(-1)[:, None, None].expand(-1, 3, 1)
+    normals = quat_to_matrix(quats).gather(-1, axis)[..., 0]
+    towards = ((eye - means) * normals.detach()).sum(-1, keepdim=True)
+    return torch.where(towards < 0, -normals, normals)
+
+
+def _disagreement(image: Tensor, matte: Tensor) -> Tensor:
+    """Mean of 1 - |cos| between neighbouring pixels' vectors [3, h, w], weighted by both mattes [h, w]; scalar."""
+    if fits(image):
+        return disagreement(image, matte)
     # torch's own norm over the channels takes longer than the rest of this function.
-    field, matte = image[0] / (image[0].square().sum(0) + 1e-24).sqrt(), alpha[0, 0].detach()
-    total, mass = means.new_zeros(()), means.new_zeros(())
+    field = image / (image.square().sum(0) + 1e-24).sqrt()
+    total, mass = image.new_zeros(()), image.new_zeros(())
     for axis in (0, 1):
-        length = size - 1
+        length = matte.shape[axis] - 1
         agree = (field.narrow(axis + 1, 1, length) * field.narrow(axis + 1, 0, length)).sum(0).abs()
         both = matte.narrow(axis, 1, length) * matte.narrow(axis, 0, length)
         total, mass = total + (both * (1 - agree)).sum(), mass + both.sum()

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from rewild4d.kernels.arrays import fits
-from rewild4d.ours.fused.images import colour_sums, matte_loss
+from rewild4d.ours.fused.images import colour_means, matte_loss
+from rewild4d.ours.fused.views import extent
 from rewild4d.ours.symmetry import Target
 
 WINDOW, SIGMA = 11, 1.5
@@ -29,14 +30,19 @@ def union_window(alphas: list[Tensor], margin: int) -> Window:
         alphas: mattes of one size, [1, h, w].
         margin: pixels.
     """
-    with torch.no_grad():
-        union = torch.stack([alpha[0] for alpha in alphas]).amax(0) > 0
     slices = []
-    for axis in (1, 0):
-        line = union.any(dim=axis).nonzero()
-        first, last = (int(line[0]), int(line[-1])) if len(line) else (0, 0)
-        slices.append(slice(max(0, first - margin), min(union.shape[1 - axis], last + 1 + margin)))
+    for (first, last), length in zip(_extent(alphas), alphas[0].shape[1:], strict=True):
+        slices.append(slice(max(0, first - margin), min(length, last + 1 + margin)))
     return slices[0], slices[1]
+
+
+def _extent(alphas: list[Tensor]) -> tuple[tuple[int, int], tuple[int, int]]:
+    """First and last row and column where any matte is above zero."""
+    if all(map(fits, alphas)):
+        return extent(alphas)
+    union = torch.stack([alpha[0].detach() for alpha in alphas]).amax(0) > 0
+    rows, columns = (union.any(dim=axis).nonzero()[:, 0].tolist() or [0] for axis in (1, 0))
+    return (rows[0], rows[-1]), (columns[0], columns[-1])
 
 
 def silhouette_loss(alpha: Tensor, target: Target, window: Window) -> Tensor:
@@ -69,8 +75,7 @@ def colour_losses(
     inner = _inner(window, alpha)
     if fits(rgb):
         bounds = (inner[0].start, inner[0].stop, inner[1].start, inner[1].stop)
-        sums = colour_sums(rgb, alpha, target.rgb, target.mask, background, _corner_and_size(window), bounds)
-        return sums[0] / area, sums[1] / area
+        return colour_means(rgb, alpha, target.rgb, target.mask, background, _corner_and_size(window), bounds, area)
     behind = background[:, None, None]
     x = rgb[:, *window] + (1 - alpha[:, *window]) * behind
     y = target.rgb[:, *window] + (1 - target.mask[:, *window]) * behind

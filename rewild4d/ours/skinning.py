@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from rewild4d.kernels.arrays import fits
 from rewild4d.ours.config import Skinning
 from rewild4d.ours.fused.field import sample_grid
+from rewild4d.ours.fused.simplex import softmax
 from rewild4d.ours.geometry_losses import tv_loss
 
 
@@ -39,9 +40,10 @@ class SkinningField(nn.Module):
 
     def probabilities(self) -> Tensor:
         """Weights of every voxel, [R^3, J]."""
-        if not self.tied:
-            return self.logits.softmax(dim=-1)
-        return (0.5 * (self.logits + self.logits[self.flipped][:, self.mirror])).softmax(dim=-1)
+        logits: Tensor = self.logits
+        if self.tied:
+            logits = 0.5 * (logits + logits[self.flipped][:, self.mirror])
+        return softmax(logits) if fits(logits) else logits.softmax(dim=-1)
 
     def sample_and_vary(self, probabilities: Tensor, points: Tensor, delta: float | None) -> tuple[Tensor, Tensor]:
         """Weights of points as `sample` gives them, and L_tv of the field (zero where ``delta`` is None)."""

@@ -35,9 +35,7 @@ def _begin(places: np.ndarray, rates: np.ndarray, factors: np.ndarray, firsts: n
 
 
 @kernel
-def _move(
-    value: np.ndarray, slope: np.ndarray, mean: np.ndarray, square: np.ndarray, factors: np.ndarray
-) -> None:
+def _move(value: np.ndarray, slope: np.ndarray, mean: np.ndarray, square: np.ndarray, factors: np.ndarray) -> None:
     keep, add, keep_sq, add_sq = factors[0], factors[1], factors[2], factors[3]
     rate, root, eps = factors[4], factors[5], factors[6]
     for i in range(len(value)):

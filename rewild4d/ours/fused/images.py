@@ -193,10 +193,10 @@ def _colour_backward(
                     on_matte[0, top + row, left + column] -= value * behind[channel]
 
 
-def colour_sums(
+def colour_means(
     image: Tensor, matte: Tensor, truth: Tensor, mask: Tensor, background: Tensor, window: tuple[int, int, int, int],
-    inner: tuple[int, int, int, int],
-) -> Tensor:  # fmt: skip
+    inner: tuple[int, int, int, int], area: float,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Sums over a window of |x - y| and, inside it, of 1 - SSIM, for two images over one background; float32, CPU.
 
     Args:
@@ -207,38 +207,41 @@ def colour_sums(
         background: RGB, [3].
         window: top, left, height, width.
         inner: first and end row, first and end column of the part where SSIM counts, from the window's corner.
+        area: what the sums are divided by.
 
     Returns:
-        [2].
+        Two scalars.
     """
-    return _Colour.apply(image, matte, truth, mask, background, window, inner)
+    return _Colour.apply(image, matte, truth, mask, background, window, inner, area)
 
 
 class _Colour(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, image: Tensor, matte: Tensor, truth: Tensor, mask: Tensor, background: Tensor, window: Any, inner: Any
-    ) -> Tensor:
+        ctx: Any, image: Tensor, matte: Tensor, truth: Tensor, mask: Tensor, background: Tensor, window: Any,
+        inner: Any, area: float,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         given = tuple(array(tensor) for tensor in (image, matte, truth, mask, background))
         _, _, height, width = window
         slopes = np.zeros((9, (height + 2 * HALF) * _stride(width)), np.float32)
         sums = np.zeros((-(-height // STRIP), 2))
         call = np.zeros(1, np.int64), *given, window, inner, TAPS, LANE_NUMBERS, slopes, sums
         run(_colour_forward, [call] * thread_count())
-        ctx.given, ctx.window, ctx.slopes = given, window, slopes
-        return torch.from_numpy(sums.sum(axis=0).astype(np.float32))
+        ctx.given, ctx.window, ctx.slopes, ctx.area = given, window, slopes, area
+        apart, unlike = (sums.sum(axis=0) / area).tolist()
+        return torch.tensor(apart, dtype=torch.float32), torch.tensor(unlike, dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, by_apart: Tensor, by_unlike: Tensor) -> tuple[Tensor | None, ...]:
         image, matte = (torch.zeros(ctx.given[i].shape) for i in (0, 1))
-        g_apart, g_unlike = slope.tolist()
+        g_apart, g_unlike = by_apart.item() / ctx.area, by_unlike.item() / ctx.area
         call = (
             np.zeros(1, np.int64), *ctx.given, ctx.window, TAPS, ctx.slopes, g_apart, g_unlike, image.numpy(),
             matte.numpy(),
         )  # fmt: skip
         run(_colour_backward, [call] * thread_count())
-        return image, matte, None, None, None, None, None
+        return image, matte, None, None, None, None, None, None
 
 
 @kernel

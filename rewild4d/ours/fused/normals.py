@@ -1,0 +1,194 @@
+"""Normals of Gaussians, and how well those of neighbouring pixels agree.
+
+The twins in plain torch are in ours/geometry_losses.py.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from rewild4d.kernels.arrays import array
+from rewild4d.kernels.compiling import inlined, kernel
+from rewild4d.kernels.simd import LANES, absolute, fma, load, select_gt, splat, store
+from rewild4d.kernels.tails import store_first
+
+
+@inlined
+def _unit(quats: np.ndarray, n: int) -> tuple:
+    """A quaternion of length one, and one over its length before."""
+    a, b, c, d = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
+    inverse = np.float32(1 / max(math.sqrt(a * a + b * b + c * c + d * d), 1e-12))
+    return a * inverse, b * inverse, c * inverse, d * inverse, inverse
+
+
+@kernel
+def _forward(
+    quats: np.ndarray, log_scales: np.ndarray, means: np.ndarray, eye: np.ndarray, normals: np.ndarray,
+    chosen: np.ndarray,
+) -> None:  # fmt: skip
+    """Set the normals; ``chosen`` gets 1, 2, 3 for the axis, negative where it was turned round, [n]."""
+    one, two = np.float32(1), np.float32(2)
+    for n in range(len(quats)):
+        axis = 0
+        for i in range(1, 3):
+            if log_scales[n, i] < log_scales[n, axis]:
+                axis = i
+        w, x, y, z, _ = _unit(quats, n)
+        if axis == 0:
+            a, b, c = one - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)
+        elif axis == 1:
+            a, b, c = two * (x * y - w * z), one - two * (x * x + z * z), two * (y * z + w * x)
+        else:
+            a, b, c = two * (x * z + w * y), two * (y * z - w * x), one - two * (x * x + y * y)
+        towards = (eye[0] - means[n, 0]) * a + (eye[1] - means[n, 1]) * b + (eye[2] - means[n, 2]) * c
+        sign = np.float32(-1) if towards < 0 else np.float32(1)
+        chosen[n] = -1 - axis if towards < 0 else 1 + axis
+        normals[n, 0], normals[n, 1], normals[n, 2] = sign * a, sign * b, sign * c
+
+
+@kernel
+def _backward(quats: np.ndarray, chosen: np.ndarray, slope: np.ndarray, on_quats: np.ndarray) -> None:
+    two = np.float32(2)
+    for n in range(len(quats)):
+        w, x, y, z, inverse = _unit(quats, n)
+        twice = two if chosen[n] > 0 else -two
+        a, b, c = twice * slope[n, 0], twice * slope[n, 1], twice * slope[n, 2]
+        axis = abs(chosen[n])
+        if axis == 1:
+            g_w, g_x = z * b - y * c, y * b + z * c
+            g_y, g_z = x * b - w * c - two * y * a, w * b + x * c - two * z * a
+        elif axis == 2:
+            g_w, g_x = x * c - z * a, y * a + w * c - two * x * b
+            g_y, g_z = x * a + z * c, y * c - w * a - two * z * b
+        else:
+            g_w, g_x = y * a - x * b, z * a - w * b - two * x * c
+            g_y, g_z = w * a + z * b - two * y * c, x * a + y * b
+        along = w * g_w + x * g_x + y * g_y + z * g_z
+        on_quats[n, 0], on_quats[n, 1] = (g_w - along * w) * inverse, (g_x - along * x) * inverse
+        on_quats[n, 2], on_quats[n, 3] = (g_y - along * y) * inverse, (g_z - along * z) * inverse
+
+
+def smallest_axes(quats: Tensor, log_scales: Tensor, means: Tensor, eye: Tensor) -> Tensor:
+    """The axis of each Gaussian's smallest scale, turned towards a point; float32, CPU.
+
+    Args:
+        quats: any length, [n, 4]; the only input that gets a gradient.
+        log_scales: [n, 3].
+        means: [n, 3].
+        eye: the point, [3].
+
+    Returns:
+        Unit vectors, [n, 3].
+    """
+    return _SmallestAxes.apply(quats, log_scales, means, eye)
+
+
+class _SmallestAxes(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, quats: Tensor, log_scales: Tensor, means: Tensor, eye: Tensor) -> Tensor:
+        normals, given, chosen = torch.empty(means.shape), array(quats), np.empty(len(quats), np.int8)
+        _forward(given, array(log_scales), array(means), array(eye), normals.numpy(), chosen)
+        ctx.given, ctx.chosen = given, chosen
+        return normals
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+        on_quats = torch.empty(ctx.given.shape)
+        _backward(ctx.given, ctx.chosen, array(slope), on_quats.numpy())
+        return on_quats, None, None, None
+
+
+@kernel
+def _read(
+    image: np.ndarray, matte: np.ndarray, stride: int, field: np.ndarray, cover: np.ndarray, over: np.ndarray
+) -> None:
+    """Unit vectors [3, (h + 2) stride], mattes and one over the lengths [(h + 2) stride], zeros around the image."""
+    height, width = matte.shape
+    field[:], cover[:], over[:] = 0, 0, 0
+    for y in range(height):
+        row = slice((y + 1) * stride + LANES, (y + 1) * stride + LANES + width)
+        a, b, c, inverse = image[0, y], image[1, y], image[2, y], over[row]
+        for x in range(width):
+            inverse[x] = np.float32(1) / math.sqrt(a[x] * a[x] + b[x] * b[x] + c[x] * c[x] + np.float32(1e-24))
+        cover[row] = matte[y]
+        for i in range(3):
+            out, given = field[i][row], image[i, y]
+            for x in range(width):
+                out[x] = given[x] * inverse[x]
+
+
+@inlined
+def _beside(field: np.ndarray, cover: np.ndarray, place: int, other: int) -> tuple:
+    """Sixteen pairs of pixels: the weight, the cosine, and the weighted directions that the first should take."""
+    a, b, c = load(field[0], other), load(field[1], other), load(field[2], other)
+    agree = fma(load(field[0], place), a, fma(load(field[1], place), b, load(field[2], place) * c))
+    both, zero = load(cover, place) * load(cover, other), splat(np.float32(0))
+    share = select_gt(agree, zero, both, select_gt(zero, agree, zero - both, zero))
+    return both, agree, share * a, share * b, share * c
+
+
+@kernel
+def _agreement(image: np.ndarray, matte: np.ndarray, slope: np.ndarray) -> tuple:
+    """The loss times the pairs' weight, and that weight; sets the former's slope by the image [3, h, w]."""
+    height, width = matte.shape
+    stride = (width + LANES - 1) // LANES * LANES + LANES
+    room = (height + 2) * stride + LANES
+    field, cover, over = np.empty((3, room), np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
+    _read(image, matte, stride, field, cover, over)
+    one = splat(np.float32(1))
+    sums, total, mass = np.empty(2 * LANES, np.float32), 0.0, 0.0
+    for y in range(height):
+        lacking, weight = splat(np.float32(0)), splat(np.float32(0))
+        for x in range(0, width, LANES):
+            place = (y + 1) * stride + LANES + x
+            right, r_cos, a, b, c = _beside(field, cover, place, place + 1)
+            below, b_cos, d, e, f = _beside(field, cover, place, place + stride)
+            lacking = lacking + (right * (one - absolute(r_cos)) + below * (one - absolute(b_cos)))
+            weight = weight + (right + below)
+            a, b, c = a + d, b + e, c + f
+            for other in (place - 1, place - stride):
+                _, _, d, e, f = _beside(field, cover, place, other)
+                a, b, c = a + d, b + e, c + f
+            p, q, r = load(field[0], place), load(field[1], place), load(field[2], place)
+            along, inverse = fma(a, p, fma(b, q, c * r)), load(over, place)
+            target = y * width + x
+            store_first(slope[0], target, width - x, inverse * fma(along, p, splat(np.float32(0)) - a))
+            store_first(slope[1], target, width - x, inverse * fma(along, q, splat(np.float32(0)) - b))
+            store_first(slope[2], target, width - x, inverse * fma(along, r, splat(np.float32(0)) - c))
+        store(sums, 0, lacking)
+        store(sums, LANES, weight)
+        total += sums[:LANES].sum()
+        mass += sums[LANES:].sum()
+    return total, mass
+
+
+def disagreement(image: Tensor, matte: Tensor) -> Tensor:
+    """How far the directions of neighbouring pixels are from parallel, weighted by both mattes; float32, CPU.
+
+    Args:
+        image: vectors of any length, [3, h, w]; the only input that gets a gradient.
+        matte: [h, w].
+
+    Returns:
+        Mean of 1 - |cos| over horizontal and vertical pairs, scalar.
+    """
+    return _Disagreement.apply(image, matte)
+
+
+class _Disagreement(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, matte: Tensor) -> Tensor:
+        ctx.slope = torch.empty(image.shape)
+        total, mass = _agreement(array(image), array(matte), ctx.slope.numpy().reshape(3, -1))
+        ctx.mass = max(mass, 1.0)
+        return torch.tensor(total / ctx.mass, dtype=torch.float32)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+        return ctx.slope * (slope.item() / ctx.mass), None
