@@ -131,6 +131,16 @@ def test_probabilities_of_the_field(joints: int, tied: bool) -> None:
     check_twins(make)
 
 
+@pytest.mark.parametrize("place", [0, 9, 17])
+def test_what_is_not_a_number_stays_visible(place: int) -> None:
+    rows = torch.zeros(3, 18)
+    rows[1, place] = math.nan
+    field = SkinningField(rows, torch.zeros(3), torch.ones(3), torch.arange(18), False)
+    assert field.probabilities()[:, place].isnan().tolist() == [False, True, False]
+    own = Gaussians({name: torch.zeros(3, 3) for name in NAMES}, 1.0)
+    assert torch.equal(own.scales(rows).isnan(), rows.isnan())
+
+
 def test_normals() -> None:
     quats, log_scales = normal(1100, 4, seed=1), normal(1100, 3, seed=2)
     log_scales[:5] = 0  # the first of equals

@@ -23,7 +23,8 @@ def _forward(log_scales: np.ndarray, blur: float, scales: np.ndarray) -> None:
     nothing, square = splat(np.float32(0)), np.float32(blur * blur)
     for i in range(0, len(scales), LANES):
         bits = load_first(log_scales, i, len(scales) - i, nothing) * splat(TO_BITS)
-        store_first(scales, i, len(scales) - i, exp2(minimum(splat(MOST), maximum(splat(-MOST), bits))))
+        bits = minimum(splat(MOST), maximum(splat(-MOST), bits))  # in this order a NaN stays one
+        store_first(scales, i, len(scales) - i, exp2(bits))
     for i in range(len(scales)):
         scales[i] = math.sqrt(scales[i] + square)
 

@@ -36,7 +36,7 @@ def _forward(tickets: np.ndarray, logits: np.ndarray, width: int, shares: np.nda
             shift = splat(-lanes_maximum(top) * TO_BITS)
             for i in range(0, width, LANES):
                 bits = fma(load_first(logits, place + i, width - i, bottom), splat(TO_BITS), shift)
-                share = exp2(maximum(bits, splat(LOWEST)))
+                share = exp2(maximum(splat(LOWEST), bits))  # in this order a NaN stays one
                 store_first(shares, place + i, width - i, share)
                 total = total + load_first(shares, place + i, width - i, zero)
             inverse = splat(np.float32(1) / lanes_sum(total))
