@@ -6,6 +6,7 @@ import numpy as np
 
 from rewild4d.kernels.compiling import inlined
 from rewild4d.kernels.simd import LANES, fma, fold1, fold2, fold4, fold8, load, splat, store
+from rewild4d.kernels.tails import load_first, store_first
 
 
 @inlined
@@ -36,5 +37,7 @@ def add_scaled(share: float, source: np.ndarray, start: int, target: np.ndarray,
     factor = splat(share)
     for i in range(0, whole, LANES):
         store(target, place + i, fma(factor, load(source, start + i), load(target, place + i)))
-    for i in range(whole, count):
-        target[place + i] += share * source[start + i]
+    if whole < count:
+        own = load_first(target, place + whole, count - whole, factor)
+        own = fma(factor, load_first(source, start + whole, count - whole, factor), own)
+        store_first(target, place + whole, count - whole, own)

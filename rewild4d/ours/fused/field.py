@@ -13,65 +13,57 @@ from torch.autograd.function import once_differentiable
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.rows import add_scaled
-from rewild4d.kernels.simd import take_ticket
+from rewild4d.kernels.simd import LANES, fma, maximum, minimum, splat, take_ticket
+from rewild4d.kernels.tails import lanes_sum, load_first, store_first
 from rewild4d.kernels.threads import run, thread_count
 
 CHUNK = 1024
 """Gaussians a unit of work holds."""
 
 
-@kernel
-def _forward_difference(
-    own: np.ndarray, following: np.ndarray, width: float, out: np.ndarray, totals: np.ndarray
-) -> None:
-    half = np.float32(0.5)
-    for i in range(len(own)):
-        step = following[i] - own[i]
-        held = min(max(step, -width), width)
-        totals[i] += held * (step - half * held)
-        out[i] -= held
+@inlined
+def _held(step: Any, width: float) -> Any:
+    """The Huber function's slope: a step held between -width and width."""
+    return minimum(splat(width), maximum(splat(-width), step))
 
 
-@kernel
-def _backward_difference(own: np.ndarray, before: np.ndarray, width: float, out: np.ndarray) -> None:
-    for i in range(len(own)):
-        out[i] += min(max(own[i] - before[i], -width), width)
+@inlined
+def _huber(step: Any, held: Any) -> Any:
+    return held * (step - splat(np.float32(0.5)) * held)
 
 
 @kernel
 def _variation(tickets: np.ndarray, grid: np.ndarray, delta: float, slope: np.ndarray, sums: np.ndarray) -> None:
-    """Set slope [R, R, R J] and sums [R] of the Huber function of forward differences, plane by plane."""
+    """Set slope [R, R, R J] and sums [R] of the Huber function of forward differences, plane by plane.
+
+    Beyond the border lies the border once more: a difference of zero.
+    """
     size, line = grid.shape[0], grid.shape[2]
-    joints = line // size
-    width = np.float32(delta)
-    half = np.float32(0.5)
-    totals = np.empty(line, np.float32)
+    joints, last = line // size, size - 1
+    width, zero = np.float32(delta), splat(np.float32(0))
+    wide = np.empty(line + 2 * joints, np.float32)
     while True:
         x = take_ticket(tickets)
         if x >= size:
             return
         plane_sum = 0.0
         for y in range(size):
-            own, out = grid[x, y], slope[x, y]
-            totals[:] = 0
-            out[:] = 0
-            for i in range(line - joints):
-                step = own[i + joints] - own[i]
-                held = min(max(step, -width), width)
-                totals[i] += held * (step - half * held)
-                out[i] -= held
-            for i in range(joints, line):
-                step = own[i] - own[i - joints]
-                out[i] += min(max(step, -width), width)
-            if y + 1 < size:
-                _forward_difference(own, grid[x, y + 1], width, out, totals)
-            if x + 1 < size:
-                _forward_difference(own, grid[x + 1, y], width, out, totals)
-            if y > 0:
-                _backward_difference(own, grid[x, y - 1], width, out)
-            if x > 0:
-                _backward_difference(own, grid[x - 1, y], width, out)
-            plane_sum += totals.sum()
+            own, out, total = grid[x, y], slope[x, y], zero
+            wide[:joints], wide[joints : joints + line], wide[joints + line :] = own[:joints], own, own[line - joints :]
+            behind, ahead = grid[x, max(y - 1, 0)], grid[x, min(y + 1, last)]
+            below, above = grid[max(x - 1, 0), y], grid[min(x + 1, last), y]
+            for i in range(0, line, LANES):
+                left = line - i
+                here = load_first(own, i, left, zero)
+                a, b = load_first(wide, i + 2 * joints, left, zero) - here, load_first(ahead, i, left, zero) - here
+                c = load_first(above, i, left, zero) - here
+                p, q, r = _held(a, width), _held(b, width), _held(c, width)
+                total = total + (_huber(a, p) + _huber(b, q) + _huber(c, r))
+                pull = _held(here - load_first(wide, i, left, zero), width)
+                pull = pull + _held(here - load_first(behind, i, left, zero), width)
+                pull = pull + _held(here - load_first(below, i, left, zero), width)
+                store_first(out, i, left, pull - (p + q + r))
+            plane_sum += lanes_sum(total)
         sums[x] = plane_sum
 
 
@@ -97,14 +89,18 @@ def _sample_forward(
             x, ahead_x = _corner(points, n, 0, origin, pitch, size - 1)
             y, ahead_y = _corner(points, n, 1, origin, pitch, size - 1)
             z, ahead_z = _corner(points, n, 2, origin, pitch, size - 1)
-            weights[n * joints : (n + 1) * joints] = 0
-            for i in range(2):
-                for j in range(2):
-                    for k in range(2):
-                        share = (ahead_x if i else 1 - ahead_x) * (ahead_y if j else 1 - ahead_y)
-                        share = np.float32(share * (ahead_z if k else 1 - ahead_z))
-                        row = ((x + i) * size + y + j) * size + z + k
-                        add_scaled(share, table, row * joints, weights, n * joints, joints)
+            first = ((x * size + y) * size + z) * joints
+            for at in range(0, joints, LANES):
+                total = splat(np.float32(0))
+                for i in range(2):
+                    for j in range(2):
+                        along = (ahead_x if i else 1 - ahead_x) * (ahead_y if j else 1 - ahead_y)
+                        row = first + (i * size + j) * size * joints + at
+                        near = load_first(table, row, joints - at, total)
+                        far = load_first(table, row + joints, joints - at, total)
+                        total = fma(splat(np.float32(along * (1 - ahead_z))), near, total)
+                        total = fma(splat(np.float32(along * ahead_z)), far, total)
+                store_first(weights, n * joints + at, joints - at, total)
 
 
 @kernel
@@ -138,10 +134,10 @@ def _sample_backward(
         plane = take_ticket(tickets)
         if plane >= size:
             return
-        first = plane * line
-        on_table[first : first + line] = 0
+        own = on_table[plane * line : (plane + 1) * line]
+        own[:] = 0
         if len(variation) > 0:
-            add_scaled(np.float32(share_of_it), variation, first, on_table, first, line)
+            add_scaled(np.float32(share_of_it), variation, plane * line, own, 0, line)
         for upper in (1, 0):
             if plane < upper:
                 continue
