@@ -207,6 +207,12 @@ def absolute(typing: Any, a: Any) -> Any:
 
 
 @intrinsic
+def square_root(typing: Any, a: Any) -> Any:
+    """Lane by lane square root."""
+    return signature(lanes_type, a), lambda context, builder, sig, args: llvm_call(builder, "llvm.sqrt.v16f32", args)
+
+
+@intrinsic
 def negated_absolute(typing: Any, a: Any) -> Any:
     """Lane by lane, minus the absolute value."""
 

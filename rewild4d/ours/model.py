@@ -103,8 +103,8 @@ class Model(nn.Module):
         if strength == 0 or not self.config.deform.enabled:
             return posed
         features = pose.features[0].detach() if self.config.deform.detach_features else pose.features[0]
-        parts = weights.detach() @ self.network.anchors if self.config.deform.anchors else weights.detach()
-        return self.deform(features, parts, posed, strength)
+        anchors = self.network.anchors if self.config.deform.anchors else None
+        return self.deform(features, weights, anchors, posed, strength)
 
     def moved(self, pose: Pose, weights: Tensor, strength: float) -> tuple[Posed, Posed]:
         """Skinned Gaussians, and the same deformed, of the appearance branch at a pose of one code."""
