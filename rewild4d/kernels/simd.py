@@ -16,6 +16,8 @@ from numba.core.typing.templates import AbstractTemplate, infer_global
 from numba.extending import intrinsic as numba_intrinsic
 from numba.extending import lower_builtin, models, register_model
 
+from rewild4d.kernels.compiling import inlined
+
 intrinsic: Any = numba_intrinsic  # to a type checker its results are still functions of the typing context
 
 LANES = 16
@@ -278,6 +280,44 @@ def _power_of_two_fit() -> list[float]:
     """Coefficients of 2**x on [-1/2, 1/2], degree 5 at Chebyshev nodes, relative error 2e-7 in float32."""
     nodes = 0.5 * np.cos((np.arange(6) + 0.5) * np.pi / 6)
     return [float(value) for value in np.polyfit(nodes, np.exp2(nodes), 5)]
+
+
+POWER_TERMS = np.array([1.5 * 2.0**23, *_power_of_two_fit()], np.float32)
+"""What `exp2_with` needs: a number whose addition rounds to an integer, left in the low bits, then the polynomial."""
+
+
+@intrinsic
+def _times_power(typing: Any, value: Any, shifted: Any) -> Any:
+    """The value times two to the power that the low bits of ``shifted`` hold."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        exponent = builder.shl(builder.bitcast(args[1], _INTEGERS), ir.Constant(_INTEGERS, [23] * LANES))
+        return builder.bitcast(builder.add(builder.bitcast(args[0], _INTEGERS), exponent), _VECTOR)
+
+    return signature(lanes_type, lanes_type, lanes_type), generate
+
+
+@inlined
+def load_terms(constants: np.ndarray, place: int) -> tuple:
+    """`POWER_TERMS` from an array that holds them at ``place``."""
+    return (
+        broadcast(constants, place), broadcast(constants, place + 1), broadcast(constants, place + 2),
+        broadcast(constants, place + 3), broadcast(constants, place + 4), broadcast(constants, place + 5),
+        broadcast(constants, place + 6),
+    )  # fmt: skip
+
+
+@inlined
+def exp2_with(terms: tuple, x: Any) -> Any:
+    """`exp2` with its constants in registers: as literals each costs an instruction of ten bytes at every use."""
+    shifted = x + terms[0]
+    fraction = x - (shifted - terms[0])
+    value = fma(terms[1], fraction, terms[2])
+    value = fma(value, fraction, terms[3])
+    value = fma(value, fraction, terms[4])
+    value = fma(value, fraction, terms[5])
+    value = fma(value, fraction, terms[6])
+    return _times_power(value, shifted)
 
 
 @intrinsic
