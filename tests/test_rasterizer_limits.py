@@ -146,7 +146,8 @@ image, _, _ = rasterize(means, torch.ones(count, 4), torch.full((count, 3), 0.2)
                         torch.ones(count, 3), camera, pinhole, 16, 16)
 image.sum().backward()
 from rewild4d.rasterizer.stages import bin_and_blend
-print(float(image.max()) > 0, *(sum(each.values()) for each in (bin_and_blend.stats.cache_hits, bin_and_blend.stats.cache_misses)))
+stats = bin_and_blend.stats
+print(float(image.max()) > 0, sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
 """
 
 

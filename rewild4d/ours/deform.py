@@ -8,8 +8,9 @@ from torch import Tensor, nn
 from rewild4d.kernels.arrays import fits
 from rewild4d.kernels.simd import LANES
 from rewild4d.ours.config import Deform as DeformConfig
-from rewild4d.ours.fused.deformation import Reach, deform
+from rewild4d.ours.fused.deformation import deform
 from rewild4d.ours.fused.folding import Layers, fold
+from rewild4d.ours.fused.queries import Reach
 from rewild4d.ours.pose import seed_linears
 from rewild4d.transforms import quat_multiply
 from rewild4d.types import OBJECT_DIAGONAL

@@ -11,19 +11,17 @@ from typing import Any
 import numpy as np
 
 from rewild4d.kernels.compiling import inlined, kernel
+from rewild4d.kernels.powers import POWER_TERMS, exp2_with, load_terms
 from rewild4d.kernels.simd import (
     LANES,
-    POWER_TERMS,
     absolute,
     bits_gt,
     broadcast,
     columns_of_block,
-    exp2_with,
     fma,
     fnma,
     keep_where_ge,
     load,
-    load_terms,
     lowest_bit,
     minimum,
     negated_absolute,

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rewild4d.kernels.compiling import inlined, kernel
+from rewild4d.kernels.powers import load_terms
 from rewild4d.kernels.rows import sum_rows
 from rewild4d.kernels.simd import (
     LANES,
@@ -23,7 +24,6 @@ from rewild4d.kernels.simd import (
     keep_where_ge,
     load,
     load_block,
-    load_terms,
     lowest_bit,
     select_gt,
     splat,

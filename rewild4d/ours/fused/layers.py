@@ -10,8 +10,9 @@ import numpy as np
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.halves import add_pair_product, pair_matrix, pair_rows, pair_vectors, transposed_words
 from rewild4d.kernels.matrix import add_product
+from rewild4d.kernels.powers import exp2
 from rewild4d.kernels.rows import sum_rows
-from rewild4d.kernels.simd import LANES, divide, exp2, fma, load, maximum, select_gt, splat, store
+from rewild4d.kernels.simd import LANES, divide, fma, load, maximum, select_gt, splat, store
 
 BLOCK = 96
 """Gaussians side by side: six vectors."""
