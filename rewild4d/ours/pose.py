@@ -1,11 +1,16 @@
 """Part anchors, the symmetry-aware time code and the pose network."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from rewild4d.kernels.arrays import fits
 from rewild4d.ours.config import Pose as PoseConfig
+from rewild4d.ours.fused.pose_layers import fits_sizes, sizes_of
+from rewild4d.ours.fused.posing import poses
 from rewild4d.transforms import mirror_points, mirror_quats, quat_to_matrix, rigid
 from rewild4d.types import OBJECT_DIAGONAL
 
@@ -71,12 +76,40 @@ class PoseNetwork(nn.Module):
         self.blocks = nn.ModuleList(Block(config.width, config.heads) for _ in range(config.blocks))
         self.norm = nn.LayerNorm(config.width)
         self.head = nn.Linear(config.width, 7)
+        self._layers = [layer for layer in self.modules() if layer._parameters]
         seed_linears(self, generator)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
 
-    def forward(self, code: Tensor) -> Pose:
-        """Poses of a batch of codes, [B, E]."""
+    def forward(self, code: Tensor, flipped: Sequence[bool] | None = None, mirror: Tensor | None = None) -> Pose:
+        """Poses of a batch of codes.
+
+        Args:
+            code: [B, E].
+            flipped: which of them are wanted with left and right exchanged, [B]; none by default.
+            mirror: joint on the other side, [J]; needed with ``flipped``.
+        """
+        if fits(self.anchors) and fits_sizes(self.config.width, self.config.heads) and not code.requires_grad:
+            return self._fused(code, flipped, mirror)
+        pose = self._plain(code)
+        if flipped is None or mirror is None:
+            return pose
+        pick = torch.tensor(flipped, device=code.device)[:, None, None]
+        return Pose(*(torch.where(pick, other, own) for own, other in zip(pose, pose.mirrored(mirror), strict=True)))
+
+    def _fused(self, code: Tensor, flipped: Sequence[bool] | None, mirror: Tensor | None) -> Pose:
+        config, (joints, anchor) = self.config, self.anchors.shape
+        # The modules' own generator of parameters takes longer than a layer.
+        parameters = [each for layer in self._layers for each in layer._parameters.values()]
+        reach = config.reach * OBJECT_DIAGONAL
+        sizes = sizes_of(
+            joints, anchor, anchor + code.shape[1], config.width, config.heads, config.blocks, reach, len(code)
+        )
+        sides = np.array(flipped if flipped is not None else [False] * len(code))
+        other = np.arange(joints) if mirror is None else mirror.numpy()
+        return Pose(*poses(sizes, parameters, code, sides, other))
+
+    def _plain(self, code: Tensor) -> Pose:
         batch, joints = code.shape[0], self.anchors.shape[0]
         tokens = torch.cat((self.anchors.expand(batch, joints, -1), code[:, None].expand(batch, joints, -1)), dim=-1)
         hidden = self.embed(tokens)
