@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from rewild4d.kernels.arrays import fits
 from rewild4d.ours.config import Pose as PoseConfig
 from rewild4d.ours.fused.pose_layers import fits_sizes, sizes_of
-from rewild4d.ours.fused.posing import poses
+from rewild4d.ours.fused.poses import blend, distance
+from rewild4d.ours.fused.posing import codes, poses
 from rewild4d.transforms import mirror_points, mirror_quats, quat_to_matrix, rigid
 from rewild4d.types import OBJECT_DIAGONAL
 
@@ -27,10 +28,6 @@ class Pose(NamedTuple):
     quats: Tensor
     shifts: Tensor
     features: Tensor
-
-    def row(self, index: int) -> "Pose":
-        """One pose of the batch, as a batch of one."""
-        return Pose(*(tensor[index : index + 1] for tensor in self))
 
     def mirrored(self, mirror: Tensor) -> "Pose":
         """The same poses with left and right exchanged."""
@@ -52,6 +49,8 @@ def time_code(time: Tensor, group: Tensor, view: Tensor, frequencies: int, expli
     Returns:
         [B, 2 + 2 frequencies (+ 1)].
     """
+    if fits(time):
+        return codes(time, group, view, frequencies, explicit_group)
     tau = (time * group)[:, None]
     angles = tau * 2.0 ** torch.arange(frequencies, dtype=tau.dtype, device=tau.device)
     parts = [tau, angles.sin(), angles.cos(), view.to(tau)[:, None]]
@@ -179,6 +178,8 @@ def blend_poses(pose: Pose, quats: Tensor, shifts: Tensor, weight: float) -> Pos
     """
     if weight == 0:
         return pose
+    if fits(pose.quats):
+        return Pose(*blend(pose.quats, pose.shifts, quats, shifts, weight), pose.features)
     mixed = (1 - weight) * pose.quats + weight * aligned(quats, pose.quats)
     return Pose(nn.functional.normalize(mixed, dim=-1), (1 - weight) * pose.shifts + weight * shifts, pose.features)
 
@@ -190,5 +191,7 @@ def aligned(quats: Tensor, reference: Tensor) -> Tensor:
 
 def pose_distance(pose: Pose, quats: Tensor, shifts: Tensor) -> Tensor:
     """Mean over joints of |q^ - q|^2 + |d^ - d|^2 / diagonal^2: how far poses are from others, scalar."""
+    if fits(pose.quats):
+        return distance(pose.quats, pose.shifts, quats, shifts, OBJECT_DIAGONAL)
     turn = (pose.quats - aligned(quats, pose.quats).detach()).square().sum(-1)
     return (turn + (pose.shifts - shifts).square().sum(-1) / OBJECT_DIAGONAL**2).mean()

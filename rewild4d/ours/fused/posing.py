@@ -20,6 +20,26 @@ from rewild4d.kernels.threads import run, thread_count
 from rewild4d.ours.fused.pose_layers import Sizes, backward_unit, forward_unit, outputs
 
 
+@kernel
+def _codes(time: np.ndarray, group: np.ndarray, view: np.ndarray, frequencies: int, code: np.ndarray) -> None:
+    last = 1 + 2 * frequencies
+    for item in range(len(time)):
+        tau = time[item] * np.float32(group[item])
+        code[item, 0], code[item, last] = tau, view[item]
+        for octave in range(frequencies):
+            angle = tau * 2.0**octave
+            code[item, 1 + octave], code[item, 1 + frequencies + octave] = math.sin(angle), math.cos(angle)
+        if code.shape[1] > last + 1:
+            code[item, last + 1] = group[item]
+
+
+def codes(time: Tensor, group: Tensor, view: Tensor, frequencies: int, explicit_group: bool) -> Tensor:
+    """The time codes of `pose.time_code`, without gradients; float32 on the CPU."""
+    code = torch.empty(len(time), 2 + 2 * frequencies + explicit_group)
+    _codes(time.numpy(), group.numpy(), view.numpy(), frequencies, code.numpy())
+    return code
+
+
 @inlined
 def _unit(out: np.ndarray, wide: int, lane: int) -> tuple:
     """The unit quaternion of the first four outputs, which are added to the identity; and one over its length."""

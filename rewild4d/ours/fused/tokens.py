@@ -213,6 +213,7 @@ def softmax_back(shares: np.ndarray, first: int, keys: int, wide: int, factor: f
 def _copy_lanes(
     source: np.ndarray, wide: int, lanes: int, rows: int, target: np.ndarray, place: int, step: int
 ) -> None:
+    """Write the first lanes of rows ``wide`` apart to rows ``step`` apart."""
     for row in range(rows):
         for lane in range(lanes):
             target[place + row * step + lane] = source[row * wide + lane]
