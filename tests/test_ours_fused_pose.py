@@ -1,5 +1,6 @@
 """The fused kernels of poses and skeleton against their plain torch twins in double precision."""
 
+import copy
 import math
 
 import msgspec
@@ -183,3 +184,14 @@ def test_blend_and_distance(weight: float) -> None:
         return [*blended, apart[None]], given
 
     check_twins(make)
+
+
+def test_the_kernels_take_the_parameters_in_the_networks_own_order() -> None:
+    own = network(SMALL)
+    copied = copy.deepcopy(own)
+    copied.load_state_dict({name: 2 * value for name, value in own.state_dict().items()}, assign=True)
+    copied.requires_grad_()
+    code = normal(1, 6, seed=1)
+    wanted = copy.deepcopy(copied).double()(code)
+    for one, other in zip(wanted, copied(code.float()), strict=True):
+        torch.testing.assert_close(one.float(), other, atol=1e-4, rtol=1e-4)

@@ -51,11 +51,11 @@ class Model(nn.Module):
     def pose(self, times: Tensor, keys: list[Key]) -> Pose:
         """Poses of views at (possibly jittered) times (i + 1) / T, [B]; mirror images of one pose where tied."""
         config = self.config.pose
-        view = torch.tensor([float(key.view) for key in keys])
         if config.tied:
-            ones = torch.ones_like(view)
+            ones = torch.ones(len(keys))
             code = time_code(times, ones, ones, config.frequencies, config.explicit_group).to(self.pivots)
             return self.network(code, [key.view < 0 for key in keys], self.mirror)
+        view = torch.tensor([float(key.view) for key in keys])
         group = torch.tensor([float(key.group) for key in keys])
         sign = group if config.encoding == "group" else view
         return self.network(time_code(times, sign, view, config.frequencies, config.explicit_group).to(self.pivots))

@@ -75,7 +75,7 @@ class PoseNetwork(nn.Module):
         self.blocks = nn.ModuleList(Block(config.width, config.heads) for _ in range(config.blocks))
         self.norm = nn.LayerNorm(config.width)
         self.head = nn.Linear(config.width, 7)
-        self._layers = [layer for layer in self.modules() if layer._parameters]
+        self._layers = [layer for layer in self.modules() if layer is not self and layer._parameters]
         seed_linears(self, generator)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
@@ -99,14 +99,15 @@ class PoseNetwork(nn.Module):
     def _fused(self, code: Tensor, flipped: Sequence[bool] | None, mirror: Tensor | None) -> Pose:
         config, (joints, anchor) = self.config, self.anchors.shape
         # The modules' own generator of parameters takes longer than a layer.
-        parameters = [each for layer in self._layers for each in layer._parameters.values()]
+        layers = (each for layer in self._layers for each in layer._parameters.values() if each is not None)
+        parameters = [self.anchors, *layers]
         reach = config.reach * OBJECT_DIAGONAL
         sizes = sizes_of(
             joints, anchor, anchor + code.shape[1], config.width, config.heads, config.blocks, reach, len(code)
         )
-        sides = np.array(flipped if flipped is not None else [False] * len(code))
-        other = np.arange(joints) if mirror is None else mirror.numpy()
-        return Pose(*poses(sizes, parameters, code, sides, other))
+        if flipped is None or mirror is None:
+            return Pose(*poses(sizes, parameters, code, np.zeros(len(code), np.bool_), np.arange(joints)))
+        return Pose(*poses(sizes, parameters, code, np.array(flipped), mirror.numpy()))
 
     def _plain(self, code: Tensor) -> Pose:
         batch, joints = code.shape[0], self.anchors.shape[0]

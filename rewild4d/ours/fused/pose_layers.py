@@ -74,7 +74,7 @@ def sizes_of(
     joints: int, anchor: int, inputs: int, width: int, heads: int, blocks: int, reach: float, items: int
 ) -> Sizes:
     """Sizes for a batch of ``items``; the arguments are as in `Sizes`."""
-    items = min(items, ITEMS)
+    items = min(max(1, items), ITEMS)
     wide, tile = (-(-count // LANES) * LANES for count in (items * joints, joints))
     shares = items * heads * tile * tile
     of_block = (10 * width + 2) * wide + shares

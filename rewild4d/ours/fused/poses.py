@@ -61,7 +61,7 @@ class _Distance(torch.autograd.Function):
         given = (array(each).reshape(-1, each.shape[-1]) for each in (quats, shifts, others, other_shifts))
         ctx.slopes = np.empty(quats.shape, np.float32), np.empty(shifts.shape, np.float32)
         flat = (slope.reshape(-1, slope.shape[-1]) for slope in ctx.slopes)
-        return torch.tensor(_distance(*given, unit, *flat), dtype=torch.float32)
+        return torch.from_numpy(np.array(_distance(*given, unit, *flat), np.float32))
 
     @staticmethod
     @once_differentiable

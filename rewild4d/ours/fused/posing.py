@@ -35,9 +35,9 @@ def _codes(time: np.ndarray, group: np.ndarray, view: np.ndarray, frequencies: i
 
 def codes(time: Tensor, group: Tensor, view: Tensor, frequencies: int, explicit_group: bool) -> Tensor:
     """The time codes of `pose.time_code`, without gradients; float32 on the CPU."""
-    code = torch.empty(len(time), 2 + 2 * frequencies + explicit_group)
-    _codes(time.numpy(), group.numpy(), view.numpy(), frequencies, code.numpy())
-    return code
+    code = np.empty((len(time), 2 + 2 * frequencies + explicit_group), np.float32)
+    _codes(time.numpy(), group.numpy(), view.numpy(), frequencies, code)
+    return torch.from_numpy(code)
 
 
 @inlined
@@ -139,7 +139,7 @@ def poses(
 
     Args:
         sizes: of the network.
-        parameters: contiguous, in the network's own order; the only inputs that get gradients.
+        parameters: contiguous float32, in the network's own order; the only inputs that get gradients.
         code: [B, E].
         flipped: which poses are wanted with left and right exchanged, bool, [B].
         mirror: joint on the other side, int64, [J].
@@ -154,19 +154,16 @@ class _Poses(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, sizes: Sizes, code: Tensor, flipped: np.ndarray, mirror: np.ndarray, keep: bool, *parameters: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         batch, units = len(code), -(-len(code) // sizes.items)
-        made = tuple(torch.empty((batch, sizes.joints, size)) for size in (4, 3, sizes.width))
+        made = tuple(np.empty((batch, sizes.joints, size), np.float32) for size in (4, 3, sizes.width))
         kept = np.empty((units if keep else 1, sizes.kept), np.float32)
         addresses = np.array([parameter.data_ptr() for parameter in parameters])
         starts = _starts(tuple(parameter.numel() for parameter in parameters))
-        call = (
-            np.zeros(1, np.int64), sizes, addresses, starts, array(code), flipped, mirror, kept,
-            *(tensor.numpy() for tensor in made),
-        )  # fmt: skip
+        call = (np.zeros(1, np.int64), sizes, addresses, starts, array(code), flipped, mirror, kept, *made)
         run(_forward, [call] * min(thread_count(), len(kept)))
         ctx.parameters, ctx.given = parameters, (sizes, addresses, starts, flipped, mirror, kept)
-        return made
+        return tuple(map(torch.from_numpy, made))
 
     @staticmethod
     @once_differentiable

@@ -253,12 +253,12 @@ class _Stand(torch.autograd.Function):
         joints, chosen = len(pivots), np.array(rows, np.int64)
         turns, moves, centers = array(quats), array(shifts), pivots.numpy()
         sizes = ((4,), (3,), (features.shape[2],), (4, 4))
-        made = tuple(torch.empty((len(rows), joints, *size)) for size in sizes)
-        _stand(turns, moves, array(features), chosen, centers, *(tensor.numpy() for tensor in made))
+        made = tuple(np.empty((len(rows), joints, *size), np.float32) for size in sizes)
+        _stand(turns, moves, array(features), chosen, centers, *made)
         slopes = np.zeros(turns.shape), np.zeros(moves.shape)
         total = _regularise(turns, moves, centers, parents.numpy(), weights, *slopes)
         ctx.given, ctx.slopes, ctx.size = (turns, chosen, centers), slopes, features.shape
-        return *made, torch.tensor(total, dtype=torch.float32)
+        return tuple(map(torch.from_numpy, (*made, np.array(total, np.float32))))
 
     @staticmethod
     @once_differentiable
