@@ -14,12 +14,12 @@ from numba.core.typing import signature
 
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.matrix import add_product, transpose_tile
+from rewild4d.kernels.powers import exp2
 from rewild4d.kernels.rows import sum_rows
 from rewild4d.kernels.simd import (
     LANES,
     absolute,
     divide,
-    exp2,
     fma,
     intrinsic,
     load,
