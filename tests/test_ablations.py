@@ -64,18 +64,20 @@ def test_without_part_anchors_the_query_holds_the_weights(case: Case) -> None:
     whole, without = model(case), model(case, deform=Deform(anchors=False))
     assert without.deform.inputs - whole.deform.inputs == 20 - 8
     weights = without.field.sample(without.field.probabilities(), without.gaussians.means)
-    seen: list[torch.Tensor] = []
-    without.deform.register_forward_pre_hook(lambda _, given: seen.append(given[1]))
+    seen: list[tuple[torch.Tensor, torch.Tensor | None]] = []
+    without.deform.register_forward_pre_hook(lambda _, given: seen.append(given[1:3]))
     pose = without.pose(torch.tensor([0.5]), [Key(1, 1, 0)])
     _, moved = without.moved(pose, weights, 1.0)
-    assert torch.equal(seen[0], weights)
+    assert torch.equal(seen[0][0], weights)
+    assert seen[0][1] is None
     moved.means.sum().backward()
     assert without.network.anchors.grad is not None, "the pose network keeps its anchors"
     # The anchors reach the deformation through the parts' features alone.
     weights = whole.field.sample(whole.field.probabilities(), whole.gaussians.means)
-    whole.deform.register_forward_pre_hook(lambda _, given: seen.append(given[1]))
+    whole.deform.register_forward_pre_hook(lambda _, given: seen.append(given[1:3]))
     whole.moved(whole.pose(torch.tensor([0.5]), [Key(1, 1, 0)]), weights, 1.0)
-    torch.testing.assert_close(seen[1], weights @ whole.network.anchors)
+    assert torch.equal(seen[1][0], weights)
+    assert seen[1][1] is whole.network.anchors
 
 
 def test_without_the_symmetric_code_both_groups_share_one(case: Case) -> None:

@@ -10,6 +10,7 @@ from torch import nn
 
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.doubles import floor, load_columns, log2, root, spread, store_columns, where_gt
+from rewild4d.kernels.halves import AVAILABLE, add_pair_product, pair_matrix, pair_rows, pair_vectors
 from rewild4d.kernels.matrix import add_product, transpose_tile
 from rewild4d.kernels.memory import keep_freed_memory
 from rewild4d.kernels.rows import add_scaled, sum_rows
@@ -32,6 +33,45 @@ def test_products_are_added(rows: int, depth: int, columns: int, transposed: boo
     stored, strides = (np.ascontiguousarray(a.T), (1, rows)) if transposed else (a, (depth, 1))
     add_product(stored.ravel(), 0, *strides, b.ravel(), 0, columns, depth, c.ravel(), 0, columns, rows, columns)
     np.testing.assert_allclose(c, before + a.astype(np.float64) @ b, atol=1e-4)
+
+
+@kernel
+def _pair_product(a: np.ndarray, b: np.ndarray, c: np.ndarray, rows: int, depth: int, columns: int) -> None:
+    left, right = np.empty(rows * depth // 2, np.int32), np.empty(depth * columns // 2, np.float32)
+    pair_matrix(a.view(np.int32), 0, rows, depth, left, np.empty_like(left), 0)
+    pair_rows(b, depth, columns, right)
+    half = depth // 2
+    add_pair_product(left.view(np.float32), 0, half, right, 0, columns, half, c, 0, columns, rows, columns)
+
+
+@pytest.mark.skipif(not AVAILABLE, reason="this CPU multiplies no bfloat16 pairs (AVX512_BF16)")
+@pytest.mark.parametrize(("rows", "depth", "columns"), [(8, 2, 16), (16, 8, 48), (64, 54, 80), (24, 48, 112)])
+def test_products_of_pairs_are_those_of_the_rounded_factors(rows: int, depth: int, columns: int) -> None:
+    a, b, before = numbers(rows, depth, seed=1), numbers(depth, columns, seed=2), numbers(rows, columns, seed=3)
+    c = before.copy()
+    _pair_product(a.ravel(), b.ravel(), c.ravel(), rows, depth, columns)
+    left, right = (torch.from_numpy(factor).bfloat16().double().numpy() for factor in (a, b))
+    np.testing.assert_allclose(c, before + left @ right, atol=1e-4)
+
+
+@kernel
+def _pairs(given: np.ndarray, along: np.ndarray, across: np.ndarray, vectors: np.ndarray) -> None:
+    pair_matrix(given.view(np.int32), 0, 16, 32, along, across, 0)
+    pair_vectors(given, 16, 32, vectors)
+
+
+def test_words_hold_neighbours_of_a_row_a_column_and_a_vector() -> None:
+    given = numbers(16, 32, seed=1)
+    along, across, vectors = np.empty(256, np.int32), np.empty(256, np.int32), np.empty(256, np.float32)
+    _pairs(given.ravel(), along, across, vectors)
+    rounded = torch.from_numpy(given).bfloat16()
+
+    def words(array: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(array.view(np.int16)).view(torch.bfloat16)
+
+    assert torch.equal(words(along).view(16, 32), rounded)
+    assert torch.equal(words(across).view(32, 16), rounded.T)
+    assert torch.equal(words(vectors).view(16, 16, 2), rounded.view(16, 2, 16).transpose(1, 2))
 
 
 @kernel

@@ -3,8 +3,9 @@
 import pytest
 import torch
 from torch import Tensor
-from twins import check_twins, leaves, normal, unit
+from twins import Make, check_twins, leaves, normal, unit
 
+from rewild4d.kernels.halves import AVAILABLE
 from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.config import Config, Deform, Skinning
 from rewild4d.ours.deform import DeformNetwork, Posed
@@ -19,29 +20,48 @@ from rewild4d.priors.template import MIRROR, PARENTS, quadruped
 from rewild4d.types import Camera
 
 
-@pytest.mark.parametrize(("count", "width", "heads"), [(1, 16, 2), (100, 32, 4), (48, 48, 4)])
-def test_deformation(count: int, width: int, heads: int) -> None:
+def deformation(count: int, config: Deform, mixed: bool = True, spread: float = 0.3) -> Make:
     def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
-        config = Deform(width=width, heads=heads)
-        network = DeformNetwork(8, 24, config, torch.Generator().manual_seed(0))
+        network = DeformNetwork(8 if mixed else 20, 24, config, torch.Generator().manual_seed(0))
         for i, layer in enumerate(network.children()):
             generator = torch.Generator().manual_seed(i)
-            torch.nn.init.normal_(layer.weight, std=0.3, generator=generator)
-            torch.nn.init.normal_(layer.bias, std=0.3, generator=generator)
+            torch.nn.init.normal_(layer.weight, std=spread, generator=generator)
+            torch.nn.init.normal_(layer.bias, std=spread, generator=generator)
         network.to(dtype)
         given = leaves(
             dtype,
             features=normal(20, 24, seed=1),
-            parts=normal(count, 8, seed=2),
+            anchors=normal(20, 8, seed=2),
             means=2 * normal(count, 3, seed=3),
             quats=unit(count, 4, seed=4),
             log_scales=normal(count, 3, seed=5) - 3,
         )
         posed = Posed(given["means"], given["quats"], given["log_scales"])
-        moved = network(given["features"], given["parts"], posed, 0.7)
+        weights = normal(count, 20, seed=6).softmax(-1).to(dtype)
+        moved = network(given["features"], weights, given["anchors"] if mixed else None, posed, 0.7)
         return list(moved), given | dict(network.named_parameters())
 
-    check_twins(make)
+    return make
+
+
+@pytest.mark.parametrize(("count", "width", "heads"), [(1, 16, 2), (150, 32, 4), (96, 48, 4)])
+@pytest.mark.parametrize("mixed", [True, False])
+def test_deformation(count: int, width: int, heads: int, mixed: bool) -> None:
+    check_twins(deformation(count, Deform(width=width, heads=heads, half=False), mixed))
+
+
+@pytest.mark.skipif(not AVAILABLE, reason="this CPU multiplies no bfloat16 pairs (AVX512_BF16)")
+def test_deformation_in_bfloat16_is_the_same_to_its_rounding() -> None:
+    make, slopes, values = deformation(600, Deform(width=32), spread=0.15), [], []
+    for dtype in (torch.float64, torch.float32):
+        (means, quats, log_scales), given = make(dtype)
+        moves = torch.cat((means - given["means"], quats - given["quats"], log_scales - given["log_scales"]), dim=1)
+        moves.square().sum().backward()
+        values.append(moves.double())
+        slopes.append(torch.cat([each.grad.flatten().double() for each in given.values() if each.grad is not None]))
+    # A factor keeps eight bits, and six layers follow each other.
+    assert (values[0] - values[1]).norm() < 6 / 256 * values[0].norm()
+    assert (slopes[0] - slopes[1]).norm() < 6 / 256 * slopes[0].norm()
 
 
 def test_deformation_is_the_same_bits_for_any_number_of_threads() -> None:
@@ -53,7 +73,8 @@ def test_deformation_is_the_same_bits_for_any_number_of_threads() -> None:
         for threads in (1, 2, 4):
             torch.set_num_threads(threads)
             network.zero_grad()
-            moved = network(normal(20, 24, seed=4).float(), normal(5000, 8, seed=5).float(), posed, 1.0)
+            weights = normal(5000, 20, seed=5).float().softmax(-1)
+            moved = network(normal(20, 24, seed=4).float(), weights, normal(20, 8, seed=6).float(), posed, 1.0)
             (moved.means.square().sum() + moved.quats[:, 0].sum()).backward()
             found.append([*moved, network.up.weight.grad, network.query.weight.grad])
     finally:

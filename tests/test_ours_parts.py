@@ -88,13 +88,14 @@ def test_pose_network_starts_at_rest_and_its_anchors_are_wide() -> None:
 def test_deformation_starts_as_skinning_and_its_query_takes_no_gradient() -> None:
     network = DeformNetwork(8, 128, Deform(width=32), generator())
     means = torch.randn(5, 3, generator=generator(), requires_grad=True)
+    features, weights, anchors = (torch.randn(*shape, generator=generator()) for shape in ((20, 128), (5, 20), (20, 8)))
     posed = Posed(means, random_poses(1, 5)[0][0], torch.zeros(5, 3))
-    out = network(torch.randn(20, 128, generator=generator()), torch.randn(5, 8, generator=generator()), posed, 1.0)
+    out = network(features, weights, anchors, posed, 1.0)
     torch.testing.assert_close(out.means, means)
     torch.testing.assert_close(out.quats, posed.quats)
     torch.testing.assert_close(out.log_scales, posed.log_scales)
     torch.nn.init.normal_(network.out.weight, generator=generator())
-    out = network(torch.randn(20, 128, generator=generator()), torch.randn(5, 8, generator=generator()), posed, 1.0)
+    out = network(features, weights, anchors, posed, 1.0)
     (slope,) = torch.autograd.grad(out.means.sum(), means)
     torch.testing.assert_close(slope, torch.ones(5, 3))
     assert (out.log_scales - posed.log_scales).abs().max() <= 1.0

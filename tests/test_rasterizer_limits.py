@@ -145,8 +145,9 @@ means = torch.zeros(count, 3).requires_grad_()
 image, _, _ = rasterize(means, torch.ones(count, 4), torch.full((count, 3), 0.2), torch.full((count,), 0.5),
                         torch.ones(count, 3), camera, pinhole, 16, 16)
 image.sum().backward()
-from rewild4d.rasterizer.blending import blend
-print(float(image.max()) > 0, sum(blend.stats.cache_hits.values()), sum(blend.stats.cache_misses.values()))
+from rewild4d.rasterizer.stages import bin_and_blend
+stats = bin_and_blend.stats
+print(float(image.max()) > 0, sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
 """
 
 

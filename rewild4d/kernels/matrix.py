@@ -4,6 +4,7 @@ A matrix is a 1D float32 array, the index of its first element and the distances
 routine serves a matrix and its transpose. Rows of the result and of the right factor are multiples of sixteen floats.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -37,8 +38,13 @@ def _broadcast(builder: Any, number: Any) -> Any:
     return builder.shuffle_vector(one, one, ir.Constant(_INTEGERS, [0] * LANES))
 
 
-def _tile(vectors: int) -> Any:
-    """An intrinsic that adds A B to a tile of C of 8 rows and ``vectors`` vectors."""
+def matrix_tile(vectors: int, multiply_add: Callable[[Any, Any, Any, Any], Any]) -> Any:
+    """An intrinsic that adds A B to a tile of C of 8 rows and ``vectors`` vectors.
+
+    Args:
+        vectors: in a row of the tile.
+        multiply_add: generates total + left * right from (builder, left, right, total).
+    """
 
     @intrinsic
     def tile(
@@ -77,10 +83,7 @@ def _tile(vectors: int) -> Any:
             new = []
             for r in range(ROWS):
                 factor = _broadcast(builder, builder.load(builder.gep(left, [builder.add(row_starts[r], along)])))
-                new += [
-                    llvm_call(builder, "llvm.fma.v16f32", [factor, columns[v], sums[r * vectors + v]])
-                    for v in range(vectors)
-                ]
+                new += [multiply_add(builder, factor, columns[v], sums[r * vectors + v]) for v in range(vectors)]
             following = builder.add(step, _word(1))
             step.add_incoming(following, loop)
             for total, value in zip(sums, new, strict=True):
@@ -107,7 +110,17 @@ def _word(value: int) -> Any:
     return ir.Constant(_WORD, value)
 
 
-_tile1, _tile2, _tile3 = _tile(1), _tile(2), _tile(3)
+def _multiply_add(builder: Any, left: Any, right: Any, total: Any) -> Any:
+    return llvm_call(builder, "llvm.fma.v16f32", [left, right, total])
+
+
+_tile1, _tile2, _tile3 = (matrix_tile(vectors, _multiply_add) for vectors in (1, 2, 3))
+
+
+@kernel
+def tile_width(left: int) -> int:
+    """Vectors of the next tile's rows where so many are left; two and two for four: eight sums wait for each other."""
+    return min(left, VECTORS) if left != VECTORS + 1 else 2
 
 
 @kernel
@@ -124,16 +137,18 @@ def add_product(
         rows: a multiple of 8.
         columns: a multiple of 16.
     """
-    for column in range(0, columns, VECTORS * LANES):
-        left = columns - column
+    column = 0
+    while column < columns:
+        width = tile_width((columns - column) // LANES)
         for row in range(0, rows, ROWS):
             place = c_first + row * c_row + column
-            if left >= 3 * LANES:
+            if width == 3:
                 _tile3(a, a_first + row * a_row, a_row, a_step, b, b_first + column, b_row, depth, c, place, c_row)
-            elif left >= 2 * LANES:
+            elif width == 2:
                 _tile2(a, a_first + row * a_row, a_row, a_step, b, b_first + column, b_row, depth, c, place, c_row)
             else:
                 _tile1(a, a_first + row * a_row, a_row, a_step, b, b_first + column, b_row, depth, c, place, c_row)
+        column += width * LANES
 
 
 @intrinsic

@@ -20,7 +20,7 @@ intrinsic: Any = numba_intrinsic  # to a type checker its results are still func
 
 LANES = 16
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
-_VECTOR, _INTEGERS = ir.VectorType(_FLOAT, LANES), ir.VectorType(_INT, LANES)
+VECTOR, INTEGERS = ir.VectorType(_FLOAT, LANES), ir.VectorType(_INT, LANES)
 
 
 class LanesType(types.Type):
@@ -36,11 +36,11 @@ lanes_type = LanesType()
 @register_model(LanesType)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _VECTOR)
+        super().__init__(manager, kind, VECTOR)
 
 
-def _constant(values: Any) -> ir.Constant:
-    return ir.Constant(_VECTOR, [float(np.float32(value)) for value in np.broadcast_to(values, LANES)])
+def constant(values: Any) -> ir.Constant:
+    return ir.Constant(VECTOR, [float(np.float32(value)) for value in np.broadcast_to(values, LANES)])
 
 
 @infer_global(operator.add)
@@ -77,8 +77,8 @@ def splat(typing: Any, value: Any) -> Any:
     """One number in all lanes."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), args[0], ir.Constant(_INT, 0))
-        return builder.shuffle_vector(one, one, ir.Constant(_INTEGERS, [0] * LANES))
+        one = builder.insert_element(ir.Constant(VECTOR, ir.Undefined), args[0], ir.Constant(_INT, 0))
+        return builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
 
     return signature(lanes_type, types.float32), generate
 
@@ -87,20 +87,20 @@ def splat(typing: Any, value: Any) -> Any:
 def columns_of_block(typing: Any) -> Any:
     """Column 0..3 of each lane in a 4 x 4 block."""
     values = [lane % 4 for lane in range(LANES)]
-    return signature(lanes_type), lambda context, builder, sig, args: _constant(values)
+    return signature(lanes_type), lambda context, builder, sig, args: constant(values)
 
 
 @intrinsic
 def rows_of_block(typing: Any) -> Any:
     """Row 0..3 of each lane in a 4 x 4 block."""
     values = [lane // 4 for lane in range(LANES)]
-    return signature(lanes_type), lambda context, builder, sig, args: _constant(values)
+    return signature(lanes_type), lambda context, builder, sig, args: constant(values)
 
 
 def _pointer(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     array = context.make_array(sig.args[0])(context, builder, args[0])
     first = builder.gep(array.data, [args[1]])
-    return builder.bitcast(first, _VECTOR.as_pointer())
+    return builder.bitcast(first, VECTOR.as_pointer())
 
 
 @intrinsic
@@ -119,9 +119,9 @@ def broadcast(typing: Any, array: Any, index: Any) -> Any:
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        one = ir.Constant(_VECTOR, ir.Undefined)
+        one = ir.Constant(VECTOR, ir.Undefined)
         one = builder.insert_element(one, builder.load(builder.gep(data, [args[1]])), ir.Constant(_INT, 0))
-        return builder.shuffle_vector(one, one, ir.Constant(_INTEGERS, [0] * LANES))
+        return builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
 
     return signature(lanes_type, array, types.intp), generate
 
@@ -174,7 +174,7 @@ def store_block(typing: Any, array: Any, index: Any, stride: Any, value: Any) ->
     return signature(types.void, array, types.intp, types.intp, lanes_type), generate
 
 
-def llvm_call(builder: Any, name: str, args: Any, result: Any = _VECTOR) -> Any:
+def llvm_call(builder: Any, name: str, args: Any, result: Any = VECTOR) -> Any:
     """A call of one of LLVM's own functions, while code is generated."""
     function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(result, [arg.type for arg in args]), name)
     return builder.call(function, args)
@@ -207,12 +207,18 @@ def absolute(typing: Any, a: Any) -> Any:
 
 
 @intrinsic
+def square_root(typing: Any, a: Any) -> Any:
+    """Lane by lane square root."""
+    return signature(lanes_type, a), lambda context, builder, sig, args: llvm_call(builder, "llvm.sqrt.v16f32", args)
+
+
+@intrinsic
 def negated_absolute(typing: Any, a: Any) -> Any:
     """Lane by lane, minus the absolute value."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        bits = builder.or_(builder.bitcast(args[0], _INTEGERS), ir.Constant(_INTEGERS, [-(2**31)] * LANES))
-        return builder.bitcast(bits, _VECTOR)
+        bits = builder.or_(builder.bitcast(args[0], INTEGERS), ir.Constant(INTEGERS, [-(2**31)] * LANES))
+        return builder.bitcast(bits, VECTOR)
 
     return signature(lanes_type, a), generate
 
@@ -242,7 +248,7 @@ def keep_where_ge(typing: Any, value: Any, a: Any, b: Any) -> Any:
     """The value where a >= b, zero elsewhere."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.select(builder.fcmp_ordered(">=", args[1], args[2]), args[0], _constant(0.0))
+        return builder.select(builder.fcmp_ordered(">=", args[1], args[2]), args[0], constant(0.0))
 
     return signature(lanes_type, lanes_type, lanes_type, lanes_type), generate
 
@@ -268,38 +274,14 @@ def bits_gt(typing: Any, a: Any, b: Any) -> Any:
     return signature(types.int64, lanes_type, lanes_type), generate
 
 
-def _power_of_two_fit() -> list[float]:
-    """Coefficients of 2**x on [-1/2, 1/2], degree 5 at Chebyshev nodes, relative error 2e-7 in float32."""
-    nodes = 0.5 * np.cos((np.arange(6) + 0.5) * np.pi / 6)
-    return [float(value) for value in np.polyfit(nodes, np.exp2(nodes), 5)]
-
-
-@intrinsic
-def exp2(typing: Any, x: Any) -> Any:
-    """2**x for -126 <= x <= 126; meaningless but harmless outside."""
-    coefficients = _power_of_two_fit()
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        magic = _constant(1.5 * 2.0**23)  # adding it rounds to an integer, left in the low bits
-        shifted = builder.fadd(args[0], magic)
-        fraction = builder.fsub(args[0], builder.fsub(shifted, magic))
-        value = _constant(coefficients[0])
-        for coefficient in coefficients[1:]:
-            value = llvm_call(builder, "llvm.fma.v16f32", [value, fraction, _constant(coefficient)])
-        exponent = builder.shl(builder.bitcast(shifted, _INTEGERS), ir.Constant(_INTEGERS, [23] * LANES))
-        return builder.bitcast(builder.add(builder.bitcast(value, _INTEGERS), exponent), _VECTOR)
-
-    return signature(lanes_type, lanes_type), generate
-
-
 def _fold(take_low: list[int], take_high: list[int]) -> Any:
     """An intrinsic that adds two shuffles of (a, b): one level of a transposing sum."""
 
     @intrinsic
     def fold(typing: Any, a: Any, b: Any) -> Any:
         def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            low = builder.shuffle_vector(*args, ir.Constant(_INTEGERS, take_low))
-            high = builder.shuffle_vector(*args, ir.Constant(_INTEGERS, take_high))
+            low = builder.shuffle_vector(*args, ir.Constant(INTEGERS, take_low))
+            high = builder.shuffle_vector(*args, ir.Constant(INTEGERS, take_high))
             return builder.fadd(low, high)
 
         return signature(lanes_type, lanes_type, lanes_type), generate

@@ -95,6 +95,8 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """Displacement per unit of output."""
     max_log_scale: float = 1.0
     """Bound on the change of log scale (tanh): unbounded offsets make points fly off."""
+    half: bool = True
+    """Factors of the network's products in bfloat16 where a CPU multiplies such pairs (sums keep single precision)."""
     ramp_start: float = 0.05
     """Fraction at which the deformation starts to fade in: the pose explains the motion first."""
     ramp_end: float = 0.15

@@ -6,9 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from rewild4d.kernels.arrays import fits
+from rewild4d.kernels.simd import LANES
 from rewild4d.ours.config import Deform as DeformConfig
-from rewild4d.ours.fused.deformation import Reach, deform
-from rewild4d.ours.fused.layers import layout, padded
+from rewild4d.ours.fused.deformation import deform
+from rewild4d.ours.fused.folding import Layers, fold
+from rewild4d.ours.fused.queries import Reach
 from rewild4d.ours.pose import seed_linears
 from rewild4d.transforms import quat_multiply
 from rewild4d.types import OBJECT_DIAGONAL
@@ -41,20 +43,25 @@ class DeformNetwork(nn.Module):
         seed_linears(self, generator)
         nn.init.zeros_(self.out.weight)
 
-    def forward(self, features: Tensor, parts: Tensor, posed: Posed, strength: float) -> Posed:
+    def forward(
+        self, features: Tensor, weights: Tensor, anchors: Tensor | None, posed: Posed, strength: float
+    ) -> Posed:
         """Deform skinned Gaussians.
 
         Args:
             features: part features F_J, [J, K].
-            parts: part mixture of each Gaussian, weights times anchors, or the weights themselves, [n, D].
+            weights: skinning weights, taken as given, [n, J].
+            anchors: of the parts; their mixture tells a Gaussian's place on the body. None: the weights do, [J, D].
             posed: skinned Gaussians; gradients pass through to them, but not through the query.
             strength: the ramp, in [0, 1].
 
         Returns:
             Deformed Gaussians.
         """
-        if fits(posed.means) and parts.shape[1] <= 16:
-            return Posed(*self._fused(features, parts, posed, strength))
+        weights = weights.detach()
+        if fits(posed.means) and (anchors is None or anchors.shape[1] <= LANES):
+            return Posed(*self._fused(features, weights, anchors, posed, strength))
+        parts = weights if anchors is None else weights @ anchors
         query = torch.cat((parts, self._place(posed)), dim=-1)
         hidden = self._attend(query, features) + self.skip(query)
         hidden = hidden + self.down(torch.relu(self.up(torch.relu(hidden))))
@@ -93,27 +100,15 @@ class DeformNetwork(nn.Module):
         mixed = torch.einsum("jhs,whs->whj", value, self.project.weight.view(width, heads, size)).flatten(1)
         return asked * size**-0.5, bias * size**-0.5, mixed
 
-    def _fused(self, features: Tensor, parts: Tensor, posed: Posed, strength: float) -> tuple[Tensor, Tensor, Tensor]:
-        asked, asked_bias, mixed = self._attention(features)
-        sizes = layout(self.inputs, len(asked), self.config.width, self.config.heads)
-        pairs = (
-            (asked, asked_bias),
-            (self.skip.weight, self.skip.bias + self.project.bias),
-            (mixed, None),
-            (self.up.weight, self.up.bias),
-            (self.down.weight, self.down.bias),
-            (self.out.weight, self.out.bias),
-        )
-        flat = torch.cat([piece for matrix, bias in pairs for piece in _padded(matrix, bias)])
-        place = 2 / OBJECT_DIAGONAL
+    def _fused(
+        self, features: Tensor, weights: Tensor, anchors: Tensor | None, posed: Posed, strength: float
+    ) -> tuple[Tensor, Tensor, Tensor]:
         config = self.config
-        reach = Reach(place, config.frequencies, parts.shape[1], float(strength), config.reach, config.max_log_scale)
-        return deform(flat, sizes, reach, parts, *posed)
-
-
-def _padded(matrix: Tensor, bias: Tensor | None) -> tuple[Tensor, Tensor]:
-    """A matrix and the bias behind it as `layers.Layout` has them, flat."""
-    rows, columns = matrix.shape
-    more = padded(rows) - rows
-    wide = nn.functional.pad(matrix, (0, padded(columns) - columns, 0, more))
-    return wide.flatten(), matrix.new_zeros(padded(rows)) if bias is None else nn.functional.pad(bias, (0, more))
+        layers = (self.query, self.skip, self.key, self.value, self.project, self.up, self.down, self.out)
+        numbers = Layers(*(number for layer in layers for number in (layer.weight, layer.bias)))
+        flat, sizes = fold(features, numbers, config.heads)
+        parts = weights.shape[1] if anchors is None else anchors.shape[1]
+        reach = Reach(
+            2 / OBJECT_DIAGONAL, config.frequencies, parts, float(strength), config.reach, config.max_log_scale
+        )
+        return deform(flat, sizes, reach, config.half, weights, anchors, *posed)

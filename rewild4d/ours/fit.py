@@ -24,7 +24,7 @@ from rewild4d.ours.losses import WINDOW, colour_losses, silhouette_loss, union_w
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.pose import blend_poses, pose_distance
 from rewild4d.ours.schedule import exponential, fade, ramp
-from rewild4d.ours.skeleton import neighbour_keys, skeleton_losses
+from rewild4d.ours.skeleton import neighbour_keys, stance
 from rewild4d.ours.symmetry import Key, Supervision, Target
 from rewild4d.ours.warmup import WarmUp
 from rewild4d.rasterizer import RasterInfo, rasterize
@@ -97,18 +97,17 @@ class Training:
         progress = index / config.iterations
         keys, own = neighbour_keys([key], self.supervision.frames, config.geometry.temporal > 0)
         poses = model.pose(self._times(keys, progress), keys)
-        prior_pose = self.supervision.prior_pose(keys)
         network_pose = poses
         if config.prior.blend:
+            prior_pose = self.supervision.prior_pose(keys)
             poses = blend_poses(poses, *prior_pose, fade(progress, config.prior.blend_until))
-        pose = poses.row(own[0])
+        pose, transforms, skeleton = stance(model, poses, own, config.geometry)
         probabilities = model.field.probabilities()
         delta = config.geometry.tv_delta if self._varies(index) else None
         weights, variation = model.field.sample_and_vary(probabilities, model.gaussians.means, delta)
         opacities = model.gaussians.opacities()
 
-        transforms = model.transforms(poses)
-        live, posed = model.skin(weights, pose.quats[0], transforms[own[0]])
+        live, posed = model.skin(weights, pose.quats.squeeze(0), transforms.squeeze(0))
         _, pose_alpha, _ = self._render(
             live, opacities.detach(), opacities.new_zeros(len(opacities), 1), target, detach_scales=True
         )
@@ -120,10 +119,9 @@ class Training:
 
         losses = self._image_losses(pose_alpha, rgb, alpha, target)
         if config.prior.pull and progress < config.prior.pull_until:
-            losses["prior"] = (
-                config.prior.pull * fade(progress, config.prior.pull_until) * pose_distance(network_pose, *prior_pose)
-            )
-        losses["skeleton"] = skeleton_losses(model, poses, transforms, config.geometry)
+            apart = pose_distance(network_pose, *self.supervision.prior_pose(keys))
+            losses["prior"] = config.prior.pull * fade(progress, config.prior.pull_until) * apart
+        losses["skeleton"] = skeleton
         if delta is not None:
             losses["tv"] = config.geometry.tv * config.geometry.tv_every * variation
         losses |= self._geometry_losses(index, weights, opacities, posed, deformed)
@@ -132,8 +130,9 @@ class Training:
     def _times(self, keys: list[Key], progress: float) -> Tensor:
         """(i + 1) / T, jittered by a share of a frame early on; neighbours share the jitter."""
         frames, pose = self.supervision.frames, self.config.pose
-        noise = torch.randn((), generator=self.generator) * pose.time_noise * fade(progress, pose.time_noise_until)
-        return (torch.tensor([key.frame + 1.0 for key in keys]) + noise) / frames
+        noise = float(torch.randn((), generator=self.generator)) * pose.time_noise
+        noise *= fade(progress, pose.time_noise_until)
+        return torch.tensor([(key.frame + 1 + noise) / frames for key in keys])
 
     def _render(
         self, posed: Posed, opacities: Tensor, features: Tensor, target: Target, detach_scales: bool = False

@@ -50,21 +50,15 @@ class Model(nn.Module):
 
     def pose(self, times: Tensor, keys: list[Key]) -> Pose:
         """Poses of views at (possibly jittered) times (i + 1) / T, [B]; mirror images of one pose where tied."""
-        pose_config = self.config.pose
+        config = self.config.pose
+        if config.tied:
+            ones = torch.ones(len(keys))
+            code = time_code(times, ones, ones, config.frequencies, config.explicit_group).to(self.pivots)
+            return self.network(code, [key.view < 0 for key in keys], self.mirror)
         view = torch.tensor([float(key.view) for key in keys])
         group = torch.tensor([float(key.group) for key in keys])
-        if not pose_config.tied:
-            sign = group if pose_config.encoding == "group" else view
-            return self.network(
-                time_code(times, sign, view, pose_config.frequencies, pose_config.explicit_group).to(self.pivots)
-            )
-        ones = torch.ones_like(view)
-        pose = self.network(
-            time_code(times, ones, ones, pose_config.frequencies, pose_config.explicit_group).to(self.pivots)
-        )
-        flipped = pose.mirrored(self.mirror)
-        pick = (view > 0).to(self.pivots.device)[:, None, None]
-        return Pose(*(torch.where(pick, plain, other) for plain, other in zip(pose, flipped, strict=True)))
+        sign = group if config.encoding == "group" else view
+        return self.network(time_code(times, sign, view, config.frequencies, config.explicit_group).to(self.pivots))
 
     def transforms(self, pose: Pose) -> Tensor:
         """Rest -> posed transforms of a batch of poses, [B, J, 4, 4]."""
@@ -103,8 +97,8 @@ class Model(nn.Module):
         if strength == 0 or not self.config.deform.enabled:
             return posed
         features = pose.features[0].detach() if self.config.deform.detach_features else pose.features[0]
-        parts = weights.detach() @ self.network.anchors if self.config.deform.anchors else weights.detach()
-        return self.deform(features, parts, posed, strength)
+        anchors = self.network.anchors if self.config.deform.anchors else None
+        return self.deform(features, weights, anchors, posed, strength)
 
     def moved(self, pose: Pose, weights: Tensor, strength: float) -> tuple[Posed, Posed]:
         """Skinned Gaussians, and the same deformed, of the appearance branch at a pose of one code."""

@@ -1,11 +1,17 @@
 """Part anchors, the symmetry-aware time code and the pose network."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from rewild4d.kernels.arrays import fits
 from rewild4d.ours.config import Pose as PoseConfig
+from rewild4d.ours.fused.pose_layers import fits_sizes, sizes_of
+from rewild4d.ours.fused.poses import blend, distance
+from rewild4d.ours.fused.posing import codes, poses
 from rewild4d.transforms import mirror_points, mirror_quats, quat_to_matrix, rigid
 from rewild4d.types import OBJECT_DIAGONAL
 
@@ -22,10 +28,6 @@ class Pose(NamedTuple):
     quats: Tensor
     shifts: Tensor
     features: Tensor
-
-    def row(self, index: int) -> "Pose":
-        """One pose of the batch, as a batch of one."""
-        return Pose(*(tensor[index : index + 1] for tensor in self))
 
     def mirrored(self, mirror: Tensor) -> "Pose":
         """The same poses with left and right exchanged."""
@@ -47,6 +49,8 @@ def time_code(time: Tensor, group: Tensor, view: Tensor, frequencies: int, expli
     Returns:
         [B, 2 + 2 frequencies (+ 1)].
     """
+    if fits(time):
+        return codes(time, group, view, frequencies, explicit_group)
     tau = (time * group)[:, None]
     angles = tau * 2.0 ** torch.arange(frequencies, dtype=tau.dtype, device=tau.device)
     parts = [tau, angles.sin(), angles.cos(), view.to(tau)[:, None]]
@@ -71,12 +75,41 @@ class PoseNetwork(nn.Module):
         self.blocks = nn.ModuleList(Block(config.width, config.heads) for _ in range(config.blocks))
         self.norm = nn.LayerNorm(config.width)
         self.head = nn.Linear(config.width, 7)
+        self._layers = [layer for layer in self.modules() if layer is not self and layer._parameters]
         seed_linears(self, generator)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
 
-    def forward(self, code: Tensor) -> Pose:
-        """Poses of a batch of codes, [B, E]."""
+    def forward(self, code: Tensor, flipped: Sequence[bool] | None = None, mirror: Tensor | None = None) -> Pose:
+        """Poses of a batch of codes.
+
+        Args:
+            code: [B, E].
+            flipped: which of them are wanted with left and right exchanged, [B]; none by default.
+            mirror: joint on the other side, [J]; needed with ``flipped``.
+        """
+        if fits(self.anchors) and fits_sizes(self.config.width, self.config.heads) and not code.requires_grad:
+            return self._fused(code, flipped, mirror)
+        pose = self._plain(code)
+        if flipped is None or mirror is None:
+            return pose
+        pick = torch.tensor(flipped, device=code.device)[:, None, None]
+        return Pose(*(torch.where(pick, other, own) for own, other in zip(pose, pose.mirrored(mirror), strict=True)))
+
+    def _fused(self, code: Tensor, flipped: Sequence[bool] | None, mirror: Tensor | None) -> Pose:
+        config, (joints, anchor) = self.config, self.anchors.shape
+        # The modules' own generator of parameters takes longer than a layer.
+        layers = (each for layer in self._layers for each in layer._parameters.values() if each is not None)
+        parameters = [self.anchors, *layers]
+        reach = config.reach * OBJECT_DIAGONAL
+        sizes = sizes_of(
+            joints, anchor, anchor + code.shape[1], config.width, config.heads, config.blocks, reach, len(code)
+        )
+        if flipped is None or mirror is None:
+            return Pose(*poses(sizes, parameters, code, np.zeros(len(code), np.bool_), np.arange(joints)))
+        return Pose(*poses(sizes, parameters, code, np.array(flipped), mirror.numpy()))
+
+    def _plain(self, code: Tensor) -> Pose:
         batch, joints = code.shape[0], self.anchors.shape[0]
         tokens = torch.cat((self.anchors.expand(batch, joints, -1), code[:, None].expand(batch, joints, -1)), dim=-1)
         hidden = self.embed(tokens)
@@ -146,6 +179,8 @@ def blend_poses(pose: Pose, quats: Tensor, shifts: Tensor, weight: float) -> Pos
     """
     if weight == 0:
         return pose
+    if fits(pose.quats):
+        return Pose(*blend(pose.quats, pose.shifts, quats, shifts, weight), pose.features)
     mixed = (1 - weight) * pose.quats + weight * aligned(quats, pose.quats)
     return Pose(nn.functional.normalize(mixed, dim=-1), (1 - weight) * pose.shifts + weight * shifts, pose.features)
 
@@ -157,5 +192,7 @@ def aligned(quats: Tensor, reference: Tensor) -> Tensor:
 
 def pose_distance(pose: Pose, quats: Tensor, shifts: Tensor) -> Tensor:
     """Mean over joints of |q^ - q|^2 + |d^ - d|^2 / diagonal^2: how far poses are from others, scalar."""
+    if fits(pose.quats):
+        return distance(pose.quats, pose.shifts, quats, shifts, OBJECT_DIAGONAL)
     turn = (pose.quats - aligned(quats, pose.quats).detach()).square().sum(-1)
     return (turn + (pose.shifts - shifts).square().sum(-1) / OBJECT_DIAGONAL**2).mean()

@@ -1,12 +1,17 @@
 """The skeleton's own regularisers of a batch of poses, and the neighbouring frames that one of them needs."""
 
+import math
+
 from torch import Tensor
 
+from rewild4d.kernels.arrays import fits
 from rewild4d.ours.config import Geometry
+from rewild4d.ours.fused.skeleton import Weights, stand
 from rewild4d.ours.geometry_losses import attach_loss, limit_loss, temporal_loss
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import Pose
 from rewild4d.ours.symmetry import Key
+from rewild4d.types import OBJECT_DIAGONAL
 
 
 def neighbour_keys(keys: list[Key], frames: int, needed: bool) -> tuple[list[Key], list[int]]:
@@ -29,6 +34,28 @@ def neighbour_keys(keys: list[Key], frames: int, needed: bool) -> tuple[list[Key
     return triples, own
 
 
+def stance(model: Model, poses: Pose, rows: list[int], config: Geometry) -> tuple[Pose, Tensor, Tensor]:
+    """Chosen poses of a batch, their transforms, and the regularisers of the whole batch.
+
+    Args:
+        model: gives the skeleton.
+        poses: [B, J, ...]; in triples of neighbouring frames where ``config.temporal`` is above zero.
+        rows: which are chosen, k of them.
+        config: the weights of joint limits, attachment and (over triples) temporal smoothness.
+
+    Returns:
+        Poses [k, J, ...], transforms [k, J, 4, 4] and the weighted sum, scalar.
+    """
+    if fits(poses.quats):
+        cosine = math.cos(math.radians(config.limit_degrees) / 2)
+        weights = Weights(config.limit, cosine, config.attach, config.temporal, OBJECT_DIAGONAL)
+        *own, transforms, total = stand(*poses, rows, model.pivots, model.parents, weights)
+        return Pose(*own), transforms, total
+    transforms = model.transforms(poses)
+    total = skeleton_losses(model, poses, transforms, config)
+    return Pose(*(tensor[rows] for tensor in poses)), transforms[rows], total
+
+
 def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geometry) -> Tensor:
     """Weighted sum of joint limits, attachment and (over triples) temporal smoothness, scalar.
 
@@ -38,6 +65,8 @@ def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geomet
         transforms: of the same poses, [B, J, 4, 4].
         config: the weights.
     """
+    if fits(pose.quats):
+        return stance(model, pose, [], config)[2]
     total = pose.shifts.sum() * 0.0
     if config.limit:
         total = total + config.limit * limit_loss(pose, model.parents, config.limit_degrees)

@@ -5,18 +5,19 @@ inner one, so neighbouring steps work on different pixels and need not wait for 
 first cache. A closed pixel keeps its last transmittance, with a minus sign, and takes nothing more.
 """
 
+import math
 from typing import Any
 
 import numpy as np
 
 from rewild4d.kernels.compiling import inlined, kernel
+from rewild4d.kernels.powers import POWER_TERMS, exp2_with, load_terms
 from rewild4d.kernels.simd import (
     LANES,
     absolute,
     bits_gt,
     broadcast,
     columns_of_block,
-    exp2,
     fma,
     fnma,
     keep_where_ge,
@@ -44,9 +45,9 @@ from rewild4d.rasterizer.projection import (
     RECORD,
 )
 
-WEAKEST = np.float32(LOG2_MIN_ALPHA)
-STRONGEST_ALPHA = np.float32(MAX_ALPHA)
-LEAST_LEFT = np.float32(MIN_TRANSMITTANCE)
+CONSTANTS = np.array([LOG2_MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, math.log2(MAX_ALPHA), *POWER_TERMS], np.float32)
+"""An argument of the kernels, so that the loop over blocks finds them in registers."""
+WEAKEST, STRONGEST_ALPHA, LEAST_LEFT, STRONGEST, TERMS = range(5)
 
 
 @inlined
@@ -65,10 +66,10 @@ def place_in_tile(records: np.ndarray, record: int, tile_left: int, tile_top: in
 
 
 @inlined
-def alpha_at(log_opacity: Any, t: Any, u: Any) -> tuple:
+def alpha_at(log_opacity: Any, t: Any, u: Any, strongest: Any, terms: tuple) -> tuple:
     """Alpha before the lower cut, and log2 of alpha before the upper one."""
     exponent = fnma(t, t, fnma(u, u, log_opacity))
-    return minimum(exp2(exponent), splat(STRONGEST_ALPHA)), exponent
+    return minimum(exp2_with(terms, exponent), strongest), exponent
 
 
 @inlined
@@ -92,6 +93,7 @@ def open_tile(tile_left: int, tile_top: int, width: int, height: int, transmitta
 @kernel
 def blend(
     tickets: np.ndarray,
+    constants: np.ndarray,
     tiles_x: int,
     tiles_y: int,
     starts: np.ndarray,
@@ -125,8 +127,8 @@ def blend(
             if bits != 0:
                 n = entry_gaussian[entry]
                 touched, closed = _blend_entry(
-                    bits, records, (view * count + n) * RECORD, features, n * channels, channels, tile_left, tile_top,
-                    steps, left, colors,
+                    bits, constants, records, (view * count + n) * RECORD, features, n * channels, channels, tile_left,
+                    tile_top, steps, left, colors,
                 )  # fmt: skip
                 pair_bits[slot] = touched
                 live &= ~closed
@@ -149,6 +151,7 @@ def _add_channel(weight: Any, features: np.ndarray, feature: int, colors: np.nda
 @inlined
 def _blend_entry(
     bits: int,
+    constants: np.ndarray,
     records: np.ndarray,
     record: int,
     features: np.ndarray,
@@ -161,7 +164,8 @@ def _blend_entry(
     colors: np.ndarray,
 ) -> tuple:
     """Blend one Gaussian into the blocks of ``bits``; give the blocks that it touched and those that are now closed."""
-    zero, least, weakest = splat(np.float32(0)), splat(LEAST_LEFT), splat(WEAKEST)
+    zero, least, weakest = splat(np.float32(0)), broadcast(constants, LEAST_LEFT), broadcast(constants, WEAKEST)
+    strongest, terms = broadcast(constants, STRONGEST_ALPHA), load_terms(constants, TERMS)
     log_opacity = broadcast(records, record + LOG_OPACITY)
     first_t, first_u = place_in_tile(records, record, tile_left, tile_top, steps)
     touched, closed = 0, 0
@@ -169,7 +173,7 @@ def _blend_entry(
         block = lowest_bit(bits)
         bits &= bits - 1
         t, u = first_t + broadcast(steps, block), first_u + broadcast(steps, LANES + block)
-        alpha, exponent = alpha_at(log_opacity, t, u)
+        alpha, exponent = alpha_at(log_opacity, t, u, strongest, terms)
         before = load(left, block * LANES)
         weight = keep_where_ge(alpha, exponent, weakest) * before
         after = before - weight

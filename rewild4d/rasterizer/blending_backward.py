@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rewild4d.kernels.compiling import inlined, kernel
+from rewild4d.kernels.powers import load_terms
 from rewild4d.kernels.rows import sum_rows
 from rewild4d.kernels.simd import (
     LANES,
@@ -32,13 +33,15 @@ from rewild4d.kernels.simd import (
 from rewild4d.rasterizer.binning import BLOCK, BLOCKS
 from rewild4d.rasterizer.blending import (
     LEAST_LEFT,
+    STRONGEST,
+    STRONGEST_ALPHA,
+    TERMS,
     WEAKEST,
     alpha_at,
     open_tile,
     place_in_tile,
     tile_place,
 )
-from rewild4d.rasterizer.conventions import MAX_ALPHA
 from rewild4d.rasterizer.projection import ALONG_X, ALONG_Y, DOWN, LOG_OPACITY, RECORD
 from rewild4d.rasterizer.projection_backward import TT, TU, UU
 
@@ -46,7 +49,6 @@ MOMENTS = 6
 """Sums of q, q t, q u, q t^2, q t u, q u^2 at the start of a slot, q = dL/dalpha alpha."""
 
 LN2 = math.log(2.0)
-_STRONGEST = np.float32(math.log2(MAX_ALPHA))
 
 
 def slot_width(channels: int) -> int:
@@ -79,6 +81,7 @@ def _read_block(plane: np.ndarray, first_row: int, x: int, y: int, width: int, h
 @kernel
 def blend_backward(
     tickets: np.ndarray,
+    constants: np.ndarray,
     tiles_x: int,
     tiles_y: int,
     starts: np.ndarray,
@@ -116,8 +119,8 @@ def blend_backward(
             if bits != 0:
                 n = entry_gaussian[entry]
                 _entry_backward(
-                    bits, records, (view * count + n) * RECORD, features, n * channels, channels, tile_left, tile_top,
-                    steps, left, behind, gradients, rows, sums, slot * row_length,
+                    bits, constants, records, (view * count + n) * RECORD, features, n * channels, channels, tile_left,
+                    tile_top, steps, left, behind, gradients, rows, sums, slot * row_length,
                 )  # fmt: skip
 
 
@@ -152,6 +155,7 @@ def _read_tile(
 @inlined
 def _entry_backward(
     bits: int,
+    constants: np.ndarray,
     records: np.ndarray,
     record: int,
     features: np.ndarray,
@@ -168,7 +172,9 @@ def _entry_backward(
     place: int,
 ) -> None:
     """Sum one Gaussian's six moments and channel gradients over the blocks of ``bits`` into sums[place:]."""
-    zero, one, least = splat(np.float32(0)), splat(np.float32(1)), splat(LEAST_LEFT)
+    zero, one, least = splat(np.float32(0)), splat(np.float32(1)), broadcast(constants, LEAST_LEFT)
+    strongest, weakest = broadcast(constants, STRONGEST_ALPHA), broadcast(constants, WEAKEST)
+    capped, terms = broadcast(constants, STRONGEST), load_terms(constants, TERMS)
     log_opacity = broadcast(records, record + LOG_OPACITY)
     first_t, first_u = place_in_tile(records, record, tile_left, tile_top, steps)
     red, green, blue, on_red, on_green, on_blue = zero, zero, zero, zero, zero, zero
@@ -184,9 +190,9 @@ def _entry_backward(
         block = lowest_bit(bits)
         bits &= bits - 1
         t, u = first_t + broadcast(steps, block), first_u + broadcast(steps, LANES + block)
-        alpha, exponent = alpha_at(log_opacity, t, u)
+        alpha, exponent = alpha_at(log_opacity, t, u, strongest, terms)
         before = load(left, block * LANES)
-        weight = keep_where_ge(alpha, exponent, splat(WEAKEST)) * before
+        weight = keep_where_ge(alpha, exponent, weakest) * before
         after = before - weight
         weight = select_gt(after, least, weight, zero)
         store(left, block * LANES, select_gt(after, least, after, zero))
@@ -210,7 +216,7 @@ def _entry_backward(
         # alpha dL/dalpha, where the pixel took this Gaussian and the cap did not hold it.
         pull = weight * along - divide(rest * alpha, one - alpha)
         pull = select_gt(weight, zero, pull, zero)
-        pull = select_gt(exponent, splat(_STRONGEST), zero, pull)
+        pull = select_gt(exponent, capped, zero, pull)
         m = m + pull
         pull_t, pull_u = pull * t, pull * u
         mt, mu = mt + pull_t, mu + pull_u

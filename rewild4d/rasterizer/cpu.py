@@ -3,6 +3,7 @@
 Between them stand the projected centres, a tensor of their own, so that densification can read its gradient.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,20 +15,15 @@ from torch.autograd.function import once_differentiable
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.doubles import WIDTH
 from rewild4d.kernels.memory import keep_freed_memory
+from rewild4d.kernels.phases import phase_counters
 from rewild4d.kernels.threads import run, spans, thread_count
-from rewild4d.rasterizer.binning import (
-    BLOCK_LEFT,
-    BLOCK_TOP,
-    mark_pairs,
-    scatter_pairs,
-    sort_by_depth,
-    start_tiles,
-)
-from rewild4d.rasterizer.blending import blend
-from rewild4d.rasterizer.blending_backward import blend_backward, gather_slots, slot_width
+from rewild4d.rasterizer.binning import BLOCK_LEFT, BLOCK_TOP
+from rewild4d.rasterizer.blending import CONSTANTS
+from rewild4d.rasterizer.blending_backward import slot_width
 from rewild4d.rasterizer.conventions import RasterInfo
-from rewild4d.rasterizer.projection import RECORD, TILE, project
+from rewild4d.rasterizer.projection import RECORD, TILE
 from rewild4d.rasterizer.projection_backward import CAMERA, CHUNK, project_backward
+from rewild4d.rasterizer.stages import bin_and_blend, blend_back, project_and_sort
 
 keep_freed_memory()
 
@@ -59,7 +55,7 @@ def rasterize(
         means2d.retain_grad()
     if background is None:
         background = features.new_zeros(world_to_camera.shape[0], features.shape[1])
-    image, alpha = _Blend.apply(means2d, records, features, background, radii, *binning, width, height)
+    image, alpha = _Blend.apply(means2d, records, features, background, *binning, width, height)
     return image, alpha, RasterInfo(radii, means2d)
 
 
@@ -78,10 +74,15 @@ def _padded(tensor: Tensor, rows: int, dimension: int = 0) -> Tensor:
     return torch.cat([tensor, tensor.new_zeros(shape)], dimension)
 
 
+def _table(rows: Sequence[tuple[int, ...]], columns: int) -> np.ndarray:
+    return np.array(rows, np.int64).reshape(-1, columns)
+
+
 class _Project(torch.autograd.Function):
     """World to image: centres [V, N, 2] and records [V, N, 8].
 
-    And without gradients radii and depths [V, N], tiles [V, N, 4] and slots [V, N + 1], see `project`.
+    And without gradients radii and order [V, N], tiles [V, N, 4], slots [V, N + 1] and counts [V], see
+    `project_and_sort`.
     """
 
     @staticmethod
@@ -98,18 +99,23 @@ class _Project(torch.autograd.Function):
         views, count = world_to_camera.shape[0], means.shape[0]
         room = max(count, WIDTH)
         means2d, records = means.new_empty(views, room, 2), means.new_empty(views, room, RECORD)
-        radii, depths = means.new_empty(views, room), means.new_empty(views, room, dtype=torch.float64)
+        radii, order = means.new_empty(views, room), torch.empty(views, room, dtype=torch.int32)
         tiles, slots = means.new_empty(views, room, 4), torch.empty(views, room + 1, dtype=torch.int64)
+        counts = np.empty(views, np.int64)
         gaussians = tuple(array(_padded(tensor, room)).ravel() for tensor in (means, quats, scales, opacities))
-        cameras = array(world_to_camera.double()), array(intrinsics.double())
-        outputs = [means2d, records, radii, depths, tiles, slots]
-        arrays = tuple(tensor.numpy().ravel() for tensor in outputs)
-        pieces = spans(room, thread_count() if count * views > SERIAL_BELOW else 1)
-        totals = np.empty((len(pieces), views), np.int64)
-        run(project, [(*piece, *gaussians, *cameras, *options, *arrays, totals[i]) for i, piece in enumerate(pieces)])
-        _join_numbers(slots.numpy(), pieces, totals)
+        cameras = array(world_to_camera).astype(np.float64), array(intrinsics).astype(np.float64)
+        threads = thread_count() if count * views > SERIAL_BELOW else 1
+        bounds = _table(spans(room, threads), 2)
+        call = (
+            phase_counters(2), bounds, *gaussians, *cameras, *options, means2d.numpy().ravel(), records.numpy().ravel(),
+            radii.numpy(), np.empty((views, room)), tiles.numpy().ravel(), slots.numpy(), order.numpy(), counts,
+            np.empty((len(bounds), views), np.int64), np.empty((views, 2, room), np.int64),
+        )  # fmt: skip
+        run(project_and_sort, [call] * threads)
+        outputs = [means2d, records, radii, order, tiles, slots]
         if room > count:
             outputs = [tensor[:, : count + (tensor is slots)].contiguous() for tensor in outputs]
+        outputs.append(torch.from_numpy(counts))
         ctx.save_for_backward(means, quats, scales, opacities, world_to_camera, intrinsics, outputs[2])
         ctx.options = options
         ctx.mark_non_differentiable(*outputs[2:])
@@ -165,62 +171,6 @@ class _Lists:
     entry_slot: np.ndarray
 
 
-def _bin(
-    records: np.ndarray,
-    radii: np.ndarray,
-    depths: np.ndarray,
-    tiles: np.ndarray,
-    slots: np.ndarray,
-    width: int,
-    height: int,
-) -> _Lists:
-    views, count = radii.shape
-    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    order = np.empty((views, count), np.int32)
-    keys, spare = np.empty(count, np.int64), np.empty(count, np.int64)
-    counts = [sort_by_depth(view, radii, depths, order, keys, spare) for view in range(views)]
-    parts = thread_count() if sum(counts) > SERIAL_BELOW else 1
-    pieces = [(view, *span) for view in range(views) for span in spans(counts[view], parts)]
-    pairs = int(slots[-1, -1])
-    pair_tile, pair_bits = np.empty(pairs, np.int32), np.empty(pairs, np.uint16)
-    histograms = np.zeros((max(1, len(pieces)), views * tiles_x * tiles_y), np.int32)
-    grid = (tiles_x, tiles_y, BLOCK_LEFT, BLOCK_TOP)
-    _run_pieces(
-        mark_pairs,
-        [
-            (*piece, order, records, tiles, slots, *grid, pair_tile, pair_bits, histograms[i])
-            for i, piece in enumerate(pieces)
-        ],
-    )
-    starts = np.empty(histograms.shape[1] + 1, np.int64)
-    start_tiles(histograms, starts)
-    entry_gaussian, entry_slot = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int32)
-    _run_pieces(
-        scatter_pairs,
-        [
-            (*piece, order, slots, pair_tile, pair_bits, histograms[i], entry_gaussian, entry_slot)
-            for i, piece in enumerate(pieces)
-        ],
-    )
-    return _Lists((tiles_x, tiles_y), slots, pair_bits, starts, entry_gaussian, entry_slot)
-
-
-def _join_numbers(slots: np.ndarray, pieces: list[tuple[int, int]], totals: np.ndarray) -> None:
-    """Let the slots of each view and piece, numbered from 0, go on where those before end."""
-    before = 0
-    for view in range(len(slots)):
-        for (begin, end), total in zip(pieces, totals[:, view].tolist(), strict=True):
-            slots[view, begin:end] += before
-            before += total
-        slots[view, -1] = before
-
-
-def _run_pieces(function: Any, calls: list[tuple[Any, ...]]) -> None:
-    width = thread_count()
-    for first in range(0, len(calls), width):
-        run(function, calls[first : first + width])
-
-
 class _Blend(torch.autograd.Function):
     """Image-space Gaussians to features [V, C, h, w] and alpha [V, 1, h, w]."""
 
@@ -231,21 +181,32 @@ class _Blend(torch.autograd.Function):
         records: Tensor,
         features: Tensor,
         background: Tensor,
-        radii: Tensor,
-        depths: Tensor,
+        order: Tensor,
         tiles: Tensor,
         slots: Tensor,
+        counts: Tensor,
         width: int,
         height: int,
     ) -> tuple[Tensor, Tensor]:
-        views, channels = radii.shape[0], features.shape[1]
-        lists = _bin(records.numpy(), radii.numpy(), depths.numpy(), tiles.numpy(), slots.numpy(), width, height)
+        views, channels = records.shape[0], features.shape[1]
+        tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+        seen, numbers = counts.tolist(), slots.numpy()
+        threads = thread_count() if sum(seen) > SERIAL_BELOW else 1
+        pieces = [(view, *span) for view in range(views) for span in spans(seen[view], threads)]
+        pairs = int(numbers[-1, -1])
+        lists = _Lists(
+            (tiles_x, tiles_y), numbers, np.empty(pairs, np.uint16), np.empty(views * tiles_x * tiles_y + 1, np.int64),
+            np.empty(pairs, np.int32), np.empty(pairs, np.int32),
+        )  # fmt: skip
         image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
         call = (
-            np.zeros(1, np.int64), *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.pair_bits,
-            records.numpy().ravel(), array(features).ravel(), array(background), image.numpy(), alpha.numpy(),
+            phase_counters(3), np.zeros(1, np.int64), _table(pieces, 3), order.numpy(),
+            tiles.numpy(), numbers, tiles_x, tiles_y, BLOCK_LEFT, BLOCK_TOP, np.empty(pairs, np.int32),
+            lists.pair_bits, np.zeros((len(pieces), views * tiles_x * tiles_y), np.int32), lists.starts,
+            lists.entry_gaussian, lists.entry_slot, CONSTANTS, records.numpy(), array(features).ravel(),
+            array(background), image.numpy(), alpha.numpy(),
         )  # fmt: skip
-        run(blend, [call] * _blend_threads(lists))
+        run(bin_and_blend, [call] * threads)
         ctx.save_for_backward(records, features, background, image, alpha)
         ctx.lists = lists
         return image, alpha
@@ -258,19 +219,16 @@ class _Blend(torch.autograd.Function):
         channels = features.shape[1]
         width = slot_width(channels)
         sums = np.empty(len(lists.pair_bits) * width, np.float32)
-        call = (
-            np.zeros(1, np.int64), *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.pair_bits,
-            records.numpy().ravel(), array(features).ravel(), image.numpy(), alpha.numpy(),
-            array(g_image), array(g_alpha), sums,
-        )  # fmt: skip
-        run(blend_backward, [call] * _blend_threads(lists))
         v_means2d, v_records = _zeros(*records.shape[:2], 2), _zeros(*records.shape)
         v_features = _zeros(*features.shape)
-        outputs = (v_means2d.numpy(), v_records.numpy(), v_features.numpy())
-        given = (lists.slots, lists.pair_bits, records.numpy(), sums, width)
-        pieces = spans(records.shape[1], _blend_threads(lists))
-        for view in range(records.shape[0]):
-            run(gather_slots, [(view, *piece, *given, *outputs) for piece in pieces])
+        threads = _blend_threads(lists)
+        call = (
+            phase_counters(2), np.zeros(1, np.int64), _table(spans(records.shape[1], threads), 2), CONSTANTS,
+            *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.pair_bits, records.numpy(),
+            array(features).ravel(), image.numpy(), alpha.numpy(), array(g_image), array(g_alpha), sums, lists.slots,
+            width, v_means2d.numpy(), v_records.numpy(), v_features.numpy(),
+        )  # fmt: skip
+        run(blend_back, [call] * threads)
         v_background = None
         if ctx.needs_input_grad[3]:
             v_background = (g_image * (1 - alpha)).sum(dim=(2, 3))
@@ -278,4 +236,4 @@ class _Blend(torch.autograd.Function):
 
 
 def _blend_threads(lists: _Lists) -> int:
-    return thread_count() if len(lists.entry_slot) > SERIAL_BELOW else 1
+    return thread_count() if len(lists.pair_bits) > SERIAL_BELOW else 1

@@ -3,8 +3,7 @@
 The twin in plain torch is `DeformNetwork.forward` itself (ours/deform.py), which also prepares the flat parameters.
 """
 
-import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,129 +11,82 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
-from rewild4d.kernels.compiling import kernel
-from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
+from rewild4d.kernels.compiling import inlined, kernel
+from rewild4d.kernels.halves import AVAILABLE
+from rewild4d.kernels.powers import exp2
+from rewild4d.kernels.simd import (
+    LANES,
+    divide,
+    fma,
+    load,
+    maximum,
+    minimum,
+    splat,
+    square_root,
+    store,
+    take_ticket,
+)
 from rewild4d.kernels.threads import run, thread_count
-from rewild4d.ours.fused.layers import BLOCK, Layout, backward_block, forward_block, round_up
+from rewild4d.ours.fused.layers import (
+    BLOCK,
+    LOG2_E,
+    Factors,
+    Layout,
+    backward_block,
+    forward_block,
+    pair_layers,
+    round_up,
+)
+from rewild4d.ours.fused.queries import Reach, mix_back, read_query
 
-CHUNK = 43 * BLOCK
+CHUNK = 11 * BLOCK
 """Gaussians a unit of work holds; parameter gradients are summed over these, whatever the number of threads."""
 
 
-class Reach(NamedTuple):
-    """What an output of one means.
-
-    Attributes:
-        place: scale of the position before its code.
-        frequencies: octaves of the code.
-        parts: inputs before the position.
-        strength: the ramp.
-        reach: displacement.
-        grow: bound on the change of log scale.
-    """
-
-    place: float
-    frequencies: int
-    parts: int
-    strength: float
-    reach: float
-    grow: float
-
-
 @kernel
-def _sines(query: np.ndarray, row: int, sine: int, cosine: int) -> None:
-    """Sine and cosine of a row of angles, by Taylor series of a quarter and two doublings, absolute error 3e-7."""
+def _activate(reach: Reach, out: np.ndarray) -> None:
+    """Rows of the output as what they mean, in place: displacement, x, y, z of a unit quaternion, change of log scale;
+    its w is row 9."""
+    one, strength = splat(np.float32(1)), splat(np.float32(reach.strength))
+    far, grow = splat(np.float32(reach.reach * reach.strength)), splat(np.float32(reach.grow))
+    twice = splat(np.float32(2 * reach.strength * LOG2_E))
+    low, high = splat(np.float32(-126)), splat(np.float32(126))
     for lane in range(0, BLOCK, LANES):
-        x = load(query, row * BLOCK + lane)
-        magic = splat(np.float32(1.5 * 2.0**23))
-        turns = (fma(x, splat(np.float32(0.5 / math.pi)), magic)) - magic
-        # Two pi as the sum of a short and a long part, so that the product loses nothing.
-        x = fma(turns, splat(np.float32(-6.28125)), x)
-        x = fma(turns, splat(np.float32(6.28125 - 2 * math.pi)), x)
-        x = x * splat(np.float32(0.25))
-        xx = x * x
-        s = fma(xx, splat(np.float32(1 / 362880)), splat(np.float32(-1 / 5040)))
-        s = fma(xx, s, splat(np.float32(1 / 120)))
-        s = fma(xx, s, splat(np.float32(-1 / 6)))
-        s = fma(x * xx, s, x)
-        c = fma(xx, splat(np.float32(-1 / 3628800)), splat(np.float32(1 / 40320)))
-        c = fma(xx, c, splat(np.float32(-1 / 720)))
-        c = fma(xx, c, splat(np.float32(1 / 24)))
-        c = fma(xx, c, splat(np.float32(-0.5)))
-        c = fma(xx, c, splat(np.float32(1)))
-        for _ in range(2):
-            s, c = _doubled(s, c)
-        store(query, sine * BLOCK + lane, s)
-        store(query, cosine * BLOCK + lane, c)
-
-
-@kernel
-def _doubled(s: Any, c: Any) -> tuple:
-    """Sine and cosine of twice the angle."""
-    twice = s + s
-    return twice * c, splat(np.float32(1)) - twice * s
-
-
-@kernel
-def _read_query(
-    begin: int, end: int, reach: Reach, parts: np.ndarray, means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray,
-    query: np.ndarray,
-) -> None:  # fmt: skip
-    """Parts, position code, orientation (w >= 0) and log scale of Gaussians begin..end, as rows; the rest is zero."""
-    query[:] = 0
-    code = reach.parts + 3
-    tail = code + 6 * reach.frequencies
-    for lane in range(end - begin):
-        n = begin + lane
-        for i in range(reach.parts):
-            query[i * BLOCK + lane] = parts[n, i]
-        sign = np.float32(-1.0) if quats[n, 0] < 0 else np.float32(1.0)
-        for i in range(3):
-            query[(reach.parts + i) * BLOCK + lane] = means[n, i] * np.float32(reach.place)
-            query[(tail + 4 + i) * BLOCK + lane] = log_scales[n, i]
-        for i in range(4):
-            query[(tail + i) * BLOCK + lane] = sign * quats[n, i]
-    cosines = code + 3 * reach.frequencies
-    for axis in range(3):
-        _sines(query, reach.parts + axis, code + axis, cosines + axis)
-        for octave in range(1, reach.frequencies):
-            row = 3 * octave + axis
-            for lane in range(0, BLOCK, LANES):
-                before = (code + row - 3) * BLOCK + lane, (cosines + row - 3) * BLOCK + lane
-                s, c = _doubled(load(query, before[0]), load(query, before[1]))
-                store(query, (code + row) * BLOCK + lane, s)
-                store(query, (cosines + row) * BLOCK + lane, c)
-
-
-@kernel
-def _turn(out: np.ndarray, lane: int, strength: float) -> tuple:
-    """The unit quaternion (1, x, y, z) of three outputs, and one over its length."""
-    x, y, z = (
-        strength * out[3 * BLOCK + lane],
-        strength * out[4 * BLOCK + lane],
-        strength * out[5 * BLOCK + lane],
-    )
-    inverse = 1.0 / math.sqrt(1.0 + x * x + y * y + z * z)
-    return inverse, x * inverse, y * inverse, z * inverse
+        square = one
+        for row in range(3):
+            store(out, row * BLOCK + lane, load(out, row * BLOCK + lane) * far)
+            turn = load(out, (3 + row) * BLOCK + lane) * strength
+            square = fma(turn, turn, square)
+            # tanh x = 1 - 2 / (1 + exp 2x)
+            power = exp2(minimum(maximum(load(out, (6 + row) * BLOCK + lane) * twice, low), high))
+            store(out, (6 + row) * BLOCK + lane, (one - divide(one + one, one + power)) * grow)
+        inverse = divide(one, square_root(square))
+        store(out, 9 * BLOCK + lane, inverse)
+        for row in range(3, 6):
+            store(out, row * BLOCK + lane, load(out, row * BLOCK + lane) * strength * inverse)
 
 
 @kernel
 def _apply(
-    begin: int, end: int, reach: Reach, out: np.ndarray, means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray,
+    begin: int, end: int, out: np.ndarray, means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray,
     new_means: np.ndarray, new_quats: np.ndarray, new_log_scales: np.ndarray,
 ) -> None:  # fmt: skip
-    strength = reach.strength
     for lane in range(end - begin):
         n = begin + lane
         for i in range(3):
-            new_means[n, i] = means[n, i] + reach.reach * strength * out[i * BLOCK + lane]
-            new_log_scales[n, i] = log_scales[n, i] + reach.grow * math.tanh(strength * out[(6 + i) * BLOCK + lane])
-        w, x, y, z = _turn(out, lane, strength)
+            new_means[n, i] = means[n, i] + out[i * BLOCK + lane]
+            new_log_scales[n, i] = log_scales[n, i] + out[(6 + i) * BLOCK + lane]
+        w, x, y, z = _quaternion(out, lane)
         a, b, c, d = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
         new_quats[n, 0] = a * w - b * x - c * y - d * z
         new_quats[n, 1] = a * x + b * w + c * z - d * y
         new_quats[n, 2] = a * y - b * z + c * w + d * x
         new_quats[n, 3] = a * z + b * y - c * x + d * w
+
+
+@inlined
+def _quaternion(out: np.ndarray, lane: int) -> tuple:
+    return out[9 * BLOCK + lane], out[3 * BLOCK + lane], out[4 * BLOCK + lane], out[5 * BLOCK + lane]
 
 
 @kernel
@@ -144,14 +96,15 @@ def _apply_back(
 ) -> None:  # fmt: skip
     """From the gradients of the moved Gaussians to those of the outputs and of the orientations."""
     slope_out[:] = 0
-    strength = reach.strength
+    strength, far = np.float32(reach.strength), np.float32(reach.reach * reach.strength)
+    steep, bend = np.float32(reach.grow * reach.strength), np.float32(reach.strength / reach.grow)
     for lane in range(end - begin):
         n = begin + lane
         for i in range(3):
-            slope_out[i * BLOCK + lane] = reach.reach * strength * g_means[n, i]
-            change = math.tanh(strength * out[(6 + i) * BLOCK + lane])
-            slope_out[(6 + i) * BLOCK + lane] = reach.grow * strength * (1 - change * change) * g_log_scales[n, i]
-        w, x, y, z = _turn(out, lane, strength)
+            slope_out[i * BLOCK + lane] = far * g_means[n, i]
+            change = out[(6 + i) * BLOCK + lane]
+            slope_out[(6 + i) * BLOCK + lane] = (steep - bend * change * change) * g_log_scales[n, i]
+        w, x, y, z = _quaternion(out, lane)
         a, b, c, d = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
         p, q, r, s = g_quats[n, 0], g_quats[n, 1], g_quats[n, 2], g_quats[n, 3]
         on_quats[n, 0] = p * w + q * x + r * y + s * z
@@ -170,8 +123,9 @@ def _apply_back(
 
 @kernel
 def _forward(
-    tickets: np.ndarray, sizes: Layout, reach: Reach, flat: np.ndarray, parts: np.ndarray, means: np.ndarray,
-    quats: np.ndarray, log_scales: np.ndarray, new_means: np.ndarray, new_quats: np.ndarray, new_log_scales: np.ndarray,
+    tickets: np.ndarray, sizes: Layout, reach: Reach, net: Factors, weights: np.ndarray, anchors: np.ndarray,
+    means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, new_means: np.ndarray, new_quats: np.ndarray,
+    new_log_scales: np.ndarray,
 ) -> None:  # fmt: skip
     count, wide = len(means), round_up(sizes.width) * BLOCK
     query = np.empty(round_up(sizes.inputs) * BLOCK, np.float32)
@@ -180,21 +134,23 @@ def _forward(
         np.empty(wide, np.float32), np.empty(wide, np.float32), np.empty(wide, np.float32), np.empty(wide, np.float32)
     )  # fmt: skip
     out = np.empty(LANES * BLOCK, np.float32)
+    words = np.empty(max(wide, len(shares), len(query)), np.float32)
     while True:
         begin = take_ticket(tickets) * BLOCK
         if begin >= count:
             return
         end = min(begin + BLOCK, count)
-        _read_query(begin, end, reach, parts, means, quats, log_scales, query)
-        forward_block(flat, sizes, query, shares, first, opened, middle, last, out)
-        _apply(begin, end, reach, out, means, quats, log_scales, new_means, new_quats, new_log_scales)
+        read_query(begin, end, reach, weights, anchors, means, quats, log_scales, query)
+        forward_block(net, sizes, query, words, shares, first, opened, middle, last, out)
+        _activate(reach, out)
+        _apply(begin, end, out, means, quats, log_scales, new_means, new_quats, new_log_scales)
 
 
 @kernel
 def _backward(
-    tickets: np.ndarray, chunk: int, sizes: Layout, reach: Reach, flat: np.ndarray, parts: np.ndarray,
-    means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, g_means: np.ndarray, g_quats: np.ndarray,
-    g_log_scales: np.ndarray, gradients: np.ndarray, on_parts: np.ndarray, on_quats: np.ndarray,
+    tickets: np.ndarray, chunk: int, sizes: Layout, reach: Reach, net: Factors, weights: np.ndarray,
+    anchors: np.ndarray, means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, g_means: np.ndarray,
+    g_quats: np.ndarray, g_log_scales: np.ndarray, gradients: np.ndarray, on_anchors: np.ndarray, on_quats: np.ndarray,
 ) -> None:  # fmt: skip
     count, wide = len(means), round_up(sizes.width) * BLOCK
     query = np.empty(round_up(sizes.inputs) * BLOCK, np.float32)
@@ -205,6 +161,7 @@ def _backward(
     )  # fmt: skip
     slope, inner = np.empty(wide, np.float32), np.empty(wide, np.float32)
     turned = np.empty(max(wide, scores, len(query)), np.float32)
+    words = np.empty_like(turned)
     out, slope_out, on_query = (
         np.empty(LANES * BLOCK, np.float32), np.empty(LANES * BLOCK, np.float32), np.empty(LANES * BLOCK, np.float32)
     )  # fmt: skip
@@ -214,28 +171,32 @@ def _backward(
             return
         for begin in range(unit * chunk, min((unit + 1) * chunk, count), BLOCK):
             end = min(begin + BLOCK, count)
-            _read_query(begin, end, reach, parts, means, quats, log_scales, query)
-            forward_block(flat, sizes, query, shares, first, opened, middle, last, out)
+            read_query(begin, end, reach, weights, anchors, means, quats, log_scales, query)
+            forward_block(net, sizes, query, words, shares, first, opened, middle, last, out)
+            _activate(reach, out)
             _apply_back(begin, end, reach, out, quats, g_means, g_quats, g_log_scales, slope_out, on_quats)
             backward_block(
-                flat, sizes, query, shares, opened, middle, last, slope_out, slope, inner, on_shares, turned,
+                net, sizes, query, words, shares, opened, middle, last, slope_out, slope, inner, on_shares, turned,
                 gradients[unit], on_query,
             )  # fmt: skip
-            for lane in range(end - begin):
-                for i in range(reach.parts):
-                    on_parts[begin + lane, i] = on_query[i * BLOCK + lane]
+            if len(anchors) > 0:
+                mix_back(begin, end, weights, on_query, turned, on_anchors[unit])
 
 
 def deform(
-    flat: Tensor, sizes: Layout, reach: Reach, parts: Tensor, means: Tensor, quats: Tensor, log_scales: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+    flat: Tensor, sizes: Layout, reach: Reach, half: bool, weights: Tensor, anchors: Tensor | None, means: Tensor,
+    quats: Tensor, log_scales: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Moved Gaussians; float32 on the CPU.
 
     Args:
         flat: matrices and biases, [sizes.total].
         sizes: their layout.
         reach: what the outputs mean.
-        parts: part mixtures, at most sixteen inputs, [n, D].
+        half: round the factors of all products to bfloat16 where the machine multiplies such pairs; sums keep single
+            precision.
+        weights: skinning weights, taken as given, [n, J].
+        anchors: of the parts; a query holds their weighted sum, D at most sixteen. None: it holds the weights, [J, D].
         means: [n, 3]; like the next two, differentiable only as what is moved, not as the network's input.
         quats: unit, [n, 4].
         log_scales: [n, 3].
@@ -243,33 +204,49 @@ def deform(
     Returns:
         Means [n, 3], quats [n, 4] and log scales [n, 3].
     """
-    return _Deform.apply(flat, parts, means, quats, log_scales, sizes, reach)
+    return _Deform.apply(flat, anchors, means, quats, log_scales, weights, sizes, reach, half and AVAILABLE)
+
+
+def _factors(flat: np.ndarray, sizes: Layout, half: bool) -> Factors:
+    along, across = (np.empty(sizes.total // 2 if half else 0, np.int32) for _ in range(2))
+    if half:
+        pair_layers(flat.view(np.int32), sizes, along, across)
+    return Factors(flat, along.view(np.float32), across.view(np.float32))
 
 
 class _Deform(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, flat: Tensor, parts: Tensor, means: Tensor, quats: Tensor, log_scales: Tensor, sizes: Layout,
-        reach: Reach,
+        ctx: Any, flat: Tensor, anchors: Tensor | None, means: Tensor, quats: Tensor, log_scales: Tensor,
+        weights: Tensor, sizes: Layout, reach: Reach, half: bool,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-        given = flat, parts, means, quats, log_scales
         made = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(log_scales)
-        call = np.zeros(1, np.int64), sizes, reach, *map(array, given), *(tensor.numpy() for tensor in made)
-        run(_forward, [call] * thread_count())
-        ctx.save_for_backward(*given)
-        ctx.shape = sizes, reach
+        wide = np.zeros((0 if anchors is None else len(anchors), LANES), np.float32)
+        if anchors is not None:
+            wide[:, : anchors.shape[1]] = array(anchors)
+        ctx.call = (
+            sizes, reach, _factors(array(flat), sizes, half), array(weights), wide.ravel(),
+            *map(array, (means, quats, log_scales)),
+        )  # fmt: skip
+        ctx.anchors = None if anchors is None else anchors.shape
+        run(_forward, [(np.zeros(1, np.int64), *ctx.call, *(tensor.numpy() for tensor in made))] * thread_count())
         return made
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g_means: Tensor, g_quats: Tensor, g_log_scales: Tensor) -> tuple[Tensor | None, ...]:
-        flat, parts, means, quats, log_scales = ctx.saved_tensors
-        chunks = max(1, -(-len(means) // CHUNK))
-        gradients = np.zeros((chunks, len(flat)), np.float32)
-        on_parts, on_quats = torch.empty_like(parts), torch.empty_like(quats)
+        total, count = ctx.call[0].total, len(ctx.call[3])
+        chunks = max(1, -(-count // CHUNK))
+        gradients, on_anchors = np.zeros((chunks, total), np.float32), np.zeros((chunks, len(ctx.call[4])), np.float32)
+        on_quats = torch.empty(count, 4)
         call = (
-            np.zeros(1, np.int64), CHUNK, *ctx.shape, *map(array, ctx.saved_tensors),
-            *map(array, (g_means, g_quats, g_log_scales)), gradients, on_parts.numpy(), on_quats.numpy(),
+            np.zeros(1, np.int64), CHUNK, *ctx.call, *map(array, (g_means, g_quats, g_log_scales)), gradients,
+            on_anchors, on_quats.numpy(),
         )  # fmt: skip
         run(_backward, [call] * thread_count())
-        return torch.from_numpy(gradients.sum(axis=0)), on_parts, g_means, on_quats, g_log_scales, None, None
+        by_anchors = None
+        if ctx.anchors is not None:
+            summed = on_anchors.sum(axis=0).reshape(-1, LANES)[:, : ctx.anchors[1]]
+            by_anchors = torch.from_numpy(np.ascontiguousarray(summed))
+        flat = torch.from_numpy(gradients.sum(axis=0))
+        return flat, by_anchors, g_means, on_quats, g_log_scales, None, None, None, None

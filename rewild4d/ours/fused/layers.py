@@ -1,4 +1,4 @@
-"""The deformation network on a block of 48 Gaussians: features are rows, Gaussians are the lanes of a row.
+"""The deformation network on a block of 96 Gaussians: features are rows, Gaussians are the lanes of a row.
 
 All matrices and biases lie in one flat array, each padded with zeros to multiples of sixteen; `Layout` says where.
 """
@@ -8,12 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rewild4d.kernels.compiling import kernel
-from rewild4d.kernels.matrix import add_product, transpose_tile
+from rewild4d.kernels.halves import add_pair_product, pair_matrix, pair_rows, pair_vectors, transposed_words
+from rewild4d.kernels.matrix import add_product
+from rewild4d.kernels.powers import exp2
 from rewild4d.kernels.rows import sum_rows
-from rewild4d.kernels.simd import LANES, divide, exp2, fma, load, maximum, select_gt, splat, store
+from rewild4d.kernels.simd import LANES, divide, fma, load, maximum, select_gt, splat, store
 
-BLOCK = 48
-"""Gaussians side by side: three vectors."""
+BLOCK = 96
+"""Gaussians side by side: six vectors."""
 OUTPUTS = 9
 LOG2_E = np.float32(1.4426950408889634)
 
@@ -64,10 +66,37 @@ def layout(inputs: int, scores: int, width: int, heads: int) -> Layout:
     return Layout(inputs, scores, width, heads, ask, skip, mix, up, down, out, place)
 
 
+class Factors(NamedTuple):
+    """The network's numbers.
+
+    Attributes:
+        flat: matrices and biases, float32, [total].
+        along: words of the matrices (kernels/halves.py), the one at ``first`` from first // 2; empty where products are
+            to be made in single precision, [total / 2].
+        across: words of their transposes, likewise.
+    """
+
+    flat: np.ndarray
+    along: np.ndarray
+    across: np.ndarray
+
+
 @kernel
 def round_up(size: int) -> int:
     """The next multiple of sixteen."""
     return (size + LANES - 1) // LANES * LANES
+
+
+@kernel
+def pair_layers(bits: np.ndarray, sizes: Layout, along: np.ndarray, across: np.ndarray) -> None:
+    """Set the words of `Factors`, as int32, from the bits of its flat array."""
+    q, s, w = round_up(sizes.inputs), round_up(sizes.scores), round_up(sizes.width)
+    pair_matrix(bits, sizes.ask, s, q, along, across, sizes.ask // 2)
+    pair_matrix(bits, sizes.skip, w, q, along, across, sizes.skip // 2)
+    pair_matrix(bits, sizes.mix, w, s, along, across, sizes.mix // 2)
+    pair_matrix(bits, sizes.up, w, w, along, across, sizes.up // 2)
+    pair_matrix(bits, sizes.down, w, w, along, across, sizes.down // 2)
+    pair_matrix(bits, sizes.out, LANES, w, along, across, sizes.out // 2)
 
 
 @kernel
@@ -80,31 +109,51 @@ def _bias(flat: np.ndarray, first: int, rows: int, columns: int, result: np.ndar
 
 
 @kernel
-def _layer(flat: np.ndarray, first: int, rows: int, columns: int, given: np.ndarray, result: np.ndarray) -> None:
-    """Add matrix times block to a block."""
-    add_product(flat, first, columns, 1, given, 0, BLOCK, columns, result, 0, BLOCK, rows, BLOCK)
+def _layer(
+    net: Factors, first: int, rows: int, columns: int, given: np.ndarray, words: np.ndarray, result: np.ndarray
+) -> None:
+    """Add matrix times block to a block; ``words`` is scratch."""
+    if len(net.along) > 0:
+        pair_rows(given, columns, BLOCK, words)
+        half = columns // 2
+        add_pair_product(net.along, first // 2, half, words, 0, BLOCK, half, result, 0, BLOCK, rows, BLOCK)
+    else:
+        add_product(net.flat, first, columns, 1, given, 0, BLOCK, columns, result, 0, BLOCK, rows, BLOCK)
 
 
 @kernel
-def _layer_back(flat: np.ndarray, first: int, rows: int, columns: int, slope: np.ndarray, result: np.ndarray) -> None:
-    """Set a block to the transposed matrix times a block."""
-    result[: columns * BLOCK] = 0
-    add_product(flat, first, 1, columns, slope, 0, BLOCK, rows, result, 0, BLOCK, columns, BLOCK)
+def _layer_back(
+    net: Factors, first: int, rows: int, columns: int, slope: np.ndarray, words: np.ndarray, result: np.ndarray,
+    wanted: int,
+) -> None:  # fmt: skip
+    """Add the first ``wanted`` rows of the transposed matrix, times a block, to a block; ``words`` is scratch."""
+    if len(net.across) > 0:
+        pair_rows(slope, rows, BLOCK, words)
+        half = rows // 2
+        add_pair_product(net.across, first // 2, half, words, 0, BLOCK, half, result, 0, BLOCK, wanted, BLOCK)
+    else:
+        add_product(net.flat, first, 1, columns, slope, 0, BLOCK, rows, result, 0, BLOCK, wanted, BLOCK)
 
 
 @kernel
 def _layer_gradient(
-    slope: np.ndarray, given: np.ndarray, turned: np.ndarray, rows: int, columns: int, gradient: np.ndarray, first: int
-) -> None:
-    """Add this block's share to the gradient of a matrix and of the bias behind it."""
-    for feature in range(0, columns, LANES):
-        for lane in range(0, BLOCK, LANES):
-            transpose_tile(given, feature * BLOCK + lane, BLOCK, turned, lane * columns + feature, columns)
-    add_product(slope, 0, BLOCK, 1, turned, 0, columns, BLOCK, gradient, first, columns, rows, columns)
-    # Scratch again: each row's three vectors become one, then one number.
+    half: bool, slope: np.ndarray, given: np.ndarray, words: np.ndarray, turned: np.ndarray, rows: int, columns: int,
+    gradient: np.ndarray, first: int,
+) -> None:  # fmt: skip
+    """Add this block's share to the gradient of a matrix and of the bias behind it; words and turned are scratch."""
+    if half:
+        pair_vectors(given, columns, BLOCK, words)
+        transposed_words(words, columns, BLOCK // 2, turned)
+        pair_vectors(slope, rows, BLOCK, words)
+        add_pair_product(words, 0, BLOCK // 2, turned, 0, columns, BLOCK // 2, gradient, first, columns, rows, columns)
+    else:
+        transposed_words(given, columns, BLOCK, turned)
+        add_product(slope, 0, BLOCK, 1, turned, 0, columns, BLOCK, gradient, first, columns, rows, columns)
+    # Scratch again: each row's vectors become one, then one number.
     for row in range(rows):
-        place = row * BLOCK
-        total = load(slope, place) + load(slope, place + LANES) + load(slope, place + 2 * LANES)
+        total = load(slope, row * BLOCK)
+        for lane in range(LANES, BLOCK, LANES):
+            total = total + load(slope, row * BLOCK + lane)
         store(turned, row * LANES, total)
     sum_rows(turned, rows, turned, 0)
     bias = first + rows * columns
@@ -163,84 +212,91 @@ def _softmax_back(shares: np.ndarray, heads: int, parts: int, slope: np.ndarray)
 
 @kernel
 def forward_block(
-    flat: np.ndarray, sizes: Layout, query: np.ndarray, shares: np.ndarray, first: np.ndarray, opened: np.ndarray,
-    middle: np.ndarray, last: np.ndarray, out: np.ndarray,
+    net: Factors, sizes: Layout, query: np.ndarray, words: np.ndarray, shares: np.ndarray, first: np.ndarray,
+    opened: np.ndarray, middle: np.ndarray, last: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Run the network on one block.
 
     Args:
-        flat: matrices and biases.
-        sizes: its layout.
-        query: given, [inputs, 48].
-        shares: attention of each head over the parts, [scores, 48].
-        first: hidden features before the residual layers; kept after relu in ``opened``, [width, 48].
-        opened: [width, 48].
-        middle: inside the residual, after relu, [width, 48].
-        last: hidden features after it, after relu, [width, 48].
-        out: [16, 48], nine rows count.
+        net: matrices and biases.
+        sizes: their layout.
+        query: given, [inputs, 96].
+        words: scratch, as large as the largest block.
+        shares: attention of each head over the parts, [scores, 96].
+        first: hidden features before the residual layers; kept after relu in ``opened``, [width, 96].
+        opened: [width, 96].
+        middle: inside the residual, after relu, [width, 96].
+        last: hidden features after it, after relu, [width, 96].
+        out: [16, 96], nine rows count.
     """
     q, s, w = round_up(sizes.inputs), round_up(sizes.scores), round_up(sizes.width)
-    _bias(flat, sizes.ask, s, q, shares)
-    _layer(flat, sizes.ask, s, q, query, shares)
+    _bias(net.flat, sizes.ask, s, q, shares)
+    _layer(net, sizes.ask, s, q, query, words, shares)
     _softmax(shares, sizes.heads, sizes.scores // sizes.heads)
-    _bias(flat, sizes.skip, w, q, first)
-    _layer(flat, sizes.skip, w, q, query, first)
-    _layer(flat, sizes.mix, w, s, shares, first)
+    _bias(net.flat, sizes.skip, w, q, first)
+    _layer(net, sizes.skip, w, q, query, words, first)
+    _layer(net, sizes.mix, w, s, shares, words, first)
     _positive(first, w * BLOCK, opened)
-    _bias(flat, sizes.up, w, w, middle)
-    _layer(flat, sizes.up, w, w, opened, middle)
+    _bias(net.flat, sizes.up, w, w, middle)
+    _layer(net, sizes.up, w, w, opened, words, middle)
     _positive(middle, w * BLOCK, middle)
-    _bias(flat, sizes.down, w, w, last)
+    _bias(net.flat, sizes.down, w, w, last)
     for i in range(0, w * BLOCK, LANES):
         store(last, i, load(last, i) + load(first, i))
-    _layer(flat, sizes.down, w, w, middle, last)
+    _layer(net, sizes.down, w, w, middle, words, last)
     _positive(last, w * BLOCK, last)
-    _bias(flat, sizes.out, LANES, w, out)
-    _layer(flat, sizes.out, LANES, w, last, out)
+    _bias(net.flat, sizes.out, LANES, w, out)
+    _layer(net, sizes.out, LANES, w, last, words, out)
 
 
 @kernel
 def backward_block(
-    flat: np.ndarray, sizes: Layout, query: np.ndarray, shares: np.ndarray, opened: np.ndarray, middle: np.ndarray,
-    last: np.ndarray, slope_out: np.ndarray, slope: np.ndarray, inner: np.ndarray, on_shares: np.ndarray,
-    turned: np.ndarray, gradient: np.ndarray, on_query: np.ndarray,
+    net: Factors, sizes: Layout, query: np.ndarray, words: np.ndarray, shares: np.ndarray, opened: np.ndarray,
+    middle: np.ndarray, last: np.ndarray, slope_out: np.ndarray, slope: np.ndarray, inner: np.ndarray,
+    on_shares: np.ndarray, turned: np.ndarray, gradient: np.ndarray, on_query: np.ndarray,
 ) -> None:  # fmt: skip
     """The gradient of one block, after `forward_block` has filled its arguments.
 
     Args:
-        flat: matrices and biases.
-        sizes: its layout.
-        query: given, [inputs, 48].
+        net: matrices and biases.
+        sizes: their layout.
+        query: given, [inputs, 96].
+        words: scratch, as large as the largest block.
         shares: from the forward pass.
         opened: from the forward pass.
         middle: from the forward pass.
         last: from the forward pass.
-        slope_out: gradient of ``out``, [16, 48].
-        slope: scratch, [width, 48].
-        inner: scratch, [width, 48].
-        on_shares: scratch, [scores, 48].
+        slope_out: gradient of ``out``, [16, 96].
+        slope: scratch, [width, 96].
+        inner: scratch, [width, 96].
+        on_shares: scratch, [scores, 96].
         turned: scratch for a transposed block.
         gradient: as ``flat``, added to.
-        on_query: gradient of the first sixteen inputs, set, [16, 48].
+        on_query: gradient of the first sixteen inputs, set, [16, 96].
     """
     q, s, w = round_up(sizes.inputs), round_up(sizes.scores), round_up(sizes.width)
-    _layer_gradient(slope_out, last, turned, LANES, w, gradient, sizes.out)
-    _layer_back(flat, sizes.out, LANES, w, slope_out, slope)
+    half = len(net.along) > 0
+    _layer_gradient(half, slope_out, last, words, turned, LANES, w, gradient, sizes.out)
+    slope[:] = 0
+    _layer_back(net, sizes.out, LANES, w, slope_out, words, slope, w)
     _where_positive(last, w * BLOCK, slope)
-    _layer_gradient(slope, middle, turned, w, w, gradient, sizes.down)
-    _layer_back(flat, sizes.down, w, w, slope, inner)
+    _layer_gradient(half, slope, middle, words, turned, w, w, gradient, sizes.down)
+    inner[:] = 0
+    _layer_back(net, sizes.down, w, w, slope, words, inner, w)
     _where_positive(middle, w * BLOCK, inner)
-    _layer_gradient(inner, opened, turned, w, w, gradient, sizes.up)
+    _layer_gradient(half, inner, opened, words, turned, w, w, gradient, sizes.up)
     # The hidden features feed the residual and what lies inside it.
-    _layer_back(flat, sizes.up, w, w, inner, turned)
+    turned[:] = 0
+    _layer_back(net, sizes.up, w, w, inner, words, turned, w)
     _where_positive(opened, w * BLOCK, turned)
     for i in range(0, w * BLOCK, LANES):
         store(slope, i, load(slope, i) + load(turned, i))
-    _layer_gradient(slope, shares, turned, w, s, gradient, sizes.mix)
-    _layer_back(flat, sizes.mix, w, s, slope, on_shares)
+    _layer_gradient(half, slope, shares, words, turned, w, s, gradient, sizes.mix)
+    on_shares[:] = 0
+    _layer_back(net, sizes.mix, w, s, slope, words, on_shares, s)
     _softmax_back(shares, sizes.heads, sizes.scores // sizes.heads, on_shares)
-    _layer_gradient(on_shares, query, turned, s, q, gradient, sizes.ask)
-    _layer_gradient(slope, query, turned, w, q, gradient, sizes.skip)
+    _layer_gradient(half, on_shares, query, words, turned, s, q, gradient, sizes.ask)
+    _layer_gradient(half, slope, query, words, turned, w, q, gradient, sizes.skip)
     on_query[:] = 0
-    add_product(flat, sizes.ask, 1, q, on_shares, 0, BLOCK, s, on_query, 0, BLOCK, LANES, BLOCK)
-    add_product(flat, sizes.skip, 1, q, slope, 0, BLOCK, w, on_query, 0, BLOCK, LANES, BLOCK)
+    _layer_back(net, sizes.ask, s, q, on_shares, words, on_query, LANES)
+    _layer_back(net, sizes.skip, w, q, slope, words, on_query, LANES)

@@ -10,7 +10,8 @@ from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import kernel
-from rewild4d.kernels.simd import LANES, exp2, maximum, minimum, splat
+from rewild4d.kernels.powers import exp2
+from rewild4d.kernels.simd import LANES, maximum, minimum, splat
 from rewild4d.kernels.tails import load_first, store_first
 
 TO_BITS = np.float32(2 / math.log(2))

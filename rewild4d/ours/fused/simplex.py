@@ -10,7 +10,8 @@ from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import kernel
-from rewild4d.kernels.simd import LANES, exp2, fma, maximum, splat, take_ticket
+from rewild4d.kernels.powers import exp2
+from rewild4d.kernels.simd import LANES, fma, maximum, splat, take_ticket
 from rewild4d.kernels.tails import lanes_maximum, lanes_sum, load_first, store_first
 from rewild4d.kernels.threads import run, thread_count
 

@@ -1,0 +1,143 @@
+"""Products of bfloat16 pairs: sixteen lanes of single precision, each the sum of two products, as AVX512_BF16 has it.
+
+A word is two bfloat16 numbers in the bits of a float32, the first in the lower half. Sums stay in single precision.
+"""
+
+from typing import Any
+
+import numpy as np
+from llvmlite import binding, ir
+from numba.core.typing import signature
+
+from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.matrix import ROWS, matrix_tile, tile_width, transpose_tile
+from rewild4d.kernels.simd import LANES, intrinsic, lanes_type, load, store
+
+AVAILABLE = bool(binding.get_host_cpu_features().get("avx512bf16", False))
+"""Whether this machine multiplies pairs; elsewhere `add_product` of kernels/matrix.py does the work."""
+
+_VECTOR, _INTEGERS = ir.VectorType(ir.FloatType(), LANES), ir.VectorType(ir.IntType(32), LANES)
+
+
+class _BFloat(ir.Type):
+    """LLVM's own name for the format, which llvmlite does not know."""
+
+    def _to_string(self) -> str:
+        return "bfloat"
+
+
+_PAIRS = ir.VectorType(_BFloat(), 2 * LANES)
+
+
+def _multiply_add(builder: Any, left: Any, right: Any, total: Any) -> Any:
+    """Total plus, lane by lane, the sum of the two products of a pair; only compiled where the machine has it."""
+    if not AVAILABLE:
+        return total
+    pairs = [builder.bitcast(word, _PAIRS) for word in (left, right)]
+    kind = ir.FunctionType(_VECTOR, [_VECTOR, _PAIRS, _PAIRS])
+    name = "llvm.x86.avx512bf16.dpbf16ps.512"
+    function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
+    return builder.call(function, [total, *pairs])
+
+
+_tile1, _tile2, _tile3 = (matrix_tile(vectors, _multiply_add) for vectors in (1, 2, 3))
+
+
+@kernel
+def add_pair_product(
+    a: np.ndarray, a_first: int, a_row: int, b: np.ndarray, b_first: int, b_row: int, depth: int, c: np.ndarray,
+    c_first: int, c_row: int, rows: int, columns: int,
+) -> None:  # fmt: skip
+    """C += A B.
+
+    Args:
+        a: holds words of A [rows, depth], pairs along a row, at a_first, its rows a_row words apart.
+        b: holds words of B [depth, columns], pairs along a column, at b_first, its rows b_row words apart.
+        depth: in words: half the length of a sum.
+        c: float32, holds C [rows, columns] at c_first, its rows c_row apart.
+        rows: a multiple of 8.
+        columns: a multiple of 16.
+    """
+    column = 0
+    while column < columns:
+        width = tile_width((columns - column) // LANES)
+        for row in range(0, rows, ROWS):
+            place = c_first + row * c_row + column
+            if width == 3:
+                _tile3(a, a_first + row * a_row, a_row, 1, b, b_first + column, b_row, depth, c, place, c_row)
+            elif width == 2:
+                _tile2(a, a_first + row * a_row, a_row, 1, b, b_first + column, b_row, depth, c, place, c_row)
+            else:
+                _tile1(a, a_first + row * a_row, a_row, 1, b, b_first + column, b_row, depth, c, place, c_row)
+        column += width * LANES
+
+
+@intrinsic
+def pair(typing: Any, low: Any, high: Any) -> Any:
+    """Words of two vectors, lane by lane, each number rounded to the nearest."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        half, upper, shift = (ir.Constant(_INTEGERS, [bits] * LANES) for bits in (0x8000, -0x10000, 16))
+        first, second = (builder.add(builder.bitcast(arg, _INTEGERS), half) for arg in args)
+        return builder.bitcast(builder.or_(builder.lshr(first, shift), builder.and_(second, upper)), _VECTOR)
+
+    return signature(lanes_type, lanes_type, lanes_type), generate
+
+
+@kernel
+def pair_rows(given: np.ndarray, rows: int, columns: int, words: np.ndarray) -> None:
+    """Words of neighbouring rows: [rows, columns] -> [rows / 2, columns], the right factor of a product."""
+    for row in range(0, rows, 2):
+        for lane in range(0, columns, LANES):
+            place = row * columns + lane
+            store(words, place - row // 2 * columns, pair(load(given, place), load(given, place + columns)))
+
+
+@kernel
+def pair_vectors(given: np.ndarray, rows: int, columns: int, words: np.ndarray) -> None:
+    """Words of neighbouring vectors of a row: [rows, columns] -> [rows, columns / 2], columns a multiple of 32.
+
+    Which numbers of a row make a pair does not matter to a sum over the row, if both factors agree.
+    """
+    for place in range(0, rows * columns, 2 * LANES):
+        store(words, place // 2, pair(load(given, place), load(given, place + LANES)))
+
+
+@kernel
+def transposed_words(words: np.ndarray, rows: int, columns: int, turned: np.ndarray) -> None:
+    """[rows, columns] -> [columns, rows], multiples of sixteen."""
+    for row in range(0, rows, LANES):
+        for column in range(0, columns, LANES):
+            transpose_tile(words, row * columns + column, columns, turned, column * rows + row, rows)
+
+
+@kernel
+def _rounded(bits: int) -> int:
+    return (bits + 0x8000) >> 16 & 0xFFFF
+
+
+@kernel
+def pair_matrix(
+    bits: np.ndarray, first: int, rows: int, columns: int, along: np.ndarray, across: np.ndarray, place: int
+) -> None:
+    """Words of a matrix as a left factor, and of its transpose.
+
+    Args:
+        bits: of float32 numbers as int32; holds the matrix [rows, columns] at ``first``.
+        first: its start.
+        rows: even.
+        columns: even.
+        along: int32, words of the matrix, [rows, columns / 2] from ``place``, set.
+        across: int32, words of its transpose, [columns, rows / 2] from ``place``, set.
+        place: start in both.
+    """
+    for row in range(rows):
+        for column in range(0, columns, 2):
+            low, high = bits[first + row * columns + column], bits[first + row * columns + column + 1]
+            word = _rounded(low) | _rounded(high) << 16
+            along[place + (row * columns + column) // 2] = np.int32(np.uint32(word))
+    for column in range(columns):
+        for row in range(0, rows, 2):
+            low, high = bits[first + row * columns + column], bits[first + (row + 1) * columns + column]
+            word = _rounded(low) | _rounded(high) << 16
+            across[place + (column * rows + row) // 2] = np.int32(np.uint32(word))

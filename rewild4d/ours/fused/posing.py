@@ -1,0 +1,181 @@
+"""Poses of codes: the pose network in one forward and one backward pass.
+
+The twin in plain torch is `PoseNetwork.forward` itself (ours/pose.py).
+"""
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from rewild4d.kernels.arrays import array
+from rewild4d.kernels.compiling import inlined, kernel
+from rewild4d.kernels.simd import take_ticket
+from rewild4d.kernels.threads import run, thread_count
+from rewild4d.ours.fused.pose_layers import Sizes, backward_unit, forward_unit, outputs
+
+
+@kernel
+def _codes(time: np.ndarray, group: np.ndarray, view: np.ndarray, frequencies: int, code: np.ndarray) -> None:
+    last = 1 + 2 * frequencies
+    for item in range(len(time)):
+        tau = time[item] * np.float32(group[item])
+        code[item, 0], code[item, last] = tau, view[item]
+        for octave in range(frequencies):
+            angle = tau * 2.0**octave
+            code[item, 1 + octave], code[item, 1 + frequencies + octave] = math.sin(angle), math.cos(angle)
+        if code.shape[1] > last + 1:
+            code[item, last + 1] = group[item]
+
+
+def codes(time: Tensor, group: Tensor, view: Tensor, frequencies: int, explicit_group: bool) -> Tensor:
+    """The time codes of `pose.time_code`, without gradients; float32 on the CPU."""
+    code = np.empty((len(time), 2 + 2 * frequencies + explicit_group), np.float32)
+    _codes(time.numpy(), group.numpy(), view.numpy(), frequencies, code)
+    return torch.from_numpy(code)
+
+
+@inlined
+def _unit(out: np.ndarray, wide: int, lane: int) -> tuple:
+    """The unit quaternion of the first four outputs, which are added to the identity; and one over its length."""
+    w, x, y, z = 1 + out[lane], out[wide + lane], out[2 * wide + lane], out[3 * wide + lane]
+    inverse = 1 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+
+
+@kernel
+def _finish(
+    s: Sizes, out: np.ndarray, turned: np.ndarray, flipped: np.ndarray, mirror: np.ndarray, quats: np.ndarray,
+    shifts: np.ndarray, features: np.ndarray,
+) -> None:  # fmt: skip
+    """From outputs [8, wide] and features [tokens, width] to the poses of a unit; left and right exchanged if told."""
+    for item in range(len(quats)):
+        for joint in range(s.joints):
+            other = mirror[joint] if flipped[item] else joint
+            sign = -1.0 if flipped[item] else 1.0
+            lane = item * s.joints + other
+            unit = _unit(out, s.wide, lane)
+            quats[item, joint, 0], quats[item, joint, 1] = unit[0], unit[1]
+            quats[item, joint, 2], quats[item, joint, 3] = sign * unit[2], sign * unit[3]
+            shifts[item, joint, 0] = sign * s.reach * out[4 * s.wide + lane]
+            shifts[item, joint, 1] = s.reach * out[5 * s.wide + lane]
+            shifts[item, joint, 2] = s.reach * out[6 * s.wide + lane]
+            features[item, joint] = turned[lane * s.width : (lane + 1) * s.width]
+
+
+@kernel
+def _finish_back(
+    s: Sizes, out: np.ndarray, flipped: np.ndarray, mirror: np.ndarray, g_quats: np.ndarray, g_shifts: np.ndarray,
+    g_features: np.ndarray, on_out: np.ndarray, turned: np.ndarray,
+) -> None:  # fmt: skip
+    """The gradient of `_finish`."""
+    on_out[:] = 0
+    turned[: s.wide * s.width] = 0
+    for item in range(len(g_quats)):
+        for joint in range(s.joints):
+            other = mirror[joint] if flipped[item] else joint
+            sign = -1.0 if flipped[item] else 1.0
+            lane = item * s.joints + other
+            unit = _unit(out, s.wide, lane)
+            g = g_quats[item, joint]
+            slope = 1.0 * g[0], 1.0 * g[1], sign * g[2], sign * g[3]
+            along = slope[0] * unit[0] + slope[1] * unit[1] + slope[2] * unit[2] + slope[3] * unit[3]
+            for i in range(4):
+                on_out[i * s.wide + lane] += (slope[i] - along * unit[i]) * unit[4]
+            on_out[4 * s.wide + lane] += sign * s.reach * g_shifts[item, joint, 0]
+            on_out[5 * s.wide + lane] += s.reach * g_shifts[item, joint, 1]
+            on_out[6 * s.wide + lane] += s.reach * g_shifts[item, joint, 2]
+            turned[lane * s.width : (lane + 1) * s.width] += g_features[item, joint]
+
+
+@kernel
+def _forward(
+    tickets: np.ndarray, s: Sizes, addresses: np.ndarray, starts: np.ndarray, code: np.ndarray, flipped: np.ndarray,
+    mirror: np.ndarray, kept: np.ndarray, quats: np.ndarray, shifts: np.ndarray, features: np.ndarray,
+) -> None:  # fmt: skip
+    turned = np.empty(s.wide * s.width, np.float32)
+    while True:
+        unit = take_ticket(tickets)
+        begin, end = unit * s.items, min((unit + 1) * s.items, len(code))
+        if begin >= len(code):
+            return
+        out = forward_unit(s, addresses, starts, code[begin:end], kept[min(unit, len(kept) - 1)], turned)
+        own = quats[begin:end], shifts[begin:end], features[begin:end]
+        _finish(s, out, turned, flipped[begin:end], mirror, own[0], own[1], own[2])
+
+
+@kernel
+def _backward(
+    tickets: np.ndarray, s: Sizes, addresses: np.ndarray, starts: np.ndarray, flipped: np.ndarray, mirror: np.ndarray,
+    kept: np.ndarray, g_quats: np.ndarray, g_shifts: np.ndarray, g_features: np.ndarray, gradients: np.ndarray,
+) -> None:  # fmt: skip
+    turned, on_out = np.empty(s.wide * s.width, np.float32), np.empty(8 * s.wide, np.float32)
+    while True:
+        unit = take_ticket(tickets)
+        if unit >= len(gradients):
+            return
+        begin, end = unit * s.items, min((unit + 1) * s.items, len(g_quats))
+        own = g_quats[begin:end], g_shifts[begin:end], g_features[begin:end]
+        _finish_back(s, outputs(kept[unit], s), flipped[begin:end], mirror, own[0], own[1], own[2], on_out, turned)
+        gradients[unit] = 0
+        backward_unit(s, addresses, starts, end - begin, kept[unit], on_out, turned, gradients[unit])
+
+
+@cache
+def _starts(counts: tuple[int, ...]) -> np.ndarray:
+    """Where each parameter's gradient begins, and where the last one ends."""
+    return np.cumsum((0, *counts))
+
+
+def poses(
+    sizes: Sizes, parameters: Sequence[Tensor], code: Tensor, flipped: np.ndarray, mirror: np.ndarray
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Poses of a batch of codes; float32 on the CPU.
+
+    Args:
+        sizes: of the network.
+        parameters: contiguous float32, in the network's own order; the only inputs that get gradients.
+        code: [B, E].
+        flipped: which poses are wanted with left and right exchanged, bool, [B].
+        mirror: joint on the other side, int64, [J].
+
+    Returns:
+        Quats [B, J, 4], shifts [B, J, 3] and features [B, J, K].
+    """
+    return _Poses.apply(sizes, code, flipped, mirror, torch.is_grad_enabled(), *parameters)
+
+
+class _Poses(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, sizes: Sizes, code: Tensor, flipped: np.ndarray, mirror: np.ndarray, keep: bool, *parameters: Tensor
+    ) -> tuple[Tensor, ...]:
+        batch, units = len(code), -(-len(code) // sizes.items)
+        made = tuple(np.empty((batch, sizes.joints, size), np.float32) for size in (4, 3, sizes.width))
+        kept = np.empty((units if keep else 1, sizes.kept), np.float32)
+        addresses = np.array([parameter.data_ptr() for parameter in parameters])
+        starts = _starts(tuple(parameter.numel() for parameter in parameters))
+        call = (np.zeros(1, np.int64), sizes, addresses, starts, array(code), flipped, mirror, kept, *made)
+        run(_forward, [call] * min(thread_count(), len(kept)))
+        ctx.parameters, ctx.given = parameters, (sizes, addresses, starts, flipped, mirror, kept)
+        return tuple(map(torch.from_numpy, made))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        kept, starts = ctx.given[5], ctx.given[2]
+        gradients = np.empty((len(kept), starts[-1]), np.float32)
+        call = np.zeros(1, np.int64), *ctx.given, *map(array, slopes), gradients
+        run(_backward, [call] * min(thread_count(), len(kept)))
+        total = torch.from_numpy(gradients[0] if len(kept) == 1 else gradients.sum(axis=0))
+        pieces = total.split([parameter.numel() for parameter in ctx.parameters])
+        shaped = (
+            piece if parameter.dim() == 1 else piece.view(parameter.shape)
+            for piece, parameter in zip(pieces, ctx.parameters, strict=True)
+        )
+        return None, None, None, None, None, *shaped

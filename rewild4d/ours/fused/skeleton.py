@@ -1,0 +1,270 @@
+"""Poses as transforms, with a skeleton's regularisers, distances and blends: a few hundred numbers, one thread.
+
+The twins in plain torch are in ours/skeleton.py and ours/pose.py. A loss is found with its gradient at once; the
+backward pass scales it.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from rewild4d.kernels.arrays import array
+from rewild4d.kernels.compiling import inlined, kernel
+
+
+class Weights(NamedTuple):
+    """Of the regularisers.
+
+    Attributes:
+        limit: of the joint limits.
+        cosine: of half the angle at which they begin.
+        attach: of the gaps between a joint and its parent.
+        temporal: of second differences over triples.
+        unit: length that distances are divided by.
+    """
+
+    limit: float
+    cosine: float
+    attach: float
+    temporal: float
+    unit: float
+
+
+@inlined
+def _quat(quats: np.ndarray, item: int, joint: int) -> tuple:
+    q = quats[item, joint]
+    return np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
+
+
+@inlined
+def _dot(a: tuple, b: tuple) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+
+
+@inlined
+def _unit(q: tuple) -> tuple:
+    """The unit quaternion, and one over the length."""
+    inverse = 1 / max(math.sqrt(_dot(q, q)), 1e-12)
+    return q[0] * inverse, q[1] * inverse, q[2] * inverse, q[3] * inverse, inverse
+
+
+@inlined
+def _add_unit_slope(unit: tuple, slope: tuple, target: np.ndarray) -> None:
+    """Add a quaternion's gradient, given that of its unit quaternion."""
+    along = _dot(unit, slope)
+    for i in range(4):
+        target[i] += (slope[i] - along * unit[i]) * unit[4]
+
+
+@inlined
+def _rotation(q: tuple) -> tuple:
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@inlined
+def _rotation_slope(q: tuple, g: np.ndarray) -> tuple:
+    """Gradient of a unit quaternion from that of its matrix, the upper left of ``g``."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return (
+        2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1])),
+        2 * (y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) + w * (g[2, 1] - g[1, 2]) - 2 * x * (g[1, 1] + g[2, 2])),
+        2 * (x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) + w * (g[0, 2] - g[2, 0]) - 2 * y * (g[0, 0] + g[2, 2])),
+        2 * (x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) + w * (g[1, 0] - g[0, 1]) - 2 * z * (g[0, 0] + g[1, 1])),
+    )
+
+
+@kernel
+def _limits(quats: np.ndarray, parents: np.ndarray, weight: float, cosine: float, on_quats: np.ndarray) -> float:
+    """Mean squared excess of a cosine over that of half the angle to the parent, and its gradient."""
+    count = len(quats) * max(1, (parents >= 0).sum())
+    total = 0.0
+    for item in range(len(quats)):
+        for joint in range(len(parents)):
+            above = parents[joint]
+            if above < 0:
+                continue
+            one, other = _quat(quats, item, joint), _quat(quats, item, above)
+            turned = _dot(one, other)
+            excess = cosine - abs(turned)
+            if excess > 0:
+                total += excess * excess
+                slope = -2 * weight / count * excess * np.sign(turned)
+                for i in range(4):
+                    on_quats[item, joint, i] += slope * other[i]
+                    on_quats[item, above, i] += slope * one[i]
+    return weight * total / count
+
+
+@kernel
+def _gaps(
+    quats: np.ndarray, shifts: np.ndarray, pivots: np.ndarray, parents: np.ndarray, weight: float, on_quats: np.ndarray,
+    on_shifts: np.ndarray,
+) -> float:  # fmt: skip
+    """Mean squared gap between a joint, pivot plus shift, and its parent's copy of it; and its gradient."""
+    count = len(quats) * max(1, (parents >= 0).sum())
+    total, on_matrix = 0.0, np.empty((3, 3))
+    for item in range(len(quats)):
+        for joint in range(len(parents)):
+            above = parents[joint]
+            if above < 0:
+                continue
+            unit = _unit(_quat(quats, item, above))
+            rows = _rotation(unit)
+            arm = (
+                np.float64(pivots[joint, 0]) - pivots[above, 0], np.float64(pivots[joint, 1]) - pivots[above, 1],
+                np.float64(pivots[joint, 2]) - pivots[above, 2],
+            )  # fmt: skip
+            for i in range(3):
+                row = rows[i]
+                moved = row[0] * arm[0] + row[1] * arm[1] + row[2] * arm[2]
+                gap = arm[i] + np.float64(shifts[item, joint, i]) - shifts[item, above, i] - moved
+                total += gap * gap
+                slope = 2 * weight / count * gap
+                on_shifts[item, joint, i] += slope
+                on_shifts[item, above, i] -= slope
+                for j in range(3):
+                    on_matrix[i, j] = -slope * arm[j]
+            _add_unit_slope(unit, _rotation_slope(unit, on_matrix), on_quats[item, above])
+    return weight * total / count
+
+
+@kernel
+def _second_differences(
+    quats: np.ndarray, shifts: np.ndarray, weight: float, unit: float, on_quats: np.ndarray, on_shifts: np.ndarray
+) -> float:
+    """Mean squared second difference of rotations and of shifts over triples, and its gradient."""
+    joints, total = quats.shape[1], 0.0
+    share = 3 * weight / (len(quats) * joints)
+    by_length = share / (unit * unit)
+    for item in range(1, len(quats), 3):
+        for joint in range(joints):
+            middle = _quat(quats, item, joint)
+            before, after = _quat(quats, item - 1, joint), _quat(quats, item + 1, joint)
+            one, other = -1.0 if _dot(before, middle) < 0 else 1.0, -1.0 if _dot(after, middle) < 0 else 1.0
+            for i in range(4):
+                bend = one * before[i] + other * after[i] - 2 * middle[i]
+                total += share * bend * bend
+                on_quats[item - 1, joint, i] += 2 * share * one * bend
+                on_quats[item + 1, joint, i] += 2 * share * other * bend
+                on_quats[item, joint, i] -= 4 * share * bend
+            for i in range(3):
+                swerve = np.float64(shifts[item - 1, joint, i]) + shifts[item + 1, joint, i]
+                swerve -= 2 * np.float64(shifts[item, joint, i])
+                total += by_length * swerve * swerve
+                on_shifts[item - 1, joint, i] += 2 * by_length * swerve
+                on_shifts[item + 1, joint, i] += 2 * by_length * swerve
+                on_shifts[item, joint, i] -= 4 * by_length * swerve
+    return total
+
+
+@kernel
+def _regularise(
+    quats: np.ndarray, shifts: np.ndarray, pivots: np.ndarray, parents: np.ndarray, weights: Weights,
+    on_quats: np.ndarray, on_shifts: np.ndarray,
+) -> float:  # fmt: skip
+    """The weighted sum of all; adds its gradients."""
+    total = 0.0
+    if weights.limit:
+        total += _limits(quats, parents, weights.limit, weights.cosine, on_quats)
+    if weights.attach:
+        weight = weights.attach / (weights.unit * weights.unit)
+        total += _gaps(quats, shifts, pivots, parents, weight, on_quats, on_shifts)
+    if weights.temporal and len(quats) % 3 == 0:
+        total += _second_differences(quats, shifts, weights.temporal, weights.unit, on_quats, on_shifts)
+    return total
+
+
+@kernel
+def _stand(
+    quats: np.ndarray, shifts: np.ndarray, features: np.ndarray, rows: np.ndarray, pivots: np.ndarray,
+    own_quats: np.ndarray, own_shifts: np.ndarray, own_features: np.ndarray, transforms: np.ndarray,
+) -> None:  # fmt: skip
+    """Pick rows of the poses, and set their transforms."""
+    for k in range(len(rows)):
+        item = rows[k]
+        own_quats[k], own_shifts[k], own_features[k] = quats[item], shifts[item], features[item]
+        for joint in range(len(pivots)):
+            matrix, turn = transforms[k, joint], _rotation(_unit(_quat(quats, item, joint)))
+            for i in range(3):
+                row, place = turn[i], np.float64(pivots[joint, i]) + shifts[item, joint, i]
+                for j in range(3):
+                    place -= row[j] * pivots[joint, j]
+                matrix[i, 0], matrix[i, 1], matrix[i, 2], matrix[i, 3] = row[0], row[1], row[2], place
+            matrix[3, 0], matrix[3, 1], matrix[3, 2], matrix[3, 3] = 0, 0, 0, 1
+
+
+@kernel
+def _stand_back(
+    quats: np.ndarray, rows: np.ndarray, pivots: np.ndarray, g_quats: np.ndarray, g_shifts: np.ndarray,
+    g_features: np.ndarray, g_transforms: np.ndarray, on_quats: np.ndarray, on_shifts: np.ndarray,
+    on_features: np.ndarray,
+) -> None:  # fmt: skip
+    """Add the gradients of what `_stand` gives."""
+    on_matrix = np.empty((3, 3))
+    for k in range(len(rows)):
+        item = rows[k]
+        on_quats[item] += g_quats[k]
+        on_shifts[item] += g_shifts[k]
+        on_features[item] += g_features[k]
+        for joint in range(len(pivots)):
+            unit, g = _unit(_quat(quats, item, joint)), g_transforms[k, joint]
+            for i in range(3):
+                on_shifts[item, joint, i] += g[i, 3]
+                for j in range(3):
+                    on_matrix[i, j] = g[i, j] - np.float64(g[i, 3]) * pivots[joint, j]
+            _add_unit_slope(unit, _rotation_slope(unit, on_matrix), on_quats[item, joint])
+
+
+def stand(
+    quats: Tensor, shifts: Tensor, features: Tensor, rows: list[int], pivots: Tensor, parents: Tensor, weights: Weights
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Rows of a batch of poses, their transforms, and the weighted regularisers of all; float32 on the CPU.
+
+    Args:
+        quats: [B, J, 4].
+        shifts: [B, J, 3].
+        features: [B, J, K].
+        rows: which poses, k of them.
+        pivots: [J, 3].
+        parents: -1 for a root, [J].
+        weights: of the regularisers.
+
+    Returns:
+        Quats, shifts and features of the rows [k, J, ...], transforms [k, J, 4, 4], and the sum, scalar.
+    """
+    return _Stand.apply(quats, shifts, features, rows, pivots, parents, weights)
+
+
+class _Stand(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, quats: Tensor, shifts: Tensor, features: Tensor, rows: list[int], pivots: Tensor, parents: Tensor,
+        weights: Weights,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        joints, chosen = len(pivots), np.array(rows, np.int64)
+        turns, moves, centers = array(quats), array(shifts), pivots.numpy()
+        sizes = ((4,), (3,), (features.shape[2],), (4, 4))
+        made = tuple(np.empty((len(rows), joints, *size), np.float32) for size in sizes)
+        _stand(turns, moves, array(features), chosen, centers, *made)
+        slopes = np.zeros(turns.shape), np.zeros(moves.shape)
+        total = _regularise(turns, moves, centers, parents.numpy(), weights, *slopes)
+        ctx.given, ctx.slopes, ctx.size = (turns, chosen, centers), slopes, features.shape
+        return tuple(map(torch.from_numpy, (*made, np.array(total, np.float32))))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        scale, on_features = slopes[4].item(), np.zeros(ctx.size, np.float32)
+        on_quats, on_shifts = (slope * scale for slope in ctx.slopes)
+        _stand_back(*ctx.given, *map(array, slopes[:4]), on_quats, on_shifts, on_features)
+        made = (on_quats.astype(np.float32), on_shifts.astype(np.float32), on_features)
+        return *map(torch.from_numpy, made), None, None, None, None

@@ -1,0 +1,279 @@
+"""Pieces of a transformer on a few tokens: features are rows, tokens are the lanes of a row.
+
+Parameters are read where they lie, by address; their gradients lie one behind the other in one flat array.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import carray
+from numba.core import types
+from numba.core.typing import signature
+
+from rewild4d.kernels.compiling import inlined, kernel
+from rewild4d.kernels.matrix import add_product, transpose_tile
+from rewild4d.kernels.powers import exp2
+from rewild4d.kernels.rows import sum_rows
+from rewild4d.kernels.simd import (
+    LANES,
+    absolute,
+    divide,
+    fma,
+    intrinsic,
+    load,
+    maximum,
+    select_gt,
+    splat,
+    store,
+)
+
+LOG2_E = np.float32(1.4426950408889634)
+NORM_EPS = 1e-5
+"""As `torch.nn.LayerNorm` has it."""
+
+
+@intrinsic
+def _pointer(typing: Any, address: Any) -> Any:
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.inttoptr(args[0], ir.FloatType().as_pointer())
+
+    return signature(types.CPointer(types.float32), types.int64), generate
+
+
+@inlined
+def floats(address: int, count: int) -> np.ndarray:
+    """The ``count`` numbers at an address; whoever calls the kernel keeps them alive."""
+    return carray(_pointer(address), (count,))
+
+
+@kernel
+def linear(weight: np.ndarray, bias: np.ndarray, given: np.ndarray, wide: int, result: np.ndarray) -> None:
+    """Add matrix times rows, and the bias, to rows of ``wide`` lanes; a multiple of 8 outputs."""
+    rows = len(bias)
+    depth = len(weight) // rows
+    for row in range(rows):
+        value = splat(bias[row])
+        for place in range(row * wide, (row + 1) * wide, LANES):
+            store(result, place, load(result, place) + value)
+    add_product(weight, 0, depth, 1, given, 0, wide, depth, result, 0, wide, rows, wide)
+
+
+@kernel
+def linear_back(weight: np.ndarray, rows: int, slope: np.ndarray, wide: int, result: np.ndarray) -> None:
+    """Set rows to the transposed matrix times a slope; a multiple of 8 inputs."""
+    depth = len(weight) // rows
+    result[: depth * wide] = 0
+    add_product(weight, 0, 1, depth, slope, 0, wide, rows, result, 0, wide, depth, wide)
+
+
+@kernel
+def add_row_sums(rows: np.ndarray, count: int, wide: int, scratch: np.ndarray, sums: np.ndarray) -> None:
+    """Add the sum of each of ``count`` rows to ``sums``; both lengths are multiples of sixteen."""
+    for row in range(count):
+        total = splat(np.float32(0))
+        for place in range(row * wide, (row + 1) * wide, LANES):
+            total = total + load(rows, place)
+        store(scratch, row * LANES, total)
+    sum_rows(scratch, count, scratch, 0)
+    for row in range(0, count, LANES):
+        store(sums, row, load(sums, row) + load(scratch, row))
+
+
+@kernel
+def transpose(given: np.ndarray, rows: int, wide: int, turned: np.ndarray) -> None:
+    """Write [rows, wide] as [wide, rows]; multiples of sixteen."""
+    for row in range(0, rows, LANES):
+        for lane in range(0, wide, LANES):
+            transpose_tile(given, row * wide + lane, wide, turned, lane * rows + row, rows)
+
+
+@kernel
+def linear_gradient(
+    slope: np.ndarray, given: np.ndarray, inputs: int, wide: int, tokens: int, scratch: np.ndarray, weight: np.ndarray,
+    bias: np.ndarray,
+) -> None:  # fmt: skip
+    """Add to the gradients of a matrix and of its bias; multiples of sixteen inputs and outputs."""
+    rows = len(bias)
+    transpose(given, inputs, wide, scratch)
+    add_product(slope, 0, wide, 1, scratch, 0, inputs, tokens, weight, 0, inputs, rows, inputs)
+    add_row_sums(slope, rows, wide, scratch, bias)
+
+
+@kernel
+def normalise(hidden: np.ndarray, width: int, wide: int, plain: np.ndarray, inverse: np.ndarray) -> None:
+    """Each token less its mean, over its standard deviation; and one over that."""
+    share = splat(np.float32(1 / width))
+    for lane in range(0, wide, LANES):
+        mean, square = splat(np.float32(0)), splat(np.float32(0))
+        for row in range(width):
+            mean = mean + load(hidden, row * wide + lane)
+        mean = mean * share
+        for row in range(width):
+            apart = load(hidden, row * wide + lane) - mean
+            square = fma(apart, apart, square)
+        store(inverse, lane, square * share)
+        for i in range(lane, lane + LANES):
+            inverse[i] = np.float32(1 / math.sqrt(inverse[i] + NORM_EPS))
+        factor = load(inverse, lane)
+        for row in range(width):
+            store(plain, row * wide + lane, (load(hidden, row * wide + lane) - mean) * factor)
+
+
+@kernel
+def scale_rows(plain: np.ndarray, weight: np.ndarray, bias: np.ndarray, wide: int, result: np.ndarray) -> None:
+    """Each row times a weight plus a bias."""
+    for row in range(len(weight)):
+        factor, start = splat(weight[row]), splat(bias[row])
+        for place in range(row * wide, (row + 1) * wide, LANES):
+            store(result, place, fma(factor, load(plain, place), start))
+
+
+@kernel
+def normalise_back(
+    plain: np.ndarray, inverse: np.ndarray, weight: np.ndarray, wide: int, slope: np.ndarray, scratch: np.ndarray,
+    on_weight: np.ndarray, on_bias: np.ndarray, on_hidden: np.ndarray,
+) -> None:  # fmt: skip
+    """From the slope after `normalise` and `scale_rows`, which is overwritten; adds to all three gradients."""
+    width = len(weight)
+    add_row_sums(slope, width, wide, scratch, on_bias)
+    for row in range(width):
+        total, factor = splat(np.float32(0)), splat(weight[row])
+        for place in range(row * wide, (row + 1) * wide, LANES):
+            value = load(slope, place)
+            total = fma(value, load(plain, place), total)
+            store(slope, place, value * factor)
+        store(scratch, row * LANES, total)
+    sum_rows(scratch, width, scratch, 0)
+    for row in range(0, width, LANES):
+        store(on_weight, row, load(on_weight, row) + load(scratch, row))
+    share = splat(np.float32(1 / width))
+    for lane in range(0, wide, LANES):
+        mean, along = splat(np.float32(0)), splat(np.float32(0))
+        for row in range(width):
+            value = load(slope, row * wide + lane)
+            mean, along = mean + value, fma(value, load(plain, row * wide + lane), along)
+        mean, along, factor = mean * share, along * share, load(inverse, lane)
+        for row in range(width):
+            place = row * wide + lane
+            change = load(slope, place) - mean - along * load(plain, place)
+            store(on_hidden, place, fma(change, factor, load(on_hidden, place)))
+
+
+@kernel
+def gelu(given: np.ndarray, count: int, bend: np.ndarray) -> None:
+    """x Phi(x) in place, and its derivative; Phi to 8e-8 (Abramowitz and Stegun 7.1.26)."""
+    zero, one, half = splat(np.float32(0)), splat(np.float32(1)), splat(np.float32(0.5))
+    lowest, exponent = splat(np.float32(-126)), splat(np.float32(-0.5) * LOG2_E)
+    for place in range(0, count, LANES):
+        x = load(given, place)
+        bell = exp2(maximum(x * x * exponent, lowest))
+        t = divide(one, fma(absolute(x), splat(np.float32(0.3275911 / math.sqrt(2.0))), one))
+        tail = fma(t, splat(np.float32(1.061405429)), splat(np.float32(-1.453152027)))
+        tail = fma(tail, t, splat(np.float32(1.421413741)))
+        tail = fma(tail, t, splat(np.float32(-0.284496736)))
+        tail = fma(tail, t, splat(np.float32(0.254829592))) * t * bell * half
+        below = select_gt(x, zero, one - tail, tail)
+        store(given, place, x * below)
+        store(bend, place, fma(x * bell, splat(np.float32(1 / math.sqrt(2 * math.pi))), below))
+
+
+@kernel
+def softmax(scores: np.ndarray, first: int, keys: int, wide: int, factor: float) -> None:
+    """Over the rows, of the scores times a factor, in place."""
+    lowest, scale = splat(np.float32(-126)), splat(np.float32(factor) * LOG2_E)
+    for lane in range(first, first + wide, LANES):
+        top, total = load(scores, lane), splat(np.float32(0))
+        for key in range(1, keys):
+            top = maximum(top, load(scores, lane + key * wide))
+        for key in range(keys):
+            power = exp2(maximum((load(scores, lane + key * wide) - top) * scale, lowest))
+            store(scores, lane + key * wide, power)
+            total = total + power
+        share = divide(splat(np.float32(1)), total)
+        for key in range(keys):
+            store(scores, lane + key * wide, load(scores, lane + key * wide) * share)
+
+
+@kernel
+def softmax_back(shares: np.ndarray, first: int, keys: int, wide: int, factor: float, slope: np.ndarray) -> None:
+    """From the slope of the shares to that of the scores, in place."""
+    scale = splat(np.float32(factor))
+    for lane in range(0, wide, LANES):
+        mean = splat(np.float32(0))
+        for key in range(keys):
+            mean = fma(load(shares, first + lane + key * wide), load(slope, lane + key * wide), mean)
+        for key in range(keys):
+            place = lane + key * wide
+            store(slope, place, load(shares, first + place) * (load(slope, place) - mean) * scale)
+
+
+@kernel
+def _copy_lanes(
+    source: np.ndarray, wide: int, lanes: int, rows: int, target: np.ndarray, place: int, step: int
+) -> None:
+    """Write the first lanes of rows ``wide`` apart to rows ``step`` apart."""
+    for row in range(rows):
+        for lane in range(lanes):
+            target[place + row * step + lane] = source[row * wide + lane]
+
+
+@kernel
+def attend(qkv: np.ndarray, width: int, heads: int, joints: int, items: int, wide: int, shares: np.ndarray,
+           mixed: np.ndarray) -> None:  # fmt: skip
+    """Self-attention within each item.
+
+    Args:
+        qkv: queries, keys and values, [3 width, wide].
+        width: of a token.
+        heads: of the attention.
+        joints: tokens of an item; item b has lanes b joints and on.
+        items: how many.
+        wide: lanes of a row.
+        shares: of the keys (rows) for each query (lanes), set, [items, heads, P, P] with P joints padded to sixteen.
+        mixed: set, zero in lanes of no item, [width, wide].
+    """
+    size, tile = width // heads, (joints + LANES - 1) // LANES * LANES
+    keys = (joints + 7) // 8 * 8
+    part = np.empty(size * tile, np.float32)
+    shares[:] = 0
+    mixed[:] = 0
+    # Columns and rows past an item's own belong to its neighbours: computed, never used.
+    for item in range(items):
+        for head in range(heads):
+            query, slot = head * size * wide + item * joints, (item * heads + head) * tile * tile
+            key, value = query + width * wide, query + 2 * width * wide
+            add_product(qkv, key, 1, wide, qkv, query, wide, size, shares, slot, tile, keys, tile)
+            softmax(shares, slot, joints, tile, size**-0.5)
+            part[:] = 0
+            add_product(qkv, value, wide, 1, shares, slot, tile, joints, part, 0, tile, size, tile)
+            _copy_lanes(part, tile, joints, size, mixed, query, wide)
+
+
+@kernel
+def attend_back(qkv: np.ndarray, width: int, heads: int, joints: int, items: int, wide: int, shares: np.ndarray,
+                on_mixed: np.ndarray, on_qkv: np.ndarray) -> None:  # fmt: skip
+    """The gradient of `attend`: sets ``on_qkv`` in the items' lanes; ``on_mixed`` has sixteen numbers to spare."""
+    size, tile = width // heads, (joints + LANES - 1) // LANES * LANES
+    keys = (joints + 7) // 8 * 8
+    part, on_shares = np.empty(size * tile, np.float32), np.empty(tile * tile, np.float32)
+    turned = np.empty(tile * tile, np.float32)
+    for item in range(items):
+        for head in range(heads):
+            query, slot = head * size * wide + item * joints, (item * heads + head) * tile * tile
+            key, value = query + width * wide, query + 2 * width * wide
+            transpose(shares[slot : slot + tile * tile], tile, tile, turned)
+            part[:] = 0
+            add_product(on_mixed, query, wide, 1, turned, 0, tile, joints, part, 0, tile, size, tile)
+            _copy_lanes(part, tile, joints, size, on_qkv, value, wide)
+            on_shares[:] = 0
+            add_product(qkv, value, 1, wide, on_mixed, query, wide, size, on_shares, 0, tile, keys, tile)
+            softmax_back(shares, slot, joints, tile, size**-0.5, on_shares)
+            part[:] = 0
+            add_product(qkv, key, wide, 1, on_shares, 0, tile, joints, part, 0, tile, size, tile)
+            _copy_lanes(part, tile, joints, size, on_qkv, query, wide)
+            transpose(on_shares, tile, tile, turned)
+            part[:] = 0
+            add_product(qkv, query, wide, 1, turned, 0, tile, joints, part, 0, tile, size, tile)
+            _copy_lanes(part, tile, joints, size, on_qkv, key, wide)

@@ -1,0 +1,146 @@
+"""The stages of a call in as few rounds of threads as their sizes allow: see kernels/phases.py."""
+
+import numpy as np
+
+from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.phases import end_phase, enter_phase, phase_ticket
+from rewild4d.rasterizer.binning import mark_pairs, scatter_pairs, sort_by_depth, start_tiles
+from rewild4d.rasterizer.blending import blend
+from rewild4d.rasterizer.blending_backward import blend_backward, gather_slots
+from rewild4d.rasterizer.projection import project
+
+
+@kernel
+def _join_numbers(slots: np.ndarray, bounds: np.ndarray, totals: np.ndarray) -> None:
+    """Let the slots of each view and piece, numbered from 0, go on where those before end."""
+    before = 0
+    for view in range(len(slots)):
+        for piece in range(len(bounds)):
+            for n in range(bounds[piece, 0], bounds[piece, 1]):
+                slots[view, n] += before
+            before += totals[piece, view]
+        slots[view, -1] = before
+
+
+@kernel
+def project_and_sort(
+    counters: np.ndarray, bounds: np.ndarray, means: np.ndarray, quats: np.ndarray, scales: np.ndarray,
+    opacities: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndarray, width: int, height: int, eps2d: float,
+    antialias: bool, near: float, means2d: np.ndarray, records: np.ndarray, radii: np.ndarray, depths: np.ndarray,
+    tiles: np.ndarray, slots: np.ndarray, order: np.ndarray, counts: np.ndarray, totals: np.ndarray, keys: np.ndarray,
+) -> None:  # fmt: skip
+    """Project Gaussians (`project`), number their tiles, and sort those that are seen.
+
+    Args:
+        counters: of two phases.
+        bounds: first and one past the last Gaussian of each piece, [P, 2].
+        order: set to the visible Gaussians of a view, nearest first, [V, N].
+        counts: set to their number, [V].
+        totals: scratch, [P, V].
+        keys: scratch, [V, 2, N].
+        slots: as in `project`, but running on from view to view, [V, N + 1].
+        radii: [V, N], like depths; all other arguments as in `project`.
+    """
+    views = len(slots)
+    enter_phase(counters, 0)
+    while True:
+        piece = phase_ticket(counters, 0)
+        if piece >= len(bounds):
+            break
+        project(
+            bounds[piece, 0], bounds[piece, 1], means, quats, scales, opacities, world_to_camera, intrinsics, width,
+            height, eps2d, antialias, near, means2d, records, radii.reshape(-1), depths.reshape(-1), tiles,
+            slots.reshape(-1), totals[piece],
+        )  # fmt: skip
+    end_phase(counters, 0)
+    while True:
+        unit = phase_ticket(counters, 1)
+        if unit > views:
+            return
+        if unit == views:
+            _join_numbers(slots, bounds, totals)
+        else:
+            counts[unit] = sort_by_depth(unit, radii, depths, order, keys[unit, 0], keys[unit, 1])
+
+
+@kernel
+def bin_and_blend(
+    counters: np.ndarray, tickets: np.ndarray, pieces: np.ndarray, order: np.ndarray, tiles: np.ndarray,
+    slots: np.ndarray, tiles_x: int, tiles_y: int, block_left: np.ndarray, block_top: np.ndarray,
+    pair_tile: np.ndarray, pair_bits: np.ndarray, histograms: np.ndarray, starts: np.ndarray,
+    entry_gaussian: np.ndarray, entry_slot: np.ndarray, constants: np.ndarray, records: np.ndarray,
+    features: np.ndarray, background: np.ndarray, image: np.ndarray, alpha: np.ndarray,
+) -> None:  # fmt: skip
+    """Make the tiles' lists and blend them.
+
+    Args:
+        counters: of three phases.
+        tickets: of `blend`.
+        pieces: view, first and one past the last of its sorted Gaussians, [P, 3].
+        histograms: zero, [P, tiles of all views].
+        records: [V, N, 8]; all other arguments as in `mark_pairs`, `scatter_pairs` and `blend`.
+    """
+    enter_phase(counters, 0)
+    while True:
+        piece = phase_ticket(counters, 0)
+        if piece >= len(pieces):
+            break
+        view, begin, end = pieces[piece]
+        mark_pairs(
+            view, begin, end, order, records, tiles, slots, tiles_x, tiles_y, block_left, block_top, pair_tile,
+            pair_bits, histograms[piece],
+        )  # fmt: skip
+    end_phase(counters, 0)
+    enter_phase(counters, 1)
+    if phase_ticket(counters, 1) == 0:
+        start_tiles(histograms, starts)
+    end_phase(counters, 1)
+    enter_phase(counters, 2)
+    while True:
+        piece = phase_ticket(counters, 2)
+        if piece >= len(pieces):
+            break
+        view, begin, end = pieces[piece]
+        scatter_pairs(
+            view, begin, end, order, slots, pair_tile, pair_bits, histograms[piece], entry_gaussian, entry_slot
+        )
+    end_phase(counters, 2)
+    blend(
+        tickets, constants, tiles_x, tiles_y, starts, entry_gaussian, entry_slot, pair_bits, records.reshape(-1),
+        features, background, image, alpha,
+    )  # fmt: skip
+
+
+@kernel
+def blend_back(
+    counters: np.ndarray, tickets: np.ndarray, bounds: np.ndarray, constants: np.ndarray, tiles_x: int, tiles_y: int,
+    starts: np.ndarray, entry_gaussian: np.ndarray, entry_slot: np.ndarray, pair_bits: np.ndarray,
+    records: np.ndarray, features: np.ndarray, image: np.ndarray, alpha: np.ndarray, g_image: np.ndarray,
+    g_alpha: np.ndarray, sums: np.ndarray, slots: np.ndarray, width: int, v_means2d: np.ndarray,
+    v_records: np.ndarray, v_features: np.ndarray,
+) -> None:  # fmt: skip
+    """The gradient of `bin_and_blend`: slots of all tiles, then their sums for each Gaussian.
+
+    Args:
+        counters: of two phases.
+        tickets: of `blend_backward`.
+        bounds: first and one past the last Gaussian of each piece, [P, 2].
+        features: flat.
+        v_features: zero, [N, C]; a piece goes through all views. All other arguments as in `blend_backward` and
+            `gather_slots`.
+    """
+    enter_phase(counters, 0)
+    blend_backward(
+        tickets, constants, tiles_x, tiles_y, starts, entry_gaussian, entry_slot, pair_bits, records.reshape(-1),
+        features, image, alpha, g_image, g_alpha, sums,
+    )  # fmt: skip
+    end_phase(counters, 0)
+    while True:
+        piece = phase_ticket(counters, 1)
+        if piece >= len(bounds):
+            return
+        for view in range(len(records)):
+            gather_slots(
+                view, bounds[piece, 0], bounds[piece, 1], slots, pair_bits, records, sums, width, v_means2d, v_records,
+                v_features,
+            )  # fmt: skip

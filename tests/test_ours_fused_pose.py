@@ -1,0 +1,197 @@
+"""The fused kernels of poses and skeleton against their plain torch twins in double precision."""
+
+import copy
+import math
+
+import msgspec
+import pytest
+import torch
+from torch import Tensor
+from twins import check_twins, leaves, normal, unit
+
+from rewild4d.ours.canonical import Gaussians
+from rewild4d.ours.config import Config, Deform, Geometry
+from rewild4d.ours.config import Pose as PoseConfig
+from rewild4d.ours.model import Model
+from rewild4d.ours.pose import Pose, PoseNetwork, blend_poses, pose_distance, time_code
+from rewild4d.ours.skeleton import skeleton_losses, stance
+from rewild4d.ours.skinning import SkinningField
+from rewild4d.ours.symmetry import Key
+from rewild4d.priors.template import MIRROR, PARENTS, quadruped
+from rewild4d.types import OBJECT_DIAGONAL
+
+SMALL = PoseConfig(width=32, heads=2, anchor_size=5, frequencies=2)
+
+
+def network(config: PoseConfig, joints: int = 20, dtype: torch.dtype = torch.float32) -> PoseNetwork:
+    """One whose every parameter matters: norms, biases and head are not at their start."""
+    made = PoseNetwork(joints, config, torch.Generator().manual_seed(0))
+    for i, (name, parameter) in enumerate(made.named_parameters()):
+        if parameter.dim() == 1 or name.startswith("head"):
+            parameter.data += 0.1 * normal(*parameter.shape, seed=i).float()
+    return made.to(dtype)
+
+
+def model(dtype: torch.dtype = torch.float32, pose: PoseConfig = SMALL) -> Model:
+    values = {name: torch.zeros(4, size) for name, size in (("means", 3), ("quats", 4), ("log_scales", 3))}
+    values |= {"logit_opacities": torch.zeros(4), "colors": torch.zeros(4, 1, 3)}
+    grid = SkinningField(torch.zeros(8, 20), torch.zeros(3), torch.ones(3), torch.tensor(MIRROR), False)
+    skeleton = quadruped().bones[:, 0].float(), torch.tensor(PARENTS), torch.tensor(MIRROR)
+    config = Config(deform=Deform(width=16), pose=pose)
+    made = Model(config, Gaussians(values, 1.0), grid, *skeleton, torch.Generator().manual_seed(0))
+    made.network = network(pose)
+    return made.to(dtype)
+
+
+@pytest.mark.parametrize(
+    ("batch", "joints", "config"),
+    [
+        (1, 20, PoseConfig()),
+        (3, 20, SMALL),
+        (13, 20, msgspec.structs.replace(SMALL, blocks=1)),
+        (2, 17, msgspec.structs.replace(SMALL, width=16, heads=1, anchor_size=8, blocks=3)),
+        (5, 3, msgspec.structs.replace(SMALL, blocks=0)),
+    ],
+)
+def test_poses(batch: int, joints: int, config: PoseConfig) -> None:
+    flipped = [i % 2 == 1 for i in range(batch)]
+    mirror = torch.arange(joints).flip(0)
+
+    def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
+        own = network(config, joints, dtype)
+        code = normal(batch, 2 + 2 * config.frequencies, seed=1).to(dtype)
+        return [*own(code), *own(code, flipped, mirror)], dict(own.named_parameters())
+
+    check_twins(make)
+
+
+@pytest.mark.parametrize(("width", "heads"), [(24, 3), (16, 4)])
+def test_sizes_that_the_kernels_do_not_take_go_to_the_twin(width: int, heads: int) -> None:
+    config = msgspec.structs.replace(SMALL, width=width, heads=heads)
+    code = normal(2, 6, seed=1)
+    wanted, found = network(config, dtype=torch.float64)(code), network(config)(code.float())
+    for one, other in zip(wanted, found, strict=True):
+        torch.testing.assert_close(one.float(), other, atol=1e-5, rtol=1e-5)
+
+
+def test_poses_are_the_same_bits_for_any_number_of_threads_and_without_a_gradient() -> None:
+    before, found, own = torch.get_num_threads(), [], network(SMALL)
+    code = normal(30, 6, seed=1).float()
+    try:
+        for threads in (1, 2, 4):
+            torch.set_num_threads(threads)
+            own.zero_grad()
+            pose = own(code)
+            torch.stack([part.square().sum() for part in pose]).sum().backward()
+            found.append([*pose, *(parameter.grad for parameter in own.parameters())])
+    finally:
+        torch.set_num_threads(before)
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+    with torch.no_grad():
+        assert all(torch.equal(a, b) for a, b in zip(own(code), found[0][:3], strict=True))
+
+
+def test_one_pose_does_not_depend_on_the_others_of_its_batch() -> None:
+    own, code = network(SMALL), normal(30, 6, seed=1).float()
+    whole = own(code)
+    for row in (0, 11, 12, 29):
+        for all_of_them, alone in zip(whole, own(code[row : row + 1]), strict=True):
+            torch.testing.assert_close(all_of_them[row], alone[0], atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("explicit", [False, True])
+def test_time_codes(explicit: bool) -> None:
+    signs = torch.tensor((1.0, -1.0, 1.0)), torch.tensor((1.0, 1.0, -1.0))
+    times = torch.tensor((0.1, 0.7, 1.0))
+    wanted = time_code(times.double(), signs[0], signs[1], 4, explicit)
+    found = time_code(times, *signs, 4, explicit)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, wanted.float(), atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize("tied", [False, True])
+def test_poses_of_views(tied: bool) -> None:
+    keys = [Key(1, 1, 0), Key(-1, 1, 2), Key(1, -1, 3), Key(-1, -1, 1)]
+    times = torch.tensor([(key.frame + 1) / 4 for key in keys])
+
+    def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
+        own = model(dtype, msgspec.structs.replace(SMALL, tied=tied))
+        return list(own.pose(times.to(dtype), keys)), dict(own.network.named_parameters())
+
+    check_twins(make)
+
+
+def batch_of_poses(dtype: torch.dtype, batch: int) -> dict[str, Tensor]:
+    """Some joints turn far beyond the limit, some have the other sign."""
+    turns = torch.nn.functional.normalize(torch.tensor((1.0, 0, 0, 0)) + normal(batch, 20, 4, seed=1), dim=-1)
+    return leaves(dtype, quats=turns, shifts=normal(batch, 20, 3, seed=2), features=normal(batch, 20, 4, seed=3))
+
+
+@pytest.mark.parametrize(("batch", "rows"), [(1, [0]), (3, [1]), (6, [0, 4]), (2, [])])
+@pytest.mark.parametrize("only", ["limit", "attach", "temporal", None, ""])
+def test_stance(batch: int, rows: list[int], only: str | None) -> None:
+    weights = {"limit": 3.0, "attach": 20.0, "temporal": 10.0}
+    if only is not None:
+        weights = {name: value * (name == only) for name, value in weights.items()}
+    config = Geometry(**weights)
+
+    def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
+        given = batch_of_poses(dtype, batch)
+        pose, transforms, total = stance(model(dtype), Pose(**given), rows, config)
+        return [*pose, transforms, total[None]], given
+
+    check_twins(make)
+
+
+def test_the_sum_alone_is_that_of_the_stance() -> None:
+    own, pose, config = model(), Pose(**batch_of_poses(torch.float32, 3)), Geometry()
+    alone = skeleton_losses(own, pose, own.transforms(pose), config)
+    assert float(alone.detach()) == float(stance(own, pose, [1], config)[2].detach()) > 0
+
+
+def test_attachment_of_a_shifted_joint() -> None:
+    own, shifts = model(), torch.zeros(1, 20, 3)
+    leaf = next(joint for joint in range(20) if joint not in PARENTS)
+    shifts[0, leaf, 1] = 0.5
+    pose = Pose(torch.tensor((1.0, 0, 0, 0)).repeat(1, 20, 1), shifts, torch.zeros(1, 20, 4))
+    config = Geometry(limit=0.0, temporal=0.0, attach=2.0)
+    bones = sum(parent >= 0 for parent in PARENTS)
+    expected = 2.0 * (0.5 / OBJECT_DIAGONAL) ** 2 / bones
+    assert float(stance(own, pose, [0], config)[2]) == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_bone_beyond_its_limit() -> None:
+    own, quats = model(), torch.tensor((1.0, 0, 0, 0)).repeat(1, 20, 1)
+    leaf = next(joint for joint in range(20) if joint not in PARENTS)
+    half = math.radians(90) / 2
+    quats[0, leaf] = torch.tensor((math.cos(half), 0, 0, math.sin(half)))
+    pose = Pose(quats, torch.zeros(1, 20, 3), torch.zeros(1, 20, 4))
+    config = Geometry(limit=1.0, limit_degrees=60.0, attach=0.0, temporal=0.0)
+    bones = sum(parent >= 0 for parent in PARENTS)
+    expected = (math.cos(math.radians(30)) - math.cos(half)) ** 2 / bones
+    assert float(stance(own, pose, [0], config)[2]) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("weight", [0.3, 1.0])
+def test_blend_and_distance(weight: float) -> None:
+    others, moved = unit(2, 20, 4, seed=4), normal(2, 20, 3, seed=5)
+
+    def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
+        given = batch_of_poses(dtype, 2)
+        blended = blend_poses(Pose(**given), others.to(dtype), moved.to(dtype), weight)
+        apart = pose_distance(Pose(**given), others.to(dtype), moved.to(dtype))
+        return [*blended, apart[None]], given
+
+    check_twins(make)
+
+
+def test_the_kernels_take_the_parameters_in_the_networks_own_order() -> None:
+    own = network(SMALL)
+    copied = copy.deepcopy(own)
+    copied.load_state_dict({name: 2 * value for name, value in own.state_dict().items()}, assign=True)
+    copied.requires_grad_()
+    code = normal(1, 6, seed=1)
+    wanted = copy.deepcopy(copied).double()(code)
+    for one, other in zip(wanted, copied(code.float()), strict=True):
+        torch.testing.assert_close(one.float(), other, atol=1e-4, rtol=1e-4)
