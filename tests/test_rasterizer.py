@@ -159,6 +159,17 @@ def test_mirrored_gaussians_in_the_mirrored_camera_are_the_flipped_image() -> No
     assert torch.allclose(render(single, 36, 24)[0].double(), image.flip(-1), atol=1e-2)
 
 
+@pytest.mark.parametrize("channels", [3, 5])
+def test_features_alone_have_the_gradient_that_they_have_among_others(channels: int) -> None:
+    inputs = {name: tensor.float() for name, tensor in scene(120, channels, 2, 40, 30, seed=7).items()}
+    _, wanted = gradients(inputs, 40, 30, backend="numba")
+    features = inputs["features"].clone().requires_grad_()
+    image, alpha, _ = render(inputs | {"features": features}, 40, 30, backend="numba")
+    on_image, on_alpha = (weights.to(image) for weights in loss_weights(image))
+    ((image * on_image).sum() + (alpha * on_alpha).sum()).backward()
+    assert torch.equal(features.grad, wanted["features"])
+
+
 def test_features_without_background_are_premultiplied() -> None:
     inputs = {name: tensor.float() for name, tensor in scene(50, 1, 1, 30, 30, 0).items()}
     inputs["features"] = torch.ones(50, 1)

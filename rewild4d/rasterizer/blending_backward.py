@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from rewild4d.kernels.compiling import inlined, kernel
-from rewild4d.kernels.powers import load_terms
+from rewild4d.kernels.powers import exp2
 from rewild4d.kernels.rows import sum_rows
 from rewild4d.kernels.simd import (
     LANES,
     broadcast,
     divide,
     fma,
+    fnma,
     fold1,
     fold2,
     fold4,
@@ -25,6 +26,7 @@ from rewild4d.kernels.simd import (
     load,
     load_block,
     lowest_bit,
+    minimum,
     select_gt,
     splat,
     store,
@@ -32,23 +34,20 @@ from rewild4d.kernels.simd import (
 )
 from rewild4d.rasterizer.binning import BLOCK, BLOCKS
 from rewild4d.rasterizer.blending import (
-    LEAST_LEFT,
-    STRONGEST,
-    STRONGEST_ALPHA,
-    TERMS,
-    WEAKEST,
-    alpha_at,
     open_tile,
     place_in_tile,
     tile_place,
 )
-from rewild4d.rasterizer.projection import ALONG_X, ALONG_Y, DOWN, LOG_OPACITY, RECORD
+from rewild4d.rasterizer.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
+from rewild4d.rasterizer.projection import ALONG_X, ALONG_Y, DOWN, LOG2_MIN_ALPHA, LOG_OPACITY, RECORD
 from rewild4d.rasterizer.projection_backward import TT, TU, UU
 
 MOMENTS = 6
 """Sums of q, q t, q u, q t^2, q t u, q u^2 at the start of a slot, q = dL/dalpha alpha."""
 
 LN2 = math.log(2.0)
+_WEAKEST, _LEAST_LEFT = np.float32(LOG2_MIN_ALPHA), np.float32(MIN_TRANSMITTANCE)
+_STRONGEST_ALPHA, _STRONGEST = np.float32(MAX_ALPHA), np.float32(math.log2(MAX_ALPHA))
 
 
 def slot_width(channels: int) -> int:
@@ -81,7 +80,6 @@ def _read_block(plane: np.ndarray, first_row: int, x: int, y: int, width: int, h
 @kernel
 def blend_backward(
     tickets: np.ndarray,
-    constants: np.ndarray,
     tiles_x: int,
     tiles_y: int,
     starts: np.ndarray,
@@ -94,9 +92,13 @@ def blend_backward(
     alpha: np.ndarray,
     g_image: np.ndarray,
     g_alpha: np.ndarray,
+    geometry: bool,
     sums: np.ndarray,
 ) -> None:
-    """Fill the slots' rows of ``sums`` (`slot_width` numbers each) for tiles until no ticket is left."""
+    """Fill the slots' rows of ``sums`` (`slot_width` numbers each) for tiles until no ticket is left.
+
+    Without ``geometry`` only the channels' sums are made; the moments are zero.
+    """
     views, channels, height, width = image.shape
     count = len(records) // (RECORD * views)
     left, behind = np.empty(BLOCKS * LANES, np.float32), np.empty(BLOCKS * LANES, np.float32)
@@ -119,8 +121,9 @@ def blend_backward(
             if bits != 0:
                 n = entry_gaussian[entry]
                 _entry_backward(
-                    bits, constants, records, (view * count + n) * RECORD, features, n * channels, channels, tile_left,
-                    tile_top, steps, left, behind, gradients, rows, sums, slot * row_length,
+                    bits, records, (view * count + n) * RECORD, features, n * channels, channels, tile_left,
+                    tile_top,
+                    geometry, steps, left, behind, gradients, rows, sums, slot * row_length,
                 )  # fmt: skip
 
 
@@ -155,7 +158,6 @@ def _read_tile(
 @inlined
 def _entry_backward(
     bits: int,
-    constants: np.ndarray,
     records: np.ndarray,
     record: int,
     features: np.ndarray,
@@ -163,6 +165,7 @@ def _entry_backward(
     channels: int,
     tile_left: int,
     tile_top: int,
+    geometry: bool,
     steps: np.ndarray,
     left: np.ndarray,
     behind: np.ndarray,
@@ -172,9 +175,9 @@ def _entry_backward(
     place: int,
 ) -> None:
     """Sum one Gaussian's six moments and channel gradients over the blocks of ``bits`` into sums[place:]."""
-    zero, one, least = splat(np.float32(0)), splat(np.float32(1)), broadcast(constants, LEAST_LEFT)
-    strongest, weakest = broadcast(constants, STRONGEST_ALPHA), broadcast(constants, WEAKEST)
-    capped, terms = broadcast(constants, STRONGEST), load_terms(constants, TERMS)
+    # Its constants are literals: the sums leave no registers for them.
+    zero, one, least = splat(np.float32(0)), splat(np.float32(1)), splat(_LEAST_LEFT)
+    strongest, weakest = splat(_STRONGEST_ALPHA), splat(_WEAKEST)
     log_opacity = broadcast(records, record + LOG_OPACITY)
     first_t, first_u = place_in_tile(records, record, tile_left, tile_top, steps)
     red, green, blue, on_red, on_green, on_blue = zero, zero, zero, zero, zero, zero
@@ -190,7 +193,8 @@ def _entry_backward(
         block = lowest_bit(bits)
         bits &= bits - 1
         t, u = first_t + broadcast(steps, block), first_u + broadcast(steps, LANES + block)
-        alpha, exponent = alpha_at(log_opacity, t, u, strongest, terms)
+        exponent = fnma(t, t, fnma(u, u, log_opacity))
+        alpha = minimum(exp2(exponent), strongest)
         before = load(left, block * LANES)
         weight = keep_where_ge(alpha, exponent, weakest) * before
         after = before - weight
@@ -211,12 +215,14 @@ def _entry_backward(
                 slope = load(gradients, place_of_block + channel * LANES)
                 along = fma(slope, broadcast(features, feature + channel), along)
                 store(rows, channel * LANES, fma(weight, slope, load(rows, channel * LANES)))
+        if not geometry:
+            continue
         rest = load(behind, block * LANES) - weight * along
         store(behind, block * LANES, rest)
         # alpha dL/dalpha, where the pixel took this Gaussian and the cap did not hold it.
         pull = weight * along - divide(rest * alpha, one - alpha)
         pull = select_gt(weight, zero, pull, zero)
-        pull = select_gt(exponent, capped, zero, pull)
+        pull = select_gt(exponent, splat(_STRONGEST), zero, pull)
         m = m + pull
         pull_t, pull_u = pull * t, pull * u
         mt, mu = mt + pull_t, mu + pull_u

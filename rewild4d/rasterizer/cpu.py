@@ -223,9 +223,10 @@ class _Blend(torch.autograd.Function):
         v_features = _zeros(*features.shape)
         threads = _blend_threads(lists)
         call = (
-            phase_counters(2), np.zeros(1, np.int64), _table(spans(records.shape[1], threads), 2), CONSTANTS,
+            phase_counters(2), np.zeros(1, np.int64), _table(spans(records.shape[1], threads), 2),
             *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.pair_bits, records.numpy(),
-            array(features).ravel(), image.numpy(), alpha.numpy(), array(g_image), array(g_alpha), sums, lists.slots,
+            array(features).ravel(), image.numpy(), alpha.numpy(), array(g_image), array(g_alpha),
+            any(ctx.needs_input_grad[:2]), sums, lists.slots,
             width, v_means2d.numpy(), v_records.numpy(), v_features.numpy(),
         )  # fmt: skip
         run(blend_back, [call] * threads)

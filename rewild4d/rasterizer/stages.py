@@ -113,10 +113,10 @@ def bin_and_blend(
 
 @kernel
 def blend_back(
-    counters: np.ndarray, tickets: np.ndarray, bounds: np.ndarray, constants: np.ndarray, tiles_x: int, tiles_y: int,
+    counters: np.ndarray, tickets: np.ndarray, bounds: np.ndarray, tiles_x: int, tiles_y: int,
     starts: np.ndarray, entry_gaussian: np.ndarray, entry_slot: np.ndarray, pair_bits: np.ndarray,
     records: np.ndarray, features: np.ndarray, image: np.ndarray, alpha: np.ndarray, g_image: np.ndarray,
-    g_alpha: np.ndarray, sums: np.ndarray, slots: np.ndarray, width: int, v_means2d: np.ndarray,
+    g_alpha: np.ndarray, geometry: bool, sums: np.ndarray, slots: np.ndarray, width: int, v_means2d: np.ndarray,
     v_records: np.ndarray, v_features: np.ndarray,
 ) -> None:  # fmt: skip
     """The gradient of `bin_and_blend`: slots of all tiles, then their sums for each Gaussian.
@@ -131,8 +131,8 @@ def blend_back(
     """
     enter_phase(counters, 0)
     blend_backward(
-        tickets, constants, tiles_x, tiles_y, starts, entry_gaussian, entry_slot, pair_bits, records.reshape(-1),
-        features, image, alpha, g_image, g_alpha, sums,
+        tickets, tiles_x, tiles_y, starts, entry_gaussian, entry_slot, pair_bits, records.reshape(-1),
+        features, image, alpha, g_image, g_alpha, geometry, sums,
     )  # fmt: skip
     end_phase(counters, 0)
     while True:
