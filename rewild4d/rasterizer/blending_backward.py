@@ -45,20 +45,23 @@ from rewild4d.rasterizer.projection_backward import TT, TU, UU
 MOMENTS = 6
 """Sums of q, q t, q u, q t^2, q t u, q u^2 at the start of a slot, q = dL/dalpha alpha."""
 
+FEW = 3
+"""Channels whose sums stay in registers."""
+
 LN2 = math.log(2.0)
 _WEAKEST, _LEAST_LEFT = np.float32(LOG2_MIN_ALPHA), np.float32(MIN_TRANSMITTANCE)
 _STRONGEST_ALPHA, _STRONGEST = np.float32(MAX_ALPHA), np.float32(math.log2(MAX_ALPHA))
 
 
 def slot_width(channels: int) -> int:
-    """Numbers in a slot: a vector of moments and of three channels' sums; other channels have vectors of their own."""
-    return LANES + (0 if channels == 3 else -(-channels // LANES) * LANES)
+    """Numbers in a slot: a vector of moments and of up to three channels' sums; more have their own vectors."""
+    return LANES + (0 if channels <= FEW else -(-channels // LANES) * LANES)
 
 
 @inlined
 def _first_channel(channels: int) -> int:
     """Where in a slot the channel sums begin."""
-    return MOMENTS if channels == 3 else LANES
+    return MOMENTS if channels <= FEW else LANES
 
 
 _slot_width = kernel(slot_width)
@@ -103,7 +106,7 @@ def blend_backward(
     count = len(records) // (RECORD * views)
     left, behind = np.empty(BLOCKS * LANES, np.float32), np.empty(BLOCKS * LANES, np.float32)
     steps = np.empty(2 * LANES, np.float32)
-    gradients = np.empty(BLOCKS * channels * LANES, np.float32)
+    gradients = np.zeros(BLOCKS * max(channels, FEW) * LANES, np.float32)
     row_length = _slot_width(channels)
     rows = np.empty(row_length * LANES, np.float32)
     while True:
@@ -150,7 +153,7 @@ def _read_tile(
         for channel in range(channels):
             first_row = (view * channels + channel) * height
             slope = _read_block(g_pixels, first_row, x, y, width, height)
-            store(gradients, (block * channels + channel) * LANES, slope)
+            store(gradients, (block * max(channels, FEW) + channel) * LANES, slope)
             total = fma(slope, _read_block(pixels, first_row, x, y, width, height), total)
         store(behind, block * LANES, total)
 
@@ -181,10 +184,10 @@ def _entry_backward(
     log_opacity = broadcast(records, record + LOG_OPACITY)
     first_t, first_u = place_in_tile(records, record, tile_left, tile_top, steps)
     red, green, blue, on_red, on_green, on_blue = zero, zero, zero, zero, zero, zero
-    if channels == 3:
-        red, green, blue = (
-            broadcast(features, feature), broadcast(features, feature + 1), broadcast(features, feature + 2)
-        )  # fmt: skip
+    if channels <= FEW:
+        red = broadcast(features, feature)
+        green = broadcast(features, feature + 1) if channels > 1 else zero
+        blue = broadcast(features, feature + 2) if channels > 2 else zero
     else:
         for channel in range(channels):
             store(rows, channel * LANES, zero)
@@ -200,8 +203,8 @@ def _entry_backward(
         after = before - weight
         weight = select_gt(after, least, weight, zero)
         store(left, block * LANES, select_gt(after, least, after, zero))
-        along, place_of_block = zero, block * channels * LANES
-        if channels == 3:  # the usual case keeps its sums in registers
+        along, place_of_block = zero, block * max(channels, FEW) * LANES
+        if channels <= FEW:  # the usual case keeps its sums in registers
             first = load(gradients, place_of_block)
             second, third = load(gradients, place_of_block + LANES), load(gradients, place_of_block + 2 * LANES)
             along = fma(first, red, fma(second, green, third * blue))
@@ -229,7 +232,7 @@ def _entry_backward(
         mtt, mtu, muu = fma(pull_t, t, mtt), fma(pull_t, u, mtu), fma(pull_u, u, muu)
     near = fold4(fold2(fold1(m, mt), fold1(mu, mtt)), fold2(fold1(mtu, muu), fold1(on_red, on_green)))
     store(sums, place, fold8(near, fold4(fold2(fold1(on_blue, zero), zero), zero)))
-    sum_rows(rows, 0 if channels == 3 else channels, sums, place + LANES)
+    sum_rows(rows, 0 if channels <= FEW else channels, sums, place + LANES)
 
 
 @kernel
