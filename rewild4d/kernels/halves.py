@@ -10,13 +10,11 @@ from llvmlite import binding, ir
 from numba.core.typing import signature
 
 from rewild4d.kernels.compiling import kernel
-from rewild4d.kernels.matrix import ROWS, matrix_tile, tile_width, transpose_tile
-from rewild4d.kernels.simd import LANES, intrinsic, lanes_type, load, store
+from rewild4d.kernels.matrix import ROWS, matrix_tile, tile_width
+from rewild4d.kernels.simd import INTEGERS, LANES, VECTOR, intrinsic, lanes_type, load, store
 
 AVAILABLE = bool(binding.get_host_cpu_features().get("avx512bf16", False))
 """Whether this machine multiplies pairs; elsewhere `add_product` of kernels/matrix.py does the work."""
-
-_VECTOR, _INTEGERS = ir.VectorType(ir.FloatType(), LANES), ir.VectorType(ir.IntType(32), LANES)
 
 
 class _BFloat(ir.Type):
@@ -34,7 +32,7 @@ def _multiply_add(builder: Any, left: Any, right: Any, total: Any) -> Any:
     if not AVAILABLE:
         return total
     pairs = [builder.bitcast(word, _PAIRS) for word in (left, right)]
-    kind = ir.FunctionType(_VECTOR, [_VECTOR, _PAIRS, _PAIRS])
+    kind = ir.FunctionType(VECTOR, [VECTOR, _PAIRS, _PAIRS])
     name = "llvm.x86.avx512bf16.dpbf16ps.512"
     function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
     return builder.call(function, [total, *pairs])
@@ -77,9 +75,9 @@ def pair(typing: Any, low: Any, high: Any) -> Any:
     """Words of two vectors, lane by lane, each number rounded to the nearest."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        half, upper, shift = (ir.Constant(_INTEGERS, [bits] * LANES) for bits in (0x8000, -0x10000, 16))
-        first, second = (builder.add(builder.bitcast(arg, _INTEGERS), half) for arg in args)
-        return builder.bitcast(builder.or_(builder.lshr(first, shift), builder.and_(second, upper)), _VECTOR)
+        half, upper, shift = (ir.Constant(INTEGERS, [bits] * LANES) for bits in (0x8000, -0x10000, 16))
+        first, second = (builder.add(builder.bitcast(arg, INTEGERS), half) for arg in args)
+        return builder.bitcast(builder.or_(builder.lshr(first, shift), builder.and_(second, upper)), VECTOR)
 
     return signature(lanes_type, lanes_type, lanes_type), generate
 
@@ -101,14 +99,6 @@ def pair_vectors(given: np.ndarray, rows: int, columns: int, words: np.ndarray) 
     """
     for place in range(0, rows * columns, 2 * LANES):
         store(words, place // 2, pair(load(given, place), load(given, place + LANES)))
-
-
-@kernel
-def transposed_words(words: np.ndarray, rows: int, columns: int, turned: np.ndarray) -> None:
-    """[rows, columns] -> [columns, rows], multiples of sixteen."""
-    for row in range(0, rows, LANES):
-        for column in range(0, columns, LANES):
-            transpose_tile(words, row * columns + column, columns, turned, column * rows + row, rows)
 
 
 @kernel

@@ -13,7 +13,7 @@ from numba.core import types
 from numba.core.typing import signature
 
 from rewild4d.kernels.compiling import kernel
-from rewild4d.kernels.simd import LANES, intrinsic, llvm_call
+from rewild4d.kernels.simd import INTEGERS, LANES, VECTOR, intrinsic, llvm_call
 
 ROWS = 8
 """Rows of a tile; the left factor and the result have a multiple of it."""
@@ -21,8 +21,6 @@ VECTORS = 3
 """Vectors in a row of a tile: 24 sums, 3 loads and 8 broadcasts a step leave the multiplier as the limit."""
 
 _FLOAT, _WORD = ir.FloatType(), ir.IntType(64)
-_VECTOR = ir.VectorType(_FLOAT, LANES)
-_INTEGERS = ir.VectorType(ir.IntType(32), LANES)
 
 
 def _data(context: Any, builder: Any, kind: Any, value: Any) -> Any:
@@ -30,12 +28,12 @@ def _data(context: Any, builder: Any, kind: Any, value: Any) -> Any:
 
 
 def _vector_at(builder: Any, data: Any, place: Any) -> Any:
-    return builder.bitcast(builder.gep(data, [place]), _VECTOR.as_pointer())
+    return builder.bitcast(builder.gep(data, [place]), VECTOR.as_pointer())
 
 
 def _broadcast(builder: Any, number: Any) -> Any:
-    one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), number, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(one, one, ir.Constant(_INTEGERS, [0] * LANES))
+    one = builder.insert_element(ir.Constant(VECTOR, ir.Undefined), number, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
 
 
 def matrix_tile(vectors: int, multiply_add: Callable[[Any, Any, Any, Any], Any]) -> Any:
@@ -71,7 +69,7 @@ def matrix_tile(vectors: int, multiply_add: Callable[[Any, Any, Any, Any], Any])
             builder.position_at_end(loop)
             step = builder.phi(_WORD)
             step.add_incoming(_word(0), before)
-            sums = [builder.phi(_VECTOR) for _ in places]
+            sums = [builder.phi(VECTOR) for _ in places]
             for total, first in zip(sums, start, strict=True):
                 total.add_incoming(first, before)
             line = builder.add(b_first, builder.mul(step, b_row))
@@ -90,7 +88,7 @@ def matrix_tile(vectors: int, multiply_add: Callable[[Any, Any, Any, Any], Any])
                 total.add_incoming(value, loop)
             builder.cbranch(builder.icmp_signed("<", following, depth), loop, after)
             builder.position_at_end(after)
-            results = [builder.phi(_VECTOR) for _ in places]
+            results = [builder.phi(VECTOR) for _ in places]
             for result, value, first in zip(results, new, start, strict=True):
                 result.add_incoming(value, loop)
                 result.add_incoming(first, before)
@@ -169,8 +167,8 @@ def transpose_tile(typing: Any, source: Any, first: Any, row: Any, target: Any, 
             for i in range(LANES):
                 if not i & bit:
                     pair = lines[i], lines[i | bit]
-                    swapped[i] = builder.shuffle_vector(*pair, ir.Constant(_INTEGERS, low))
-                    swapped[i | bit] = builder.shuffle_vector(*pair, ir.Constant(_INTEGERS, high))
+                    swapped[i] = builder.shuffle_vector(*pair, ir.Constant(INTEGERS, low))
+                    swapped[i | bit] = builder.shuffle_vector(*pair, ir.Constant(INTEGERS, high))
             lines = swapped
         for i, line in enumerate(lines):
             builder.store(
@@ -180,3 +178,11 @@ def transpose_tile(typing: Any, source: Any, first: Any, row: Any, target: Any, 
 
     integer = types.intp
     return signature(types.void, source, integer, integer, target, integer, integer), generate
+
+
+@kernel
+def transpose(given: np.ndarray, rows: int, wide: int, turned: np.ndarray) -> None:
+    """Write [rows, wide] as [wide, rows]; multiples of sixteen."""
+    for row in range(0, rows, LANES):
+        for lane in range(0, wide, LANES):
+            transpose_tile(given, row * wide + lane, wide, turned, lane * rows + row, rows)

@@ -9,6 +9,9 @@ from numba.core.typing import signature
 from rewild4d.kernels.compiling import inlined
 from rewild4d.kernels.simd import INTEGERS, LANES, VECTOR, broadcast, constant, fma, intrinsic, lanes_type, llvm_call
 
+LOG2_E = np.float32(1.4426950408889634)
+"""For exp(x) = exp2(x LOG2_E)."""
+
 
 def _power_of_two_fit() -> list[float]:
     """Coefficients of 2**x on [-1/2, 1/2], degree 5 at Chebyshev nodes, relative error 2e-7 in float32."""

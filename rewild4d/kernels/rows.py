@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from rewild4d.kernels.compiling import inlined
+from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import LANES, fma, fold1, fold2, fold4, fold8, load, splat, store
 from rewild4d.kernels.tails import load_first, store_first
 
@@ -41,3 +41,16 @@ def add_scaled(share: float, source: np.ndarray, start: int, target: np.ndarray,
         own = load_first(target, place + whole, count - whole, factor)
         own = fma(factor, load_first(source, start + whole, count - whole, factor), own)
         store_first(target, place + whole, count - whole, own)
+
+
+@kernel
+def add_row_sums(rows: np.ndarray, count: int, wide: int, scratch: np.ndarray, sums: np.ndarray) -> None:
+    """Add the sum of each of ``count`` rows to ``sums``; both lengths are multiples of sixteen."""
+    for row in range(count):
+        total = splat(np.float32(0))
+        for place in range(row * wide, (row + 1) * wide, LANES):
+            total = total + load(rows, place)
+        store(scratch, row * LANES, total)
+    sum_rows(scratch, count, scratch, 0)
+    for row in range(0, count, LANES):
+        store(sums, row, load(sums, row) + load(scratch, row))

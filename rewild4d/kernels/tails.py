@@ -6,23 +6,22 @@ from llvmlite import ir
 from numba.core import types
 from numba.core.typing import signature
 
-from rewild4d.kernels.simd import LANES, intrinsic, lanes_type, llvm_call
+from rewild4d.kernels.simd import INTEGERS, LANES, VECTOR, intrinsic, lanes_type, llvm_call
 
-_FLOAT, _INT = ir.FloatType(), ir.IntType(32)
-_VECTOR, _INTEGERS = ir.VectorType(_FLOAT, LANES), ir.VectorType(_INT, LANES)
+_INT = ir.IntType(32)
 _ALIGN = ir.Constant(_INT, 4)
 
 
 def _first_lanes(builder: Any, count: Any) -> Any:
     """A mask of the first ``count`` lanes."""
-    one = builder.insert_element(ir.Constant(_INTEGERS, ir.Undefined), builder.trunc(count, _INT), ir.Constant(_INT, 0))
-    limit = builder.shuffle_vector(one, one, ir.Constant(_INTEGERS, [0] * LANES))
-    return builder.icmp_signed("<", ir.Constant(_INTEGERS, list(range(LANES))), limit)
+    one = builder.insert_element(ir.Constant(INTEGERS, ir.Undefined), builder.trunc(count, _INT), ir.Constant(_INT, 0))
+    limit = builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
+    return builder.icmp_signed("<", ir.Constant(INTEGERS, list(range(LANES))), limit)
 
 
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
     data = context.make_array(kind)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _VECTOR.as_pointer())
+    return builder.bitcast(builder.gep(data, [index]), VECTOR.as_pointer())
 
 
 @intrinsic
@@ -55,7 +54,7 @@ def _across(builder: Any, value: Any, combine: Any) -> Any:
     """Combine all lanes, halves first, into one number."""
     for half in (8, 4, 2, 1):
         order = [(lane + half) % LANES for lane in range(LANES)]
-        value = combine(value, builder.shuffle_vector(value, value, ir.Constant(_INTEGERS, order)))
+        value = combine(value, builder.shuffle_vector(value, value, ir.Constant(INTEGERS, order)))
     return builder.extract_element(value, ir.Constant(_INT, 0))
 
 

@@ -5,7 +5,6 @@ inner one, so neighbouring steps work on different pixels and need not wait for 
 first cache. A closed pixel keeps its last transmittance, with a minus sign, and takes nothing more.
 """
 
-import math
 from typing import Any
 
 import numpy as np
@@ -45,9 +44,9 @@ from rewild4d.rasterizer.projection import (
     RECORD,
 )
 
-CONSTANTS = np.array([LOG2_MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, math.log2(MAX_ALPHA), *POWER_TERMS], np.float32)
+CONSTANTS = np.array([LOG2_MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, *POWER_TERMS], np.float32)
 """An argument of the kernels, so that the loop over blocks finds them in registers."""
-WEAKEST, STRONGEST_ALPHA, LEAST_LEFT, STRONGEST, TERMS = range(5)
+WEAKEST, STRONGEST_ALPHA, LEAST_LEFT, TERMS = range(4)
 
 
 @inlined

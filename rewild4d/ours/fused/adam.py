@@ -20,7 +20,7 @@ SERIAL_BELOW = 4 * CHUNK
 
 @kernel
 def _begin(places: np.ndarray, rates: np.ndarray, factors: np.ndarray, firsts: np.ndarray) -> None:
-    """Count one step of each tensor; set its factors [tensors, 6] and the number of the chunk it begins with."""
+    """Count one step of each tensor; set its factors [tensors, 7] and the number of the chunk it begins with."""
     firsts[0] = 0
     for i in range(len(places)):
         rate, beta, beta_sq, eps = rates[i, 0], rates[i, 1], rates[i, 2], rates[i, 3]

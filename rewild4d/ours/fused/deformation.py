@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.halves import AVAILABLE
-from rewild4d.kernels.powers import exp2
+from rewild4d.kernels.powers import LOG2_E, exp2
 from rewild4d.kernels.simd import (
     LANES,
     divide,
@@ -29,7 +29,6 @@ from rewild4d.kernels.simd import (
 from rewild4d.kernels.threads import run, thread_count
 from rewild4d.ours.fused.layers import (
     BLOCK,
-    LOG2_E,
     Factors,
     Layout,
     backward_block,

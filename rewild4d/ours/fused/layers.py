@@ -8,16 +8,15 @@ from typing import NamedTuple
 import numpy as np
 
 from rewild4d.kernels.compiling import kernel
-from rewild4d.kernels.halves import add_pair_product, pair_matrix, pair_rows, pair_vectors, transposed_words
-from rewild4d.kernels.matrix import add_product
-from rewild4d.kernels.powers import exp2
-from rewild4d.kernels.rows import sum_rows
+from rewild4d.kernels.halves import add_pair_product, pair_matrix, pair_rows, pair_vectors
+from rewild4d.kernels.matrix import add_product, transpose
+from rewild4d.kernels.powers import LOG2_E, exp2
+from rewild4d.kernels.rows import add_row_sums
 from rewild4d.kernels.simd import LANES, divide, fma, load, maximum, select_gt, splat, store
 
 BLOCK = 96
 """Gaussians side by side: six vectors."""
 OUTPUTS = 9
-LOG2_E = np.float32(1.4426950408889634)
 
 
 def padded(size: int) -> int:
@@ -143,22 +142,14 @@ def _layer_gradient(
     """Add this block's share to the gradient of a matrix and of the bias behind it; words and turned are scratch."""
     if half:
         pair_vectors(given, columns, BLOCK, words)
-        transposed_words(words, columns, BLOCK // 2, turned)
+        transpose(words, columns, BLOCK // 2, turned)
         pair_vectors(slope, rows, BLOCK, words)
         add_pair_product(words, 0, BLOCK // 2, turned, 0, columns, BLOCK // 2, gradient, first, columns, rows, columns)
     else:
-        transposed_words(given, columns, BLOCK, turned)
+        transpose(given, columns, BLOCK, turned)
         add_product(slope, 0, BLOCK, 1, turned, 0, columns, BLOCK, gradient, first, columns, rows, columns)
-    # Scratch again: each row's vectors become one, then one number.
-    for row in range(rows):
-        total = load(slope, row * BLOCK)
-        for lane in range(LANES, BLOCK, LANES):
-            total = total + load(slope, row * BLOCK + lane)
-        store(turned, row * LANES, total)
-    sum_rows(turned, rows, turned, 0)
     bias = first + rows * columns
-    for row in range(0, rows, LANES):
-        store(gradient, bias + row, load(gradient, bias + row) + load(turned, row))
+    add_row_sums(slope, rows, BLOCK, turned, gradient[bias : bias + rows])
 
 
 @kernel

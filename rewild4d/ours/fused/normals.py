@@ -15,14 +15,7 @@ from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import LANES, absolute, fma, load, select_gt, splat, store
 from rewild4d.kernels.tails import store_first
-
-
-@inlined
-def _unit(quats: np.ndarray, n: int) -> tuple:
-    """A quaternion of length one, and one over its length before."""
-    a, b, c, d = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
-    inverse = np.float32(1 / max(math.sqrt(a * a + b * b + c * c + d * d), 1e-12))
-    return a * inverse, b * inverse, c * inverse, d * inverse, inverse
+from rewild4d.ours.fused.quaternions import unit_row, unit_slope
 
 
 @kernel
@@ -37,7 +30,7 @@ def _forward(
         for i in range(1, 3):
             if log_scales[n, i] < log_scales[n, axis]:
                 axis = i
-        w, x, y, z, _ = _unit(quats, n)
+        w, x, y, z, _ = unit_row(quats, n)
         if axis == 0:
             a, b, c = one - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)
         elif axis == 1:
@@ -54,7 +47,8 @@ def _forward(
 def _backward(quats: np.ndarray, chosen: np.ndarray, slope: np.ndarray, on_quats: np.ndarray) -> None:
     two = np.float32(2)
     for n in range(len(quats)):
-        w, x, y, z, inverse = _unit(quats, n)
+        turn = unit_row(quats, n)
+        w, x, y, z, _ = turn
         twice = two if chosen[n] > 0 else -two
         a, b, c = twice * slope[n, 0], twice * slope[n, 1], twice * slope[n, 2]
         axis = abs(chosen[n])
@@ -67,9 +61,9 @@ def _backward(quats: np.ndarray, chosen: np.ndarray, slope: np.ndarray, on_quats
         else:
             g_w, g_x = y * a - x * b, z * a - w * b - two * x * c
             g_y, g_z = w * a + z * b - two * y * c, x * a + y * b
-        along = w * g_w + x * g_x + y * g_y + z * g_z
-        on_quats[n, 0], on_quats[n, 1] = (g_w - along * w) * inverse, (g_x - along * x) * inverse
-        on_quats[n, 2], on_quats[n, 3] = (g_y - along * y) * inverse, (g_z - along * z) * inverse
+        on_quat = unit_slope(turn, (g_w, g_x, g_y, g_z))
+        for i in range(4):
+            on_quats[n, i] = on_quat[i]
 
 
 def smallest_axes(quats: Tensor, log_scales: Tensor, means: Tensor, eye: Tensor) -> Tensor:

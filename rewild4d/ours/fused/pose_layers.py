@@ -11,11 +11,11 @@ import numpy as np
 
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.matrix import add_product
+from rewild4d.kernels.pointers import floats_at
 from rewild4d.kernels.simd import LANES, fma, load, splat, store
 from rewild4d.ours.fused.tokens import (
     attend,
     attend_back,
-    floats,
     gelu,
     linear,
     linear_back,
@@ -111,7 +111,7 @@ def _block(kept: np.ndarray, s: Sizes, block: int) -> tuple:
 
 @kernel
 def _parameter(addresses: np.ndarray, starts: np.ndarray, index: int) -> np.ndarray:
-    return floats(addresses[index], starts[index + 1] - starts[index])
+    return floats_at(addresses[index], starts[index + 1] - starts[index])
 
 
 @kernel

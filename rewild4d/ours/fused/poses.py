@@ -3,7 +3,6 @@
 The twins in plain torch are in ours/pose.py.
 """
 
-import math
 from typing import Any
 
 import numpy as np
@@ -13,12 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
-
-
-@inlined
-def _side(a: np.ndarray, b: np.ndarray) -> float:
-    """The sign that puts a quaternion on another's side."""
-    return -1.0 if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] < 0 else 1.0
+from rewild4d.ours.fused.quaternions import side, unit, unit_slope
 
 
 @kernel
@@ -30,7 +24,7 @@ def _distance(
     total, share = 0.0, 1 / len(quats)
     by_length = share / (unit * unit)
     for n in range(len(quats)):
-        sign = _side(others[n], quats[n])
+        sign = side(others[n], quats[n])
         for i in range(4):
             apart = quats[n, i] - sign * others[n, i]
             total += share * apart * apart
@@ -73,28 +67,26 @@ class _Distance(torch.autograd.Function):
 @inlined
 def _mixed(quats: np.ndarray, others: np.ndarray, n: int, weight: float) -> tuple:
     """The unit quaternion of a blend, and one over its length before."""
-    sign = weight * _side(others[n], quats[n])
+    sign = weight * side(others[n], quats[n])
     w, x = (1 - weight) * quats[n, 0] + sign * others[n, 0], (1 - weight) * quats[n, 1] + sign * others[n, 1]
     y, z = (1 - weight) * quats[n, 2] + sign * others[n, 2], (1 - weight) * quats[n, 3] + sign * others[n, 3]
-    inverse = 1 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
-    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+    return unit((w, x, y, z))
 
 
 @kernel
 def _blend(quats: np.ndarray, others: np.ndarray, weight: float, made: np.ndarray) -> None:
     for n in range(len(quats)):
-        unit = _mixed(quats, others, n, weight)
+        turn = _mixed(quats, others, n, weight)
         for i in range(4):
-            made[n, i] = unit[i]
+            made[n, i] = turn[i]
 
 
 @kernel
 def _blend_back(quats: np.ndarray, others: np.ndarray, weight: float, slope: np.ndarray, on_quats: np.ndarray) -> None:
     for n in range(len(quats)):
-        unit, g = _mixed(quats, others, n, weight), slope[n]
-        along = g[0] * unit[0] + g[1] * unit[1] + g[2] * unit[2] + g[3] * unit[3]
+        on_mixed = unit_slope(_mixed(quats, others, n, weight), slope[n])
         for i in range(4):
-            on_quats[n, i] = (1 - weight) * (g[i] - along * unit[i]) * unit[4]
+            on_quats[n, i] = (1 - weight) * on_mixed[i]
 
 
 def blend(quats: Tensor, shifts: Tensor, others: Tensor, other_shifts: Tensor, weight: float) -> tuple[Tensor, Tensor]:

@@ -18,6 +18,7 @@ from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import take_ticket
 from rewild4d.kernels.threads import run, thread_count
 from rewild4d.ours.fused.pose_layers import Sizes, backward_unit, forward_unit, outputs
+from rewild4d.ours.fused.quaternions import unit, unit_slope
 
 
 @kernel
@@ -41,11 +42,9 @@ def codes(time: Tensor, group: Tensor, view: Tensor, frequencies: int, explicit_
 
 
 @inlined
-def _unit(out: np.ndarray, wide: int, lane: int) -> tuple:
+def _turn(out: np.ndarray, wide: int, lane: int) -> tuple:
     """The unit quaternion of the first four outputs, which are added to the identity; and one over its length."""
-    w, x, y, z = 1 + out[lane], out[wide + lane], out[2 * wide + lane], out[3 * wide + lane]
-    inverse = 1 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
-    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+    return unit((1 + out[lane], out[wide + lane], out[2 * wide + lane], out[3 * wide + lane]))
 
 
 @kernel
@@ -59,9 +58,9 @@ def _finish(
             other = mirror[joint] if flipped[item] else joint
             sign = -1.0 if flipped[item] else 1.0
             lane = item * s.joints + other
-            unit = _unit(out, s.wide, lane)
-            quats[item, joint, 0], quats[item, joint, 1] = unit[0], unit[1]
-            quats[item, joint, 2], quats[item, joint, 3] = sign * unit[2], sign * unit[3]
+            turn = _turn(out, s.wide, lane)
+            quats[item, joint, 0], quats[item, joint, 1] = turn[0], turn[1]
+            quats[item, joint, 2], quats[item, joint, 3] = sign * turn[2], sign * turn[3]
             shifts[item, joint, 0] = sign * s.reach * out[4 * s.wide + lane]
             shifts[item, joint, 1] = s.reach * out[5 * s.wide + lane]
             shifts[item, joint, 2] = s.reach * out[6 * s.wide + lane]
@@ -81,12 +80,11 @@ def _finish_back(
             other = mirror[joint] if flipped[item] else joint
             sign = -1.0 if flipped[item] else 1.0
             lane = item * s.joints + other
-            unit = _unit(out, s.wide, lane)
+            turn = _turn(out, s.wide, lane)
             g = g_quats[item, joint]
-            slope = 1.0 * g[0], 1.0 * g[1], sign * g[2], sign * g[3]
-            along = slope[0] * unit[0] + slope[1] * unit[1] + slope[2] * unit[2] + slope[3] * unit[3]
+            slope = unit_slope(turn, (1.0 * g[0], 1.0 * g[1], sign * g[2], sign * g[3]))
             for i in range(4):
-                on_out[i * s.wide + lane] += (slope[i] - along * unit[i]) * unit[4]
+                on_out[i * s.wide + lane] += slope[i]
             on_out[4 * s.wide + lane] += sign * s.reach * g_shifts[item, joint, 0]
             on_out[5 * s.wide + lane] += s.reach * g_shifts[item, joint, 1]
             on_out[6 * s.wide + lane] += s.reach * g_shifts[item, joint, 2]

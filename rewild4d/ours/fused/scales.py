@@ -10,11 +10,10 @@ from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import kernel
-from rewild4d.kernels.powers import exp2
+from rewild4d.kernels.powers import LOG2_E, exp2
 from rewild4d.kernels.simd import LANES, maximum, minimum, splat
 from rewild4d.kernels.tails import load_first, store_first
 
-TO_BITS = np.float32(2 / math.log(2))
 MOST = np.float32(126)
 """Squares lie between 2^-126 and 2^126."""
 
@@ -23,7 +22,7 @@ MOST = np.float32(126)
 def _forward(log_scales: np.ndarray, blur: float, scales: np.ndarray) -> None:
     nothing, square = splat(np.float32(0)), np.float32(blur * blur)
     for i in range(0, len(scales), LANES):
-        bits = load_first(log_scales, i, len(scales) - i, nothing) * splat(TO_BITS)
+        bits = load_first(log_scales, i, len(scales) - i, nothing) * splat(2 * LOG2_E)
         bits = minimum(splat(MOST), maximum(splat(-MOST), bits))  # in this order a NaN stays one
         store_first(scales, i, len(scales) - i, exp2(bits))
     for i in range(len(scales)):

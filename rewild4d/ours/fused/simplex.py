@@ -1,6 +1,5 @@
 """Softmax of the rows of a large matrix; the twin is `torch.softmax`."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import kernel
-from rewild4d.kernels.powers import exp2
+from rewild4d.kernels.powers import LOG2_E, exp2
 from rewild4d.kernels.simd import LANES, fma, maximum, splat, take_ticket
 from rewild4d.kernels.tails import lanes_maximum, lanes_sum, load_first, store_first
 from rewild4d.kernels.threads import run, thread_count
@@ -19,7 +18,6 @@ CHUNK = 1024
 """Rows a unit of work holds."""
 LOWEST = np.float32(-126)
 """Powers of two below are all this one: exp2 knows no smaller, and beside a one it is nothing."""
-TO_BITS = np.float32(1 / math.log(2))
 
 
 @kernel
@@ -34,9 +32,9 @@ def _forward(tickets: np.ndarray, logits: np.ndarray, width: int, shares: np.nda
             top, total = bottom, zero
             for i in range(0, width, LANES):
                 top = maximum(top, load_first(logits, place + i, width - i, bottom))
-            shift = splat(-lanes_maximum(top) * TO_BITS)
+            shift = splat(-lanes_maximum(top) * LOG2_E)
             for i in range(0, width, LANES):
-                bits = fma(load_first(logits, place + i, width - i, bottom), splat(TO_BITS), shift)
+                bits = fma(load_first(logits, place + i, width - i, bottom), splat(LOG2_E), shift)
                 share = exp2(maximum(splat(LOWEST), bits))  # in this order a NaN stays one
                 store_first(shares, place + i, width - i, share)
                 total = total + load_first(shares, place + i, width - i, zero)

@@ -4,7 +4,6 @@ The twins in plain torch are in ours/skeleton.py and ours/pose.py. A loss is fou
 backward pass scales it.
 """
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
+from rewild4d.ours.fused.quaternions import dot, rotation, rotation_slope, side, unit, unit_slope
 
 
 class Weights(NamedTuple):
@@ -41,45 +41,9 @@ def _quat(quats: np.ndarray, item: int, joint: int) -> tuple:
 
 
 @inlined
-def _dot(a: tuple, b: tuple) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
-
-
-@inlined
-def _unit(q: tuple) -> tuple:
-    """The unit quaternion, and one over the length."""
-    inverse = 1 / max(math.sqrt(_dot(q, q)), 1e-12)
-    return q[0] * inverse, q[1] * inverse, q[2] * inverse, q[3] * inverse, inverse
-
-
-@inlined
-def _add_unit_slope(unit: tuple, slope: tuple, target: np.ndarray) -> None:
-    """Add a quaternion's gradient, given that of its unit quaternion."""
-    along = _dot(unit, slope)
+def _add(slope: tuple, target: np.ndarray) -> None:
     for i in range(4):
-        target[i] += (slope[i] - along * unit[i]) * unit[4]
-
-
-@inlined
-def _rotation(q: tuple) -> tuple:
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-
-
-@inlined
-def _rotation_slope(q: tuple, g: np.ndarray) -> tuple:
-    """Gradient of a unit quaternion from that of its matrix, the upper left of ``g``."""
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    return (
-        2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1])),
-        2 * (y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) + w * (g[2, 1] - g[1, 2]) - 2 * x * (g[1, 1] + g[2, 2])),
-        2 * (x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) + w * (g[0, 2] - g[2, 0]) - 2 * y * (g[0, 0] + g[2, 2])),
-        2 * (x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) + w * (g[1, 0] - g[0, 1]) - 2 * z * (g[0, 0] + g[1, 1])),
-    )
+        target[i] += slope[i]
 
 
 @kernel
@@ -93,7 +57,7 @@ def _limits(quats: np.ndarray, parents: np.ndarray, weight: float, cosine: float
             if above < 0:
                 continue
             one, other = _quat(quats, item, joint), _quat(quats, item, above)
-            turned = _dot(one, other)
+            turned = dot(one, other)
             excess = cosine - abs(turned)
             if excess > 0:
                 total += excess * excess
@@ -117,8 +81,8 @@ def _gaps(
             above = parents[joint]
             if above < 0:
                 continue
-            unit = _unit(_quat(quats, item, above))
-            rows = _rotation(unit)
+            turn = unit(_quat(quats, item, above))
+            rows = rotation(turn)
             arm = (
                 np.float64(pivots[joint, 0]) - pivots[above, 0], np.float64(pivots[joint, 1]) - pivots[above, 1],
                 np.float64(pivots[joint, 2]) - pivots[above, 2],
@@ -133,7 +97,7 @@ def _gaps(
                 on_shifts[item, above, i] -= slope
                 for j in range(3):
                     on_matrix[i, j] = -slope * arm[j]
-            _add_unit_slope(unit, _rotation_slope(unit, on_matrix), on_quats[item, above])
+            _add(unit_slope(turn, rotation_slope(turn, on_matrix)), on_quats[item, above])
     return weight * total / count
 
 
@@ -149,7 +113,7 @@ def _second_differences(
         for joint in range(joints):
             middle = _quat(quats, item, joint)
             before, after = _quat(quats, item - 1, joint), _quat(quats, item + 1, joint)
-            one, other = -1.0 if _dot(before, middle) < 0 else 1.0, -1.0 if _dot(after, middle) < 0 else 1.0
+            one, other = side(before, middle), side(after, middle)
             for i in range(4):
                 bend = one * before[i] + other * after[i] - 2 * middle[i]
                 total += share * bend * bend
@@ -193,7 +157,7 @@ def _stand(
         item = rows[k]
         own_quats[k], own_shifts[k], own_features[k] = quats[item], shifts[item], features[item]
         for joint in range(len(pivots)):
-            matrix, turn = transforms[k, joint], _rotation(_unit(_quat(quats, item, joint)))
+            matrix, turn = transforms[k, joint], rotation(unit(_quat(quats, item, joint)))
             for i in range(3):
                 row, place = turn[i], np.float64(pivots[joint, i]) + shifts[item, joint, i]
                 for j in range(3):
@@ -216,12 +180,12 @@ def _stand_back(
         on_shifts[item] += g_shifts[k]
         on_features[item] += g_features[k]
         for joint in range(len(pivots)):
-            unit, g = _unit(_quat(quats, item, joint)), g_transforms[k, joint]
+            turn, g = unit(_quat(quats, item, joint)), g_transforms[k, joint]
             for i in range(3):
                 on_shifts[item, joint, i] += g[i, 3]
                 for j in range(3):
                     on_matrix[i, j] = g[i, j] - np.float64(g[i, 3]) * pivots[joint, j]
-            _add_unit_slope(unit, _rotation_slope(unit, on_matrix), on_quats[item, joint])
+            _add(unit_slope(turn, rotation_slope(turn, on_matrix)), on_quats[item, joint])
 
 
 def stand(

@@ -3,7 +3,6 @@
 The twin in plain torch is `transforms.skin_points` and `skin_quats`, called once for each branch.
 """
 
-import math
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.rows import sum_rows
 from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
 from rewild4d.kernels.threads import run, thread_count
+from rewild4d.ours.fused.quaternions import conjugate, times, unit_row, unit_slope
 
 CHUNK = 1024
 """Gaussians a unit of work holds; gradients of the joints are summed over these, whatever the number of threads."""
@@ -29,40 +29,6 @@ def _leader(weights: np.ndarray, n: int) -> int:
         if weights[n, joint] > weights[n, best]:
             best = joint
     return best
-
-
-@inlined
-def _unit(quats: np.ndarray, n: int) -> tuple:
-    """A quaternion of length one, and one over its length before."""
-    a, b, c, d = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
-    inverse = np.float32(1 / max(math.sqrt(a * a + b * b + c * c + d * d), 1e-12))
-    return a * inverse, b * inverse, c * inverse, d * inverse, inverse
-
-
-@inlined
-def _times(p: tuple, q: tuple) -> tuple:
-    return (
-        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
-        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
-        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
-        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
-    )
-
-
-@inlined
-def _conjugate(q: tuple) -> tuple:
-    return q[0], -q[1], -q[2], -q[3]
-
-
-@inlined
-def _unit_slope(unit: tuple, slope: tuple) -> tuple:
-    """Gradient of a quaternion from that of its unit quaternion, given with one over the length."""
-    inverse = unit[4]
-    along = unit[0] * slope[0] + unit[1] * slope[1] + unit[2] * slope[2] + unit[3] * slope[3]
-    return (
-        (slope[0] - along * unit[0]) * inverse, (slope[1] - along * unit[1]) * inverse,
-        (slope[2] - along * unit[2]) * inverse, (slope[3] - along * unit[3]) * inverse,
-    )  # fmt: skip
 
 
 @inlined
@@ -92,7 +58,7 @@ def _forward(
                 new_means[n, i] = (
                     blended[4 * i] * x + blended[4 * i + 1] * y + blended[4 * i + 2] * z + blended[4 * i + 3]
                 )
-            turned = _times(_unit(blended[12:].reshape(1, 4), 0), _unit(quats, n))
+            turned = times(unit_row(blended[12:].reshape(1, 4), 0), unit_row(quats, n))
             for i in range(4):
                 new_quats[n, i] = turned[i]
 
@@ -115,15 +81,15 @@ def _backward(
         for n in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(means))):
             leader = _leader(weights, n)
             _blend(weights, n, leader, rows, blended)
-            turn, rest = _unit(blended[12:].reshape(1, 4), 0), _unit(quats, n)
+            turn, rest = unit_row(blended[12:].reshape(1, 4), 0), unit_row(quats, n)
             g = g_live_quats[n, 0], g_live_quats[n, 1], g_live_quats[n, 2], g_live_quats[n, 3]
-            on_live = _unit_slope(turn, _times(g, _conjugate(rest)))
+            on_live = unit_slope(turn, times(g, conjugate(rest)))
             both = (
                 g[0] + g_still_quats[n, 0], g[1] + g_still_quats[n, 1],
                 g[2] + g_still_quats[n, 2], g[3] + g_still_quats[n, 3],
             )  # fmt: skip
-            on_turn = _unit_slope(turn, _times(both, _conjugate(rest)))
-            on_rest = _unit_slope(rest, _times(_conjugate(turn), both))
+            on_turn = unit_slope(turn, times(both, conjugate(rest)))
+            on_rest = unit_slope(rest, times(conjugate(turn), both))
             for i in range(4):
                 live[12 + i], slope[12 + i], on_quats[n, i] = on_live[i], on_turn[i], on_rest[i]
             for i in range(3):

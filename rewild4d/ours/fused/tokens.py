@@ -4,24 +4,18 @@ Parameters are read where they lie, by address; their gradients lie one behind t
 """
 
 import math
-from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import carray
-from numba.core import types
-from numba.core.typing import signature
 
-from rewild4d.kernels.compiling import inlined, kernel
-from rewild4d.kernels.matrix import add_product, transpose_tile
-from rewild4d.kernels.powers import exp2
-from rewild4d.kernels.rows import sum_rows
+from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.matrix import add_product, transpose
+from rewild4d.kernels.powers import LOG2_E, exp2
+from rewild4d.kernels.rows import add_row_sums, sum_rows
 from rewild4d.kernels.simd import (
     LANES,
     absolute,
     divide,
     fma,
-    intrinsic,
     load,
     maximum,
     select_gt,
@@ -29,23 +23,8 @@ from rewild4d.kernels.simd import (
     store,
 )
 
-LOG2_E = np.float32(1.4426950408889634)
 NORM_EPS = 1e-5
 """As `torch.nn.LayerNorm` has it."""
-
-
-@intrinsic
-def _pointer(typing: Any, address: Any) -> Any:
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.inttoptr(args[0], ir.FloatType().as_pointer())
-
-    return signature(types.CPointer(types.float32), types.int64), generate
-
-
-@inlined
-def floats(address: int, count: int) -> np.ndarray:
-    """The ``count`` numbers at an address; whoever calls the kernel keeps them alive."""
-    return carray(_pointer(address), (count,))
 
 
 @kernel
@@ -66,27 +45,6 @@ def linear_back(weight: np.ndarray, rows: int, slope: np.ndarray, wide: int, res
     depth = len(weight) // rows
     result[: depth * wide] = 0
     add_product(weight, 0, 1, depth, slope, 0, wide, rows, result, 0, wide, depth, wide)
-
-
-@kernel
-def add_row_sums(rows: np.ndarray, count: int, wide: int, scratch: np.ndarray, sums: np.ndarray) -> None:
-    """Add the sum of each of ``count`` rows to ``sums``; both lengths are multiples of sixteen."""
-    for row in range(count):
-        total = splat(np.float32(0))
-        for place in range(row * wide, (row + 1) * wide, LANES):
-            total = total + load(rows, place)
-        store(scratch, row * LANES, total)
-    sum_rows(scratch, count, scratch, 0)
-    for row in range(0, count, LANES):
-        store(sums, row, load(sums, row) + load(scratch, row))
-
-
-@kernel
-def transpose(given: np.ndarray, rows: int, wide: int, turned: np.ndarray) -> None:
-    """Write [rows, wide] as [wide, rows]; multiples of sixteen."""
-    for row in range(0, rows, LANES):
-        for lane in range(0, wide, LANES):
-            transpose_tile(given, row * wide + lane, wide, turned, lane * rows + row, rows)
 
 
 @kernel

@@ -1,0 +1,87 @@
+"""Quaternions, wxyz, inside kernels: tuples (or rows of an array) of four numbers; a unit one carries a fifth."""
+
+import math
+
+import numpy as np
+
+from rewild4d.kernels.compiling import inlined
+
+SHORTEST = 1e-12
+"""Lengths below count as this one, as in torch's `normalize`."""
+
+
+@inlined
+def dot(p: tuple, q: tuple) -> float:
+    """The product as vectors."""
+    return p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3]
+
+
+@inlined
+def side(p: tuple, q: tuple) -> float:
+    """The sign that puts one on the other's side."""
+    return -1.0 if dot(p, q) < 0 else 1.0
+
+
+@inlined
+def times(p: tuple, q: tuple) -> tuple:
+    """Rotation q, then p."""
+    return (
+        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
+    )
+
+
+@inlined
+def conjugate(q: tuple) -> tuple:
+    """The rotation back."""
+    return q[0], -q[1], -q[2], -q[3]
+
+
+@inlined
+def unit(q: tuple) -> tuple:
+    """The same with length one, and one over its length before, in double precision."""
+    inverse = 1 / max(math.sqrt(dot(q, q)), SHORTEST)
+    return q[0] * inverse, q[1] * inverse, q[2] * inverse, q[3] * inverse, inverse
+
+
+@inlined
+def unit_row(quats: np.ndarray, n: int) -> tuple:
+    """`unit` of a row of a float32 array, in single precision."""
+    a, b, c, d = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
+    inverse = np.float32(1 / max(math.sqrt(a * a + b * b + c * c + d * d), SHORTEST))
+    return a * inverse, b * inverse, c * inverse, d * inverse, inverse
+
+
+@inlined
+def unit_slope(unit: tuple, slope: tuple) -> tuple:
+    """Gradient of a quaternion from that of its unit quaternion, given with one over the length."""
+    along, inverse = dot(unit, slope), unit[4]
+    return (
+        (slope[0] - along * unit[0]) * inverse, (slope[1] - along * unit[1]) * inverse,
+        (slope[2] - along * unit[2]) * inverse, (slope[3] - along * unit[3]) * inverse,
+    )  # fmt: skip
+
+
+@inlined
+def rotation(q: tuple) -> tuple:
+    """Rows of the matrix of a unit quaternion."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@inlined
+def rotation_slope(q: tuple, g: np.ndarray) -> tuple:
+    """Gradient of a unit quaternion from that of its matrix, the upper left of ``g``."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return (
+        2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1])),
+        2 * (y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) + w * (g[2, 1] - g[1, 2]) - 2 * x * (g[1, 1] + g[2, 2])),
+        2 * (x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) + w * (g[0, 2] - g[2, 0]) - 2 * y * (g[0, 0] + g[2, 2])),
+        2 * (x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) + w * (g[1, 0] - g[0, 1]) - 2 * z * (g[0, 0] + g[1, 1])),
+    )
