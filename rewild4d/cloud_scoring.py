@@ -1,5 +1,6 @@
 """Scores of a mesh or a cloud in a file beside the true one: aligned by one similarity, then Chamfer and F-scores."""
 
+import sys
 import time
 from pathlib import Path
 from typing import Literal
@@ -11,7 +12,7 @@ from rewild4d.leaderboard.records import Score
 from rewild4d.leaderboard.reports import SCHEMA, Report
 from rewild4d.machine import code_version, machine
 from rewild4d.metrics.geometry import POINTS, compare
-from rewild4d.ply import read_surface
+from rewild4d.ply import is_mesh, read_surface
 
 UP = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -25,7 +26,7 @@ def score_clouds(
         prediction: a mesh, sampled over its surface, Gaussians, whose centres count, or points, taken as they are.
         truth: the same.
         up: axis that points up in both files, for the alignment's starts.
-        points: that are sampled; of a larger cloud so many are drawn.
+        points: that are sampled from a mesh; of a larger cloud so many are drawn.
         seed: of all draws.
 
     Raises:
@@ -33,8 +34,10 @@ def score_clouds(
     """
     started = time.monotonic()
     shape = read_surface(prediction, points, seed)
-    target, second = (read_surface(truth, points, seed + i) for i in (1, 2))
-    independent = None if torch.equal(target, second) else second  # a plain cloud has no second sampling
+    # Only a mesh can be sampled twice: of points, `compare` makes two draws that share none.
+    sampled = is_mesh(truth)
+    target = read_surface(truth, points if sampled else sys.maxsize, seed + 1)
+    independent = read_surface(truth, points, seed + 2) if sampled else None
     try:
         found = compare(
             shape, target, up=torch.tensor(UP[up]) if up else None, second=independent, points=points, seed=seed

@@ -7,7 +7,9 @@ carries how many there were.
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache
+from typing import Literal
 
 import msgspec
 import torch
@@ -43,11 +45,15 @@ class NovelViews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         frames: moments, evenly spaced over the clip, that KID-V sees from every view.
         clip: frames T of a clip that FVD sees; a shorter video is padded with its last frame.
         stride: frames from the start of one clip to that of the next.
+        upright: the circle is level in the world (`world_up`) and its middle is that of the images. Left out, as in
+            the first versions: up is the mean of the cameras' own, which tilts the circle of a camera that did not go
+            around the animal, and the images have the first one's principal point.
     """
 
     frames: int = 8
     clip: int = 16
     stride: int = 8
+    upright: Literal[True] | None = None
 
 
 Render = Callable[[Splats, Camera], tuple[Tensor, Tensor]]
@@ -65,11 +71,12 @@ def novel_view_distances(
     images: ImageExtractor | None,
     videos: VideoExtractor | None,
     log: Log,
+    up: Tensor | None = None,
 ) -> tuple[list[Distance], list[Compared]]:
     """Compare sixteen novel views with the input video.
 
-    The orbit's middle is the median Gaussian over the clip, its radius and elevation are the medians of the input
-    cameras', its first view stands where the first input camera does, and it has that camera's intrinsics and size.
+    The orbit's middle is the median Gaussian over the clip; its radius and elevation are the medians of the input
+    cameras', its first view stands where the first input camera does, and it has that camera's focal lengths and size.
 
     Args:
         reconstruction: what is scored.
@@ -81,6 +88,7 @@ def novel_view_distances(
         images: network of KID-V; None leaves it out.
         videos: network of FVD and KVD; None leaves them out.
         log: progress.
+        up: of the world, where the data set knows it, see `world_up`, [3].
 
     Returns:
         The distances, and the sets of features that they were computed from: what pooling over sequences needs.
@@ -88,7 +96,7 @@ def novel_view_distances(
     Raises:
         UserError: neither the clip nor the reconstruction has a camera.
     """
-    orbit = _Orbit(reconstruction, clip, background, render)
+    orbit = _Orbit(reconstruction, clip, background, render, settings, up)
     reference = [frame.over(background).clamp(0, 1) for frame in clip.frames]
     conditions = Conditions(f"grey {background:g}", "full frame", clip.fps)
     found: list[Distance] = []
@@ -140,13 +148,24 @@ def as_scores(found: Sequence[Distance], names: Sequence[str], missing: dict[str
 class _Orbit:
     """Renders of the closed circle of cameras; the Gaussians of the last few moments are kept."""
 
-    def __init__(self, reconstruction: Reconstruction, clip: Clip, background: float, render: Render) -> None:
+    def __init__(
+        self, reconstruction: Reconstruction, clip: Clip, background: float, render: Render, settings: NovelViews,
+        up: Tensor | None,
+    ) -> None:  # fmt: skip
         self.times, self.background, self.render = clip.times, background, render
         self.at = lru_cache(maxsize=24)(reconstruction.at)
         known = [input_camera(reconstruction, frame) for frame in clip.frames]
         if not any(known) and not len(self.at(self.times[0])):
             known = [_any_camera(clip.frames[0])]
-        self.cameras = _cameras(known, self._middle())
+        cameras = [camera for camera in known if camera is not None]
+        if not cameras:
+            raise UserError(
+                "novel views need a camera of the input video, but neither the data nor the method has one."
+            )
+        if settings.upright:
+            cameras = [_centred(camera) for camera in cameras]
+        axis = world_up(clip, cameras, up) if settings.upright else _mean_up(cameras)
+        self.cameras = _cameras(cameras, self._middle(), axis)
 
     def _middle(self) -> Tensor:
         """Median over all Gaussians of some moments, [3]; the origin where there are none."""
@@ -203,12 +222,36 @@ def _any_camera(frame: Frame) -> Camera:
     return Camera(pose, intrinsics, width, height)
 
 
-def _cameras(cameras: Sequence[Camera | None], middle: Tensor) -> list[Camera]:
-    """The sixteen views of a clip."""
-    known = [camera for camera in cameras if camera is not None]
-    if not known:
-        raise UserError("novel views need a camera of the input video, but neither the data nor the method has one.")
-    up = torch.nn.functional.normalize(-torch.stack([c.world_to_camera[1, :3] for c in known]).mean(0), dim=0)
+def world_up(clip: Clip, cameras: Sequence[Camera], known: Tensor | None) -> Tensor:
+    """The direction that points up in the world, unit, float64, [3].
+
+    Of footage the world is the prior's object frame, whose y points up. Where nobody knows it, it is the mean of the
+    cameras' own: right for a ring of them, tilted by its elevation for one alone.
+
+    Args:
+        clip: what the cameras saw.
+        cameras: of its frames, at least one.
+        known: by the data set, [3].
+    """
+    if known is None and all(frame.crop is not None for frame in clip.frames):
+        known = torch.tensor((0.0, 1.0, 0.0))
+    return _mean_up(cameras) if known is None else torch.nn.functional.normalize(known.double(), dim=0)
+
+
+def _mean_up(cameras: Sequence[Camera]) -> Tensor:
+    axes = torch.stack([-camera.world_to_camera[1, :3] for camera in cameras])
+    return torch.nn.functional.normalize(axes.double().mean(0), dim=0)
+
+
+def _centred(camera: Camera) -> Camera:
+    """The camera with its principal point in the middle of the image: a crop's lies where the original's was."""
+    intrinsics = camera.intrinsics.clone()
+    intrinsics[0, 2], intrinsics[1, 2] = camera.width / 2, camera.height / 2
+    return replace(camera, intrinsics=intrinsics)
+
+
+def _cameras(known: Sequence[Camera], middle: Tensor, up: Tensor) -> list[Camera]:
+    """The sixteen views of a clip, from its input cameras."""
     offsets = torch.stack([camera.center - middle for camera in known])
     radii = offsets.norm(dim=1)
     elevations = torch.asin((offsets @ up / radii.clamp_min(1e-9)).clamp(-1, 1))
@@ -217,8 +260,16 @@ def _cameras(cameras: Sequence[Camera | None], middle: Tensor) -> list[Camera]:
     first = known[0]
     return orbit_cameras(
         middle, float(radii.median()), elevation, intrinsics=first.intrinsics, width=first.width, height=first.height,
-        up=up, ahead=offsets[0], views=VIEWS,
+        up=up, ahead=_ahead(offsets, up), views=VIEWS,
     )  # fmt: skip
+
+
+def _ahead(offsets: Tensor, up: Tensor) -> Tensor:
+    """The way to the first camera that does not stand straight above; any level one where all do, [3]."""
+    for offset in offsets:
+        if float(torch.linalg.cross(offset, up).norm()) > 1e-6 * float(offset.norm()):
+            return offset
+    return torch.linalg.cross(up, torch.eye(3).double()[int(up.abs().argmin())])
 
 
 def _windows(frames: int, settings: NovelViews) -> list[list[int]]:

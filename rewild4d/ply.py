@@ -83,6 +83,15 @@ def read_surface(path: Path, count: int, seed: int) -> Tensor:
         raise UserError(f"{path}: {error}.") from error
 
 
+def is_mesh(path: Path) -> bool:
+    """Whether `read_surface` samples what a PLY file holds; its errors."""
+    elements = read_elements(path)
+    vertices = _vertices(path, elements)
+    if set(SPLAT_PROPERTIES) <= vertices.columns.keys():
+        return False
+    return len(_triangles(path, elements, len(_points(path, vertices)))) > 0
+
+
 def write_splats(path: Path, splats: Splats) -> None:
     """Write Gaussians in the INRIA layout, binary little-endian, atomically.
 

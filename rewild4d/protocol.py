@@ -74,6 +74,8 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 del given[name]
         if self.selection.split is None:
             del given["selection"]["split"]
+        if self.novel is not None and self.novel.upright is None:
+            del given["novel"]["upright"]
         return digest(msgspec.json.encode(given))
 
 
@@ -179,7 +181,7 @@ def evaluate(
     if protocol.novel is not None and sets:
         distances, compared = novel_views.novel_view_distances(
             reconstruction, clip, protocol.novel, names=sets, background=protocol.background, render=render,
-            images=networks.images, videos=networks.videos, log=log,
+            images=networks.images, videos=networks.videos, log=log, up=truth.up,
         )  # fmt: skip
         scores |= novel_views.as_scores(distances, sets, dict(networks.missing))
     used = {name: network.digest for name, network in networks.lpips.items()}

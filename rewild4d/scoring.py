@@ -184,13 +184,19 @@ def image_distances(
         return [_absent(name, counts, networks.missing["kid"], conditions) for name in ("KID", "KID-u")[: 1 + paired]]
     x, y = (
         image_features(side, networks.images, stage(f"KID, {title}"))
-        for side, title in zip(shown, ("predictions", "truths"), strict=True)
+        for side, title in zip(_numbered(shown, paired), ("predictions", "truths"), strict=True)
     )
     found = kid(x, y, conditions=conditions)
     if not paired:
         return [found]
     beware = "; ".join(filter(None, (found.note, PAIRED)))
     return [replace(found, note=beware), kid(x, y, paired=True, conditions=conditions)]
+
+
+def _numbered(shown: Sequence[Sequence[Images]], paired: bool) -> Sequence[Sequence[Images]]:
+    """The clips of both sides; unpaired truths are numbered after the predictions, for they are other sequences."""
+    prediction, truth = shown
+    return shown if paired else (prediction, [*([] for _ in prediction), *truth])
 
 
 def video_distances(
@@ -203,7 +209,7 @@ def video_distances(
     if networks.videos is None:
         counts = [len(side) for side in shown]
         return [_absent(name, counts, networks.missing["fvd"], conditions) for name in ("FVD", "KVD")]
-    prediction, truth = ([[clip] for clip in side] for side in shown)
+    prediction, truth = ([[clip] if len(clip) else [] for clip in side] for side in _numbered(shown, paired))
     return clip_distances(
         prediction, truth, networks.videos, paired=paired, conditions=conditions, progress=stage("FVD")
     )

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from rewild4d.contracts import Articulated, Reconstruction
-from rewild4d.novel_views import input_camera
+from rewild4d.novel_views import input_camera, world_up
 from rewild4d.orbit import orbit_cameras
 from rewild4d.pictures import PANEL, header, over
 from rewild4d.types import Camera, Clip, Splats
@@ -146,9 +146,7 @@ def _axes(
     count = len(clip.times)
     if all(frame.crop is not None for frame in clip.frames):  # footage: the prior's object frame is the world
         return torch.eye(3).double().expand(count, 3, 3), True
-    if up is None:
-        up = -torch.stack([camera.world_to_camera[1, :3] for camera in cameras]).mean(0)
-    up = normalize(up.double(), dim=0)
+    up = world_up(clip, cameras, up)
     toward = cameras[0].center - middles[0]
     level = toward - (toward @ up) * up
     if float(level.norm()) < 1e-6 * float(toward.norm()):

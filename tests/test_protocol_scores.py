@@ -19,7 +19,8 @@ from rewild4d.metrics.sets import FILE, KINDS, distances, read_features
 from rewild4d.novel_views import NovelViews
 from rewild4d.protocol import Protocol, evaluate, find_protocol, load_protocols
 from rewild4d.scoring import Networks
-from rewild4d.types import Case, Clip, Splats
+from rewild4d.transforms import look_at
+from rewild4d.types import Camera, Case, Clip, Splats
 
 CPU = torch.device("cpu")
 FETCH = "weights missing, run: rewild4d-bench weights fetch"
@@ -177,8 +178,10 @@ class Ball:
 
 
 def test_the_orbit_closes_around_the_animal_at_the_input_distance(case: Case) -> None:
-    cameras = novel_views._cameras([frame.camera for frame in case.clip.frames], torch.zeros(3, dtype=torch.float64))
-    given = torch.stack([frame.camera.center for frame in case.clip.frames if frame.camera is not None])
+    inputs = [frame.camera for frame in case.clip.frames if frame.camera is not None]
+    up = novel_views.world_up(case.clip, inputs, case.truth.up)
+    cameras = novel_views._cameras(inputs, torch.zeros(3, dtype=torch.float64), up)
+    given = torch.stack([camera.center for camera in inputs])
     centers = torch.stack([camera.center for camera in cameras])
     assert len(cameras) == 16
     torch.testing.assert_close(centers.norm(dim=1), given.norm(dim=1).median().expand(16))
@@ -189,8 +192,24 @@ def test_the_orbit_closes_around_the_animal_at_the_input_distance(case: Case) ->
     assert float(steps[0]) == pytest.approx(2 * float(radius) * math.sin(math.pi / 16))
 
 
+@pytest.mark.parametrize("degrees", [0, 20, 40, 90])
+def test_the_orbit_of_a_still_camera_keeps_its_elevation(case: Case, degrees: int) -> None:
+    up = torch.tensor((0.0, 1.0, 0.0), dtype=torch.float64)
+    high = math.radians(degrees)
+    eye = 5 * torch.tensor((0.0, math.sin(high), math.cos(high)), dtype=torch.float64)
+    intrinsics = torch.tensor(((300.0, 0, 10), (0, 300, 90), (0, 0, 1)), dtype=torch.float64)  # of a crop
+    middle = torch.zeros(3, dtype=torch.float64)
+    above = up if degrees < 90 else torch.tensor((0.0, 0.0, -1.0), dtype=torch.float64)
+    camera = Camera(look_at(eye, middle, above), intrinsics, 128, 128)
+    views = novel_views._cameras([novel_views._centred(camera)], middle, novel_views.world_up(case.clip, [camera], up))
+    elevations = [math.degrees(math.asin(float(view.center[1]) / 5)) for view in views]
+    assert elevations == pytest.approx([min(degrees, 80)] * 16)
+    for view in views:
+        torch.testing.assert_close(view.project(middle[None])[0][0], torch.tensor((64.0, 64.0)).double())
+
+
 def test_a_ball_against_itself_is_at_distance_zero(case: Case) -> None:
-    still = novel_views._Orbit(Ball(), case.clip, 1.0, protocol.render)
+    still = novel_views._Orbit(Ball(), case.clip, 1.0, protocol.render, NovelViews(), None)
     frames = []
     for i, frame in enumerate(case.clip.frames):
         image = still.image(i, i)

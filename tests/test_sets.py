@@ -270,6 +270,6 @@ def test_nothing_is_scored_as_before_and_costs_one_call_a_set(case: Case) -> Non
     assert found["KID-V"].value == kid(still, image_features([reference], LinearNetwork())).value
     calls = images.calls, videos.calls
     assert videos.calls == 2 + len(windows) and score() and videos.calls == calls[1] + 2
-    orbit = novel_views._Orbit(EmptyReconstruction(), case.clip, 1.0, protocol.render)
+    orbit = novel_views._Orbit(EmptyReconstruction(), case.clip, 1.0, protocol.render, NovelViews(), None)
     color, alpha = protocol.render(EmptyReconstruction().at(0.0), orbit.cameras[3])
     assert torch.equal(orbit.image(3, 0), (color + (1 - alpha) * 1.0).clamp(0, 1))

@@ -13,6 +13,7 @@ from rewild4d import novel_views
 from rewild4d.baselines.empty import EmptyReconstruction
 from rewild4d.datasets.online import Online
 from rewild4d.errors import UserError
+from rewild4d.novel_views import NovelViews
 from rewild4d.protocol import Protocol, evaluate, find_protocol
 from rewild4d.types import Camera, Clip, Splats, Truth
 from rewild4d.view import save_pictures
@@ -75,16 +76,20 @@ def test_without_any_camera_it_says_so(case: tuple[Clip, Truth]) -> None:
         evaluate(Plate(clip, knows=False), clip, truth, PROTOCOL, lambda *_: None, CPU)
 
 
+def nothing(splats: Splats, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.zeros(3, 1, 1), torch.zeros(1, 1, 1)
+
+
 def test_the_orbit_starts_at_the_reconstructions_camera(case: tuple[Clip, Truth]) -> None:
     clip = case[0]
-    orbit = novel_views._Orbit(Plate(clip), clip, 1.0, lambda *_: (torch.zeros(3, 1, 1), torch.zeros(1, 1, 1)))
+    orbit = novel_views._Orbit(Plate(clip), clip, 1.0, nothing, NovelViews(upright=True), None)
     assert (orbit.cameras[0].width, orbit.cameras[0].height) == (64, 64)
     middle = orbit._middle()
     distances = torch.stack([(camera.center - middle).norm() for camera in orbit.cameras])
     assert torch.allclose(distances, middle.norm().expand(16))
-    blank = novel_views._Orbit(
-        EmptyReconstruction(), clip, 1.0, lambda *_: (torch.zeros(3, 1, 1), torch.zeros(1, 1, 1))
-    )
+    heights = torch.stack([camera.center[1] - middle[1] for camera in orbit.cameras])
+    assert torch.allclose(heights, heights[:1])  # footage's y points up: a level circle
+    blank = novel_views._Orbit(EmptyReconstruction(), clip, 1.0, nothing, NovelViews(upright=True), None)
     assert len(blank.cameras) == 16
 
 
@@ -108,6 +113,6 @@ def test_digests_of_older_protocols_stay() -> None:
     """A setting that came later and is left out changes no digest."""
     old = find_protocol("artemis", "artemis-sweep-256-v1")
     assert old.selection.split is None
-    assert find_protocol("davis", None).digest != find_protocol("davis", "davis-256-v1").digest
+    assert find_protocol("davis", None).digest != find_protocol("davis", "davis-256-v2").digest
     clip = Clip("a", "b", (), 1.0, "", "", ())
     assert replace(clip, notes=("x",)).digest == clip.digest

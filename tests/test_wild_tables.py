@@ -58,8 +58,8 @@ def test_both_tables_take_the_eight_animals_of_davis(name: str) -> None:
 )
 def test_both_tables_read_the_same_runs(name: str, scores: tuple[str, ...]) -> None:
     spec = chosen(name, load_specs()[name], Choice())
-    assert (spec.dataset, spec.conditions[0].protocol, spec.scores) == ("davis", "davis-512-v1", scores)
-    protocol = load_protocols()["davis-512-v1"]
+    assert (spec.dataset, spec.conditions[0].protocol, spec.scores) == ("davis", "davis-512-v2", scores)
+    protocol = load_protocols()["davis-512-v2"]
     assert set(scores) <= set(protocol.scores) and protocol.default
     assert (protocol.selection.split, protocol.selection.framing, protocol.selection.size) == (5, "crop", 512)
 
@@ -72,7 +72,7 @@ def test_only_the_cases_that_the_data_has_are_planned(tmp_path: Path, capsys: py
     assert err.strip() == "table 'input-view': the data has no bear, dog, dog-agility, elephant, goat, rhino"
     lines = out.splitlines()
     assert {Path(line.split()[-1]).parent.relative_to(tmp_path / "runs").as_posix() for line in lines} == {
-        "davis-512-v1/camel", "davis-512-v1/cows",
+        "davis-512-v2/camel", "davis-512-v2/cows",
     }  # fmt: skip
     labels = ["empty", "prior-only", *(row.label for row in load_specs()["input-view"].rows)]
     assert [line[8:28].strip() for line in lines] == labels * 2
@@ -104,7 +104,7 @@ def test_the_cases_of_a_table() -> None:
 def test_a_protocol_of_another_data_set_brings_that_data_set(protocol: str, dataset: str) -> None:
     spec = chosen("novel-view", load_specs()["novel-view"], Choice(protocol=protocol))
     (condition,) = spec.conditions
-    assert (spec.dataset, condition.protocol, condition.cases) == (dataset, f"{protocol}-v1", ())
+    assert (spec.dataset, condition.protocol, condition.cases) == (dataset, f"{protocol}-v2", ())
     assert set(spec.scores) <= set(load_protocols()[condition.protocol].scores)
     other = chosen("novel-view", load_specs()["novel-view"], Choice(protocol="davis-256"))
     assert other.conditions[0].cases[0] == "bear"
@@ -115,7 +115,7 @@ def test_a_video_of_ones_own_can_fill_the_table(tmp_path: Path, capsys: pytest.C
     frames, masks = (root / kind / "480p" / "camel" for kind in ("JPEGImages", "Annotations"))
     words = ("--table", "input-view", "--protocol", "online-512", "--video", str(frames), "--masks", str(masks))
     assert call("run", *words, "--fps", "10", "--out", str(tmp_path / "runs"), "--seeds", "0", "--plan") == 0
-    assert "online-512-v1" in capsys.readouterr().out
+    assert "online-512-v2" in capsys.readouterr().out
     assert call("run", *words[:4], "--data", str(root), "--out", str(tmp_path / "runs"), "--plan") == 2
     assert call("run", "--table", "artemis", "--masks", str(masks), "--out", str(tmp_path / "runs"), "--plan") == 2
     assert "--masks: the data set 'artemis' does not take it" in capsys.readouterr().err
@@ -139,7 +139,7 @@ def test_distances_that_were_not_computed_say_why(tmp_path: Path, capsys: pytest
         "kid_v": Score(0.125, "1", "lower", 128, [], "n = 128, m = 40"),
         "fvd_f": Score(None, "1", "lower", 0, [], "not computed: weights missing"),
     }
-    protocol = {**msgspec.to_builtins(load_protocols()["davis-512-v1"]), "digest": "d"}
+    protocol = {**msgspec.to_builtins(load_protocols()["davis-512-v2"]), "digest": "d"}
     made = record(
         dataset="davis", case="camel", config=msgspec.to_builtins(entry.config), preset="standard", scores=scores,
         protocol=protocol, prior={"choice": "template"},
