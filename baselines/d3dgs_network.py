@@ -5,6 +5,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
+from rewild4d.ours.config import Count, Whole
 from rewild4d.ours.pose import seed_linears
 
 OUTPUTS = 10
@@ -20,19 +21,19 @@ def octave_code(values: Tensor, octaves: int) -> Tensor:
 class NetworkShape(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Sizes of the network; the defaults are the original's."""
 
-    depth: int = 8
+    depth: Count = 8
     """Layers before the heads."""
-    width: int = 256
+    width: Count = 256
     """Of each: 10,000 Gaussians cost about 32 GFLOP a step at 256, 8 at 128, so short presets are narrower."""
-    skip: int = 4
+    skip: Whole = 4
     """The input joins once more after this layer (counted from 0)."""
-    place_octaves: int = 10
+    place_octaves: Whole = 10
     """Of the position code."""
-    time_octaves: int = 6
+    time_octaves: Whole = 6
     """Of the time code."""
-    time_width: int = 256
+    time_width: Count = 256
     """Hidden width of the time's own network."""
-    time_features: int = 30
+    time_features: Count = 30
     """What it makes of the time."""
 
 

@@ -42,7 +42,7 @@ from rewild4d.contracts import Log, MethodInfo
 from rewild4d.harmonics import C0
 from rewild4d.kernels.arrays import fits
 from rewild4d.kernels.threads import torch_on_one
-from rewild4d.ours.canonical import Gaussians
+from rewild4d.ours.canonical import REST_GAIN, Gaussians
 from rewild4d.ours.checkpoint import fit_digest
 from rewild4d.ours.fused.skinning import skin_both
 from rewild4d.ours.geometry_losses import neighbours
@@ -144,7 +144,7 @@ class GartTraining(SplatTraining):
             self.near = torch.cat((torch.arange(len(own), device=others.device)[:, None], others), dim=1)
         scales = own.scales_log().exp() / OBJECT_DIAGONAL
         total = config.small * scales.amax(-1).square().mean()
-        colors = torch.cat((own.colors[:, :1] / C0, own.colors[:, 1:]), dim=1).flatten(1)
+        colors = torch.cat((own.colors[:, :1] / C0, own.colors[:, 1:] / REST_GAIN), dim=1).flatten(1)
         for weight, values in (
             (config.quats, own.quats),
             (config.scales, scales),

@@ -1,117 +1,132 @@
 """Settings of GART; "fraction" means a share of the original's 10k steps, or of as many as `iterations` says."""
 
+from typing import Annotated
+
 import msgspec
+from msgspec import Meta
 
 from rewild4d.baselines.splatting import GaussianRates, ImageLoss, Resets, SplatConfig
-from rewild4d.ours.config import Canonical, Density, Skinning
+from rewild4d.ours.config import (
+    Canonical,
+    Count,
+    Degree,
+    Density,
+    Opacity,
+    Positive,
+    Rate,
+    Share,
+    Skinning,
+    Weight,
+    Whole,
+)
 
 
 class Poses(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Poses and skinning: when and how fast they learn."""
 
-    rate: float = 1e-4
+    rate: Positive = 1e-4
     """Of the joints' rotations, radians a step (Adam); the shifts have `OBJECT_DIAGONAL` times that."""
-    start: float = 0.05
+    start: Weight = 0.05
     """Fraction before which poses are the prior's (500 of 10k)."""
-    skinning_rate: tuple[float, float] = (1e-4, 1e-5)
+    skinning_rate: Rate = (1e-4, 1e-5)
     """Of the skinning residual, falling exponentially."""
-    skinning_start: float = 0.2
+    skinning_start: Annotated[float, Meta(ge=0, lt=1)] = 0.2
     """Fraction before which skinning is the template's (2k of 10k)."""
 
 
 class Regularisers(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Weights of what keeps neighbours alike and the residual small."""
 
-    neighbours: int = 3
+    neighbours: Count = 3
     """Gaussians that are compared, itself counted."""
-    quats: float = 1e-3
+    quats: Weight = 1e-3
     """Standard deviation of the orientations among neighbours."""
-    scales: float = 1e-3
+    scales: Weight = 1e-3
     """Of the scales."""
-    opacities: float = 1e-3
+    opacities: Weight = 1e-3
     """Of the opacities."""
-    colors: float = 1e-3
+    colors: Weight = 1e-3
     """Of the colours, as harmonics' coefficients."""
-    variation: float = 0.5
+    variation: Weight = 0.5
     """Total variation of the skinning residual."""
-    norm: float = 0.1
+    norm: Weight = 0.1
     """Size of the skinning residual."""
-    every: int = 1
+    every: Count = 1
     """Steps between evaluations of these two, weights multiplied accordingly: their cost grows with the grid."""
-    small: float = 0.05
+    small: Weight = 0.05
     """Mean square of a Gaussian's largest scale."""
 
 
 class GartCanonical(Canonical, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The canonical Gaussians, on the template's surface."""
 
-    opacity: float = 0.99
+    opacity: Opacity = 0.99
     """At the start."""
-    sh_degree: int = 3
+    sh_degree: Degree = 3
     """Spherical harmonics of colour, 0 to 3."""
-    sh_every: float = 0.1
+    sh_every: Positive = 0.1
     """Fraction after which one more degree joins (1k of 10k)."""
 
 
 class GartRates(GaussianRates, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Learning rates of the Gaussians' attributes (Adam)."""
 
-    quats: float = 5e-3
+    quats: Weight = 5e-3
     """Orientations."""
-    colors: float = 1.4e-3
+    colors: Weight = 1.4e-3
     """Colours: 5e-3 on harmonics' coefficients."""
 
 
 class GartLoss(ImageLoss, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Losses of one rendered view, sums over pixels divided by the area of the animal's box as in `ours`."""
 
-    l1: float = 1.0
+    l1: Weight = 1.0
     """Absolute difference of colour."""
-    ssim: float = 0.1
+    ssim: Weight = 0.1
     """One minus SSIM."""
 
 
 class GartDensity(Density, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Densification with a cap."""
 
-    start: float = 0.01
+    start: Weight = 0.01
     """Fraction of the first round (100 of 10k)."""
-    end: float = 0.8
+    end: Weight = 0.8
     """Fraction of the last (8k of 10k)."""
-    every: float = 0.03
+    every: Positive = 0.03
     """Fraction between rounds (300 of 10k)."""
-    gradient: float = 5e-4
+    gradient: Weight = 5e-4
     """Mean image gradient above which a Gaussian is refined, in half sides of the animal's box."""
-    prune_opacity: float = 0.05
+    prune_opacity: Share = 0.05
     """Gaussians below this opacity are removed."""
 
 
 class GartResets(Resets, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Opacity resets: every Gaussian has to earn its opacity again."""
 
-    every: float = 0.1
+    every: Weight = 0.1
     """Fraction between resets (1k of 10k); 0 for none."""
-    until: float = 0.95
+    until: Weight = 0.95
     """Fraction after which there are none (the last is at 9,002 of 10k)."""
-    opacity: float = 0.06
+    opacity: Opacity = 0.06
     """Opacities above this are set to it (the original's 0.05 is also where it prunes)."""
 
 
 class GartSkinning(Skinning, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The skinning grid."""
 
-    resolution: int = 64
+    resolution: Annotated[int, Meta(ge=2)] = 64
     """Voxels along each axis."""
-    neighbours: int = 30
+    neighbours: Count = 30
     """Vertices averaged by inverse distance to fill a voxel."""
-    sweeps: int = 30
+    sweeps: Whole = 30
     """Neighbour averages."""
 
 
 class GartConfig(SplatConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """`gart`; the defaults are the original's dog profile."""
 
-    iterations: int = 10_000
+    iterations: Whole = 10_000
     """Steps (the original's)."""
     template: str = ""
     """Path of a D-SMAL file that you own; empty for the prior's own 20 bones."""
@@ -128,11 +143,11 @@ class GartConfig(SplatConfig, frozen=True, forbid_unknown_fields=True, kw_only=T
 class Refine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The pose of each frame fitted once more to that frame, by SGD."""
 
-    steps: int = 160
+    steps: Whole = 160
     """Steps a frame."""
-    rate: float = 2e-2
+    rate: Positive = 2e-2
     """At the start."""
-    halve_every: int = 50
+    halve_every: Count = 50
     """Steps after which the rate is halved."""
 
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.contracts import Log, MethodInfo
+from rewild4d.ours.config import Count, Positive
 from rewild4d.priors.io import load_prior, save_prior
 from rewild4d.priors.motion import (
     SurfaceSample,
@@ -29,9 +30,9 @@ from rewild4d.types import Camera, Clip, Prior, Splats
 class PriorOnlyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How the prior's surface is drawn."""
 
-    gaussians: int = 12000
+    gaussians: Count = 12000
     """Points on the surface: enough that their discs close at 512 pixels."""
-    thickness: float = 0.3
+    thickness: Positive = 0.3
     """Along the normal, as a share of the disc's radius: a thin shell."""
 
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from rewild4d.contracts import Log
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.checkpoint import load_checkpoint, save_checkpoint
-from rewild4d.ours.config import Canonical, Density
+from rewild4d.ours.config import Canonical, Count, Density, Opacity, Rate, Size, Weight, Whole
 from rewild4d.ours.density import DensityControl
 from rewild4d.ours.losses import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.schedule import exponential
@@ -34,26 +34,26 @@ LOG_EVERY = 20
 class GaussianRates(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Learning rates of the Gaussians' attributes (Adam)."""
 
-    means: tuple[float, float] = (8e-4, 8e-6)
+    means: Rate = (8e-4, 8e-6)
     """Positions, falling exponentially: 1.6e-4 and 1.6e-6 at a scene size of 5."""
-    quats: float = 1e-3
+    quats: Weight = 1e-3
     """Orientations."""
-    log_scales: float = 5e-3
+    log_scales: Weight = 5e-3
     """Scales."""
-    logit_opacities: float = 5e-2
+    logit_opacities: Weight = 5e-2
     """Opacities."""
-    colors: float = 2.5e-3
+    colors: Weight = 2.5e-3
     """Colours."""
 
 
 class ImageLoss(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Losses of one rendered view, sums over pixels divided by the area of the animal's box as in `ours`."""
 
-    l1: float = 0.8
+    l1: Weight = 0.8
     """Absolute difference of colour."""
-    ssim: float = 0.2
+    ssim: Weight = 0.2
     """One minus SSIM."""
-    silhouette: float = 0.0
+    silhouette: Weight = 0.0
     """BCE + Dice of the matte."""
     random_background: bool = True
     """One random colour a step behind render and target, white otherwise."""
@@ -62,24 +62,24 @@ class ImageLoss(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 class Resets(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Opacity resets: every Gaussian has to earn its opacity again, so that floaters are pruned."""
 
-    every: float = 0.0
+    every: Weight = 0.0
     """Fraction of the iterations between resets; 0 for none."""
-    until: float = 1.0
+    until: Weight = 1.0
     """Fraction of the iterations after which there are none."""
-    opacity: float = 0.01
+    opacity: Opacity = 0.01
     """Opacities above this are set to it."""
 
 
 class SplatConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Settings that every Gaussian competitor has; "fraction" means a share of `iterations`."""
 
-    image_size: int = 512
+    image_size: Size = 512
     """Longest image side it trains at; larger clips are reduced."""
-    iterations: int = 20_000
+    iterations: Whole = 20_000
     """Steps."""
-    steps_per_frame: int = 0
+    steps_per_frame: Whole = 0
     """At least so many steps for every frame of the clip; 0 leaves it at `iterations`."""
-    checkpoint_every: int = 500
+    checkpoint_every: Count = 500
     """Steps between checkpoints, where a work folder is given."""
     canonical: Canonical = Canonical()
     rates: GaussianRates = GaussianRates()

@@ -72,7 +72,22 @@ def parse_flags(options_type: type[T], arguments: list[str], *, prog: str, descr
         raise unknown_name("option", unknown[0].split("=")[0], _flags(options_type))
     if unknown:
         raise UserError(f"{prog}: expected options only, got '{unknown[0]}'; see {prog} --help.")
+    if isinstance(config := getattr(options, "config", None), msgspec.Struct):
+        _require_ranges(config, prog)
     return options
+
+
+def _require_ranges(config: msgspec.Struct, prog: str) -> None:
+    """Hold a method's settings against the ranges of their types, which a constructor does not look at."""
+    try:
+        msgspec.convert(msgspec.to_builtins(config), type=type(config))
+    except msgspec.ValidationError as error:
+        said, _, place = str(error).partition(" - at `$.")
+        value: Any = config
+        for part in re.findall(r"\w+", place):
+            value = value[int(part)] if part.isdigit() else getattr(value, part)
+        flag = place.rstrip("`").replace("_", "-")
+        raise UserError(f"--{flag}: {said[0].lower()}{said[1:]}, got {value}; see {prog} --help.") from None
 
 
 def _first_words(box: str) -> str:

@@ -98,3 +98,21 @@ def test_entry_point_keeps_standard_output_clean() -> None:
     done = call("run", "--method", "nobody", "--json")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("rewild4d-bench: unknown method 'nobody'")
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--canonical.sh-degree", "5"], "--canonical.sh-degree: expected `int` <= 3, got 5"),
+        (["--image-size", "0"], "--image-size: expected `int` >= 16, got 0"),
+        (["--rates.means", "0", "1"], "--rates.means[0]: expected `float` > 0.0, got 0.0"),
+        (["--pose.width", "20", "--pose.heads", "3"], "expected a width that is a multiple of the heads, got 20 and 3"),
+    ],
+)
+def test_a_setting_out_of_its_range_is_a_sentence(
+    words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["run", "--method", "ours", "--dataset", "artemis", *words])
+    said = capsys.readouterr().err
+    assert (stop.value.code, sentence in said, len(said.strip().splitlines())) == (2, True, 1)

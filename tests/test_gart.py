@@ -21,7 +21,8 @@ from rewild4d.baselines.gart_smal import follow, template_prior
 from rewild4d.baselines.splatting import surface_gaussians
 from rewild4d.conformance import tiny_case
 from rewild4d.errors import UserError
-from rewild4d.ours.canonical import Gaussians
+from rewild4d.harmonics import C0
+from rewild4d.ours.canonical import REST_GAIN, Gaussians
 from rewild4d.ours.symmetry import Supervision
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.template import PARENTS
@@ -141,6 +142,22 @@ def test_spread_is_the_standard_deviation_among_neighbours() -> None:
     near = torch.tensor([[0, 1, 2], [1, 0, 0]])
     deviations = [np.std((1, 2, 6), ddof=1), np.std((2, 1, 1), ddof=1)]
     assert float(spread(values, near)) == pytest.approx(sum(deviations) / 2)
+
+
+def test_colours_are_alike_as_coefficients(case: Case) -> None:
+    weights = {"quats": 0.0, "scales": 0.0, "opacities": 0.0, "small": 0.0, "colors": 1.0}
+    settings = SETTINGS | {"canonical": {"samples": 300, "sh_degree": 1}, "regularisers": weights}
+    made = training(case, msgspec.convert(settings, GartConfig))
+    own = made.model.gaussians
+    coefficients = 0.1 * torch.randn(len(own), 3, 3, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        own.colors[:, 1:] = REST_GAIN * coefficients
+    loss = float(made._alike()["alike"].detach())
+    assert made.near is not None
+    constant = own.colors[:, :1].detach() / C0
+    assert loss == pytest.approx(
+        float(spread(torch.cat((constant, coefficients), dim=1).flatten(1), made.near)), rel=1e-4
+    )
 
 
 def test_both_ways_of_skinning_agree(case: Case) -> None:

@@ -50,6 +50,11 @@ def test_deformation(count: int, width: int, heads: int, mixed: bool) -> None:
     check_twins(deformation(count, Deform(width=width, heads=heads, half=False), mixed))
 
 
+@pytest.mark.parametrize("frequencies", [0, 1])
+def test_deformation_with_few_octaves(frequencies: int) -> None:
+    check_twins(deformation(33, Deform(width=16, heads=2, frequencies=frequencies, half=False)))
+
+
 @pytest.mark.skipif(not AVAILABLE, reason="this CPU multiplies no bfloat16 pairs (AVX512_BF16)")
 def test_deformation_in_bfloat16_is_the_same_to_its_rounding() -> None:
     make, slopes, values = deformation(600, Deform(width=32), spread=0.15), [], []

@@ -146,8 +146,25 @@ def test_stance(batch: int, rows: list[int], only: str | None) -> None:
 
 def test_the_sum_alone_is_that_of_the_stance() -> None:
     own, pose, config = model(), Pose(**batch_of_poses(torch.float32, 3)), Geometry()
-    alone = skeleton_losses(own, pose, own.transforms(pose), config)
+    alone = skeleton_losses(own, pose, own.transforms(pose), config, True)
     assert float(alone.detach()) == float(stance(own, pose, [1], config)[2].detach()) > 0
+
+
+def test_only_neighbouring_frames_have_a_bend() -> None:
+    own, pose = model(), Pose(**batch_of_poses(torch.float32, 3))
+    config = Geometry(limit=0.0, attach=0.0, temporal=10.0)
+    assert float(skeleton_losses(own, pose, own.transforms(pose), config, False).detach()) == 0
+    assert float(stance(own, pose, [0, 1, 2], config)[2].detach()) == 0  # three views of a clip of two frames
+    assert float(stance(own, pose, [1], config)[2].detach()) > 0
+
+
+def test_a_skeleton_without_parents_has_no_joints_to_hold() -> None:
+    given = {dtype: batch_of_poses(dtype, 3) for dtype in (torch.float32, torch.float64)}
+    for dtype, leaf in given.items():
+        own = model(dtype)
+        own.parents.fill_(-1)
+        total = stance(own, Pose(**leaf), [1], Geometry(temporal=0.0))[2]
+        assert float(total.detach()) == 0, dtype
 
 
 def test_attachment_of_a_shifted_joint() -> None:

@@ -10,7 +10,7 @@ from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.config import Config, Deform, Density, Pose, Skinning
 from rewild4d.ours.deform import DeformNetwork, Posed
 from rewild4d.ours.density import replace_gaussians
-from rewild4d.ours.geometry_losses import attach_loss, compact_loss, limit_loss, relative_turn, tv_loss
+from rewild4d.ours.geometry_losses import attach_loss, compact_loss, limit_loss, neighbours, relative_turn, tv_loss
 from rewild4d.ours.losses import colour_losses, silhouette_loss, ssim_map, union_window
 from rewild4d.ours.motion import frame_position, interpolate_similarity
 from rewild4d.ours.pose import Pose as Poses
@@ -283,3 +283,9 @@ def test_the_default_is_the_papers_profile() -> None:
     assert (config.geometry.tv, config.geometry.compact, config.geometry.smooth) == (10.0, 0.1, 0.1)
     assert config.density == Density(cap=40_000)
     assert len(PARENTS) == 20
+
+
+def test_neighbours_of_few_points_are_all_others() -> None:
+    points = torch.tensor(((0.0, 0, 0), (1.0, 0, 0), (3.0, 0, 0)))
+    assert neighbours(points, 5).tolist() == [[1, 2], [0, 2], [1, 0]]
+    assert neighbours(points[:1], 5).shape == (1, 0)

@@ -4,42 +4,58 @@ Section numbers are the design's method notes. "fraction" means a share of `Conf
 length follow one schedule. Lengths without a unit are in the object frame, whose rest diagonal is 5.
 """
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
+from msgspec import Meta
+
+Count = Annotated[int, Meta(ge=1)]
+Whole = Annotated[int, Meta(ge=0)]
+Positive = Annotated[float, Meta(gt=0)]
+Weight = Annotated[float, Meta(ge=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+Opacity = Annotated[float, Meta(gt=0, lt=1)]
+Degree = Annotated[int, Meta(ge=0, le=3)]
+Size = Annotated[int, Meta(ge=16)]
+Rate = tuple[Positive, Positive]
+
+
+def _require_heads(width: int, heads: int) -> None:
+    if heads < 1 or width % heads:
+        raise ValueError(f"expected a width that is a multiple of the heads, got {width} and {heads}")
 
 
 class Canonical(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The canonical Gaussians (section 3)."""
 
-    samples: int = 15_000
+    samples: Count = 15_000
     """Gaussians at the start: area-uniform samples of the prior's rest surface."""
-    thickness: float = 0.5
+    thickness: Positive = 0.5
     """Scale along the normal over the scale in the surface: flat enough for a normal, thick enough edge-on."""
-    opacity: float = 0.9
+    opacity: Opacity = 0.9
     """At the start; 0.1 leaves the silhouette too weak when the pose loss begins."""
-    sh_degree: int = 0
+    sh_degree: Degree = 0
     """Spherical harmonics of colour, 0 to 3; lighting is not mirror-symmetric and views are few (paper: 3)."""
-    sh_every: float = 0.05
+    sh_every: Positive = 0.05
     """Fraction after which one more degree joins (1k of 20k)."""
-    max_scale: float = 0.05
+    max_scale: Positive = 0.05
     """Largest standard deviation, times the rest diagonal: one huge Gaussian hides a wrong pose."""
 
 
 class Skinning(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The learnable skinning field (section 3)."""
 
-    resolution: int = 32
+    resolution: Annotated[int, Meta(ge=2)] = 32
     """Voxels along each axis of the cubic field (paper)."""
-    margin: float = 1.2
+    margin: Positive = 1.2
     """Half-size of the cube over half the longest side of the rest shape, so that points can leave the surface."""
-    neighbours: int = 8
+    neighbours: Count = 8
     """Vertices averaged by inverse distance to fill a voxel; 30 mix both legs of a pair."""
-    sweeps: int = 2
+    sweeps: Whole = 2
     """Neighbour averages; 30 (SelfRecon) moved the posed prior by 5 times as much."""
-    keep: float = 0.7
+    keep: Share = 0.7
     """Share of itself that a voxel keeps in a sweep."""
-    floor: float = 1e-3
+    floor: Positive = 1e-3
     """Added before the logarithm, so that every part can still gain any voxel."""
     tied: bool = False
     """Average the logits with their mirror image (left and right exchanged)."""
@@ -50,31 +66,34 @@ class Skinning(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Part anchors and the pose network (section 4)."""
 
-    anchor_size: int = 8
+    anchor_size: Count = 8
     """Length of a part anchor (paper)."""
-    anchor_std: float = 1.0
+    anchor_std: Weight = 1.0
     """At 0.1 all joints turn alike for ever; 1 tells them apart."""
-    frequencies: int = 4
+    frequencies: Count = 4
     """Octaves of the time code; 4 fitted better than 6 in the measured prototype."""
     encoding: Literal["group", "view"] = "group"
     """Sign that turns time in the code: the group's m, or the image's v (the paper's "w/o Symm. Enc.", emb(t v) + v:
     both groups share one code). Without effect where `tied`: poses are then mirrored, not coded."""
     explicit_group: bool = False
     """Append the group sign m to the code."""
-    width: int = 128
+    width: Count = 128
     """Width of a token: a per-video network needs less than an animal-general one (256)."""
-    blocks: int = 2
+    blocks: Count = 2
     """Pre-norm self-attention blocks."""
-    heads: int = 4
+    heads: Count = 4
     """Attention heads."""
-    reach: float = 0.1
+    reach: Positive = 0.1
     """Translation of a joint per unit of the head's output, times the rest diagonal."""
-    time_noise: float = 0.1
+    time_noise: Weight = 0.1
     """Standard deviation of the time jitter in frames, falling linearly to zero."""
-    time_noise_until: float = 0.5
+    time_noise_until: Weight = 0.5
     """Fraction at which the jitter ends."""
     tied: bool = False
     """Pose of a flipped image = mirror image of that of the image, not its own: twice the evidence for each pose."""
+
+    def __post_init__(self) -> None:
+        _require_heads(self.width, self.heads)
 
 
 class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -84,25 +103,28 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """False is the paper's "w/o Deform" ablation."""
     anchors: bool = True
     """The query holds skinning weights times part anchors; False: the weights themselves ("w/o Part Anchors")."""
-    width: int = 64
+    width: Count = 64
     """Hidden width; the dearest network of the method. 128 for 64: +0.03 dB on one horse, +0.3 on one cow (one seed,
     3,000 steps, preset standard), and 1.3 times the time of the whole fit."""
-    heads: int = 4
+    heads: Count = 4
     """Attention heads over the parts."""
-    frequencies: int = 6
+    frequencies: Whole = 6
     """Octaves of the position code."""
-    reach: float = 0.1
+    reach: Positive = 0.1
     """Displacement per unit of output."""
-    max_log_scale: float = 1.0
+    max_log_scale: Positive = 1.0
     """Bound on the change of log scale (tanh): unbounded offsets make points fly off."""
     half: bool = True
     """Factors of the network's products in bfloat16 where a CPU multiplies such pairs (sums keep single precision)."""
-    ramp_start: float = 0.05
+    ramp_start: Weight = 0.05
     """Fraction at which the deformation starts to fade in: the pose explains the motion first."""
-    ramp_end: float = 0.15
+    ramp_end: Weight = 0.15
     """Fraction at which it acts in full."""
     detach_features: bool = False
     """Keep the appearance losses out of the part features too (the strict reading of gradient isolation)."""
+
+    def __post_init__(self) -> None:
+        _require_heads(self.width, self.heads)
 
 
 class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -113,51 +135,51 @@ class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     and poses still start from the prior)."""
     blend: bool = False
     """Blend the prior's poses into the network's (paper; off on Artemis: after a warm-up it only undoes that)."""
-    blend_until: float = 0.35
+    blend_until: Weight = 0.35
     """Fraction at which the blend reaches zero (7k of 20k)."""
-    pull: float = 0.3
+    pull: Weight = 0.3
     """Weight of the squared distance to the prior's poses, falling linearly to zero at `pull_until` (paper: open). 50
     for 5 in 1,500 steps, one seed each: horse +0.1, wolf +0.2, cow -0.5, fox -0.2 dB."""
-    pull_until: float = 1.0
+    pull_until: Weight = 1.0
     """Fraction at which the pull ends (paper: 4k of 20k); above 1 it is still on at the end."""
 
 
 class WarmUp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The pose warm-up: poses from blurred silhouettes, Gaussians frozen (section 11.3)."""
 
-    iterations: int = 0
+    iterations: Whole = 0
     """Steps on silhouettes. 600 of them after a fitted prior changed the held-out mask IoU by -.04 (horse, Walk) and
     +.01 (wolf, Gallop), one seed each: off. A prior without poses needs it (section 11)."""
-    regress: int = 300
+    regress: Whole = 300
     """Steps before those that only copy the prior's poses into the network (zero for both leaves the stage out)."""
-    copies: int = 48
+    copies: Count = 48
     """Poses a step of those; a handful has not reached the prior by the end."""
-    views: int = 4
+    views: Count = 4
     """Images a step."""
-    samples: int = 2500
+    samples: Count = 2500
     """Gaussians that stand for the body: silhouettes need few."""
-    size: int = 160
+    size: Size = 160
     """Longest image side."""
-    blur: float = 0.06
+    blur: Weight = 0.06
     """Blur at the start, times the side of the animal's box, falling linearly to zero: reaches limbs apart."""
-    regress_rate: float = 2e-3
+    regress_rate: Positive = 2e-3
     """Learning rate of the pose network while it copies."""
-    rate: float = 5e-4
+    rate: Positive = 5e-4
     """Learning rate on silhouettes."""
-    pull: float = 0.3
+    pull: Weight = 0.3
     """Weight of the pull to the prior's poses, falling linearly to zero."""
 
 
 class Loss(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Image losses of the two branches (section 6)."""
 
-    pose_silhouette: float = 0.2
+    pose_silhouette: Weight = 0.2
     """BCE + Dice of the pose branch (paper)."""
-    l1: float = 0.8
+    l1: Weight = 0.8
     """Colour of the deformed branch (paper)."""
-    ssim: float = 0.2
+    ssim: Weight = 0.2
     """One minus SSIM, deformed branch (paper)."""
-    silhouette: float = 0.1
+    silhouette: Weight = 0.1
     """BCE + Dice of the deformed branch (paper)."""
     random_background: bool = True
     """One random colour a step behind render and target: floaters cannot hide in a known background."""
@@ -166,101 +188,101 @@ class Loss(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Regularisers: the paper's three, and a skeleton's (sections 6, 9, 11.6)."""
 
-    until: float = 0.5
+    until: Weight = 0.5
     """Fraction at which the paper's three end (10k of 20k)."""
-    tv: float = 10.0
+    tv: Weight = 10.0
     """Total variation of the skinning probabilities (paper)."""
-    tv_delta: float = 0.05
+    tv_delta: Positive = 0.05
     """Where the Huber function turns linear (paper)."""
-    tv_every: int = 1
+    tv_every: Count = 1
     """Steps between evaluations, weight multiplied accordingly."""
-    compact: float = 0.1
+    compact: Weight = 0.1
     """Compactness of the parts (paper)."""
-    compact_power: float = 2.0
+    compact_power: Positive = 2.0
     """Exponent on the weights: a squared weight leaves less torso in every part."""
-    smooth: float = 0.1
+    smooth: Weight = 0.1
     """Smoothness of rendered normals (paper)."""
-    smooth_every: int = 2
+    smooth_every: Count = 2
     """Steps between evaluations, weight multiplied accordingly."""
-    smooth_size: int = 256
+    smooth_size: Size = 256
     """Side of the square image of normals."""
-    limit: float = 1.0
+    limit: Weight = 1.0
     """Pose: penalty on turning more than `limit_degrees` against the parent."""
-    limit_degrees: float = 70.0
+    limit_degrees: Positive = 70.0
     """Wider than any joint of a quadruped needs between two bones of the template."""
-    attach: float = 20.0
+    attach: Weight = 20.0
     """Pose: squared gap between a joint and its parent there, over the squared diagonal; not measured alone."""
-    temporal: float = 10.0
+    temporal: Weight = 10.0
     """Pose: squared second difference over neighbouring frames; not measured alone."""
-    rigid: float = 1.0
+    rigid: Weight = 1.0
     """Deformed branch: change of distance between canonical neighbours (as isometric as possible); +0.3 dB on one
     horse, one seed, 1,500 steps, against a run that also had more Gaussians."""
-    rigid_neighbours: int = 5
+    rigid_neighbours: Count = 5
     """Neighbours a Gaussian is compared with."""
-    steady: float = 0.1
+    steady: Weight = 0.1
     """Deformed branch: squared change of log scale. Unchecked, scales grow while the deformation shrinks them again."""
 
 
 class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Learning rates (section 6, Schedule); pairs fall exponentially from the first to the second."""
 
-    means: tuple[float, float] = (8e-4, 8e-6)
+    means: Rate = (8e-4, 8e-6)
     """Positions: 1.6e-4 and 1.6e-6 at a scene size of 5."""
-    quats: float = 1e-3
+    quats: Weight = 1e-3
     """Orientations."""
-    log_scales: float = 5e-3
+    log_scales: Weight = 5e-3
     """Scales."""
-    logit_opacities: float = 1e-2
+    logit_opacities: Weight = 1e-2
     """5e-2 makes moving legs transparent within 200 iterations, before the pose has moved."""
-    colors: float = 2.5e-3
+    colors: Weight = 2.5e-3
     """Colours."""
-    skinning: tuple[float, float] = (1e-3, 1e-4)
+    skinning: Rate = (1e-3, 1e-4)
     """Logits of the field."""
-    pose: tuple[float, float] = (6e-4, 1e-5)
+    pose: Rate = (6e-4, 1e-5)
     """Anchors and pose network; 2e-4 was 0.6 dB worse on one horse in 1,500 steps (with more Gaussians)."""
-    rise: float = 0.02
+    rise: Weight = 0.02
     """Fraction over which the networks' rates rise from zero: Adam's first steps would undo the warm-up."""
-    deform: tuple[float, float] = (8e-4, 1.6e-6)
+    deform: Rate = (8e-4, 1.6e-6)
     """Deformation network."""
-    clip: float = 1.0
+    clip: Positive = 1.0
     """Bound on the gradient norm of the networks."""
 
 
 class Density(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Densification with a cap (section 6)."""
 
-    start: float = 0.025
+    start: Weight = 0.025
     """Fraction of the first round (500 of 20k)."""
-    end: float = 0.5
+    end: Weight = 0.5
     """Fraction of the last: unregularised points appear once the geometric losses stop."""
-    every: float = 0.005
+    every: Positive = 0.005
     """Fraction between rounds (100 of 20k)."""
-    gradient: float = 4e-4
+    gradient: Weight = 4e-4
     """Mean image gradient above which a Gaussian is refined, in half sides of the animal's box."""
-    split_scale: float = 0.01
+    split_scale: Positive = 0.01
     """Split above this scale (times the rest diagonal), clone below."""
-    prune_opacity: float = 0.01
+    prune_opacity: Share = 0.01
     """Gaussians below this opacity are removed."""
-    prune_radius: float = 0.2
+    prune_radius: Positive = 0.2
     """Gaussians that cover more than this share of the image's longest side are removed."""
-    cap: int = 40_000
+    cap: Count = 40_000
     """Most Gaussians: memory, and the speed of every later step."""
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """`ours`; the defaults are the paper's profile, presets change them."""
 
-    image_size: int = 512
+    image_size: Size = 512
     """Longest image side it trains at; larger clips are reduced."""
-    iterations: int = 20_000
+    iterations: Count = 20_000
     """Steps of the main stage (paper)."""
-    steps_per_frame: int = 0
+    steps_per_frame: Whole = 0
     """At least so many steps for every frame of the clip; 0 leaves it at `iterations`."""
-    mirrored: float = 0.5
+    mirrored: Share = 0.5
     """Share of the steps that see a mirror image (paper: half). Mirror images teach the side that no camera saw; what
     cameras did see they pull towards its mirror image. .125 for .5 (preset standard, one seed each, sweep camera, held-
     out PSNR): pinto horse 25.6 for 24.4, tiger 22.6 for 22.2; symmetric coats: cow 27.4 for 27.3, fox 20.5 for 20.7."""
-    checkpoint_every: int = 500
+    checkpoint_every: Count = 500
     """Steps between checkpoints, where a work folder is given."""
     canonical: Canonical = Canonical()
     skinning: Skinning = Skinning()

@@ -180,7 +180,7 @@ class Training:
             if config.smooth and index % config.smooth_every == 0:
                 smooth = smooth_loss(deformed, opacities, config.smooth_size, self.generator)
                 losses["smooth"] = config.smooth * config.smooth_every * smooth
-        if config.rigid:
+        if config.rigid and len(own) > 1:
             if self.near is None:
                 self.near = neighbours(own.means, config.rigid_neighbours)
             losses["rigid"] = config.rigid * rigid_loss(own.means, deformed.means, self.near)
@@ -210,6 +210,8 @@ class Training:
         every = max(1, round(config.every * total))
         if config.start * total <= index < config.end * total and (index + 1) % every == 0:
             self.density.round(self.model.gaussians, self.gaussian_optimizer, self.generator)
+            if len(self.model.gaussians) == 0:
+                raise FloatingPointError(f"iteration {index}: no Gaussian is left; every opacity fell below the limit")
             self.near = None
 
     def state(self) -> dict[str, Any]:

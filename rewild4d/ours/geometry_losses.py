@@ -119,6 +119,8 @@ def _disagreement(image: Tensor, matte: Tensor) -> Tensor:
 def limit_loss(pose: Pose, parents: Tensor, degrees: float) -> Tensor:
     """Mean squared excess of cos(half the angle between a bone and its parent) below that of ``degrees``."""
     has_parent = parents >= 0
+    if not bool(has_parent.any()):
+        return pose.quats.sum() * 0.0
     own, above = pose.quats[:, has_parent], pose.quats[:, parents[has_parent]]
     relative = (own * above).sum(-1).abs()
     return (math.cos(math.radians(degrees) / 2) - relative).clamp_min(0).square().mean()
@@ -133,6 +135,8 @@ def attach_loss(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
         parents: -1 for a root, [J].
     """
     has_parent = parents >= 0
+    if not bool(has_parent.any()):
+        return transforms.sum() * 0.0
     pivot = torch.nn.functional.pad(pivots[has_parent], (0, 1), value=1.0)[..., None]
     own, above = transforms[:, has_parent] @ pivot, transforms[:, parents[has_parent]] @ pivot
     return (own - above).square().sum((-1, -2)).mean() / OBJECT_DIAGONAL**2
@@ -148,9 +152,9 @@ def temporal_loss(pose: Pose) -> Tensor:
 
 
 def neighbours(points: Tensor, count: int) -> Tensor:
-    """Indices of the nearest other points, [n, 3] -> [n, count]."""
+    """Indices of the nearest other points, of all others where there are fewer, [n, 3] -> [n, min(count, n - 1)]."""
     place = points.detach().cpu().double().numpy()
-    _, index = cKDTree(place).query(place, k=count + 1)
+    _, index = cKDTree(place).query(place, k=list(range(1, min(count, len(place) - 1) + 2)))
     return torch.from_numpy(np.ascontiguousarray(index[:, 1:]))
 
 

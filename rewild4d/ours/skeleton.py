@@ -39,39 +39,44 @@ def stance(model: Model, poses: Pose, rows: list[int], config: Geometry) -> tupl
 
     Args:
         model: gives the skeleton.
-        poses: [B, J, ...]; in triples of neighbouring frames where ``config.temporal`` is above zero.
+        poses: [B, J, ...]; where B = 3 k, triples of neighbouring frames as `neighbour_keys` makes them.
         rows: which are chosen, k of them.
         config: the weights of joint limits, attachment and (over triples) temporal smoothness.
 
     Returns:
         Poses [k, J, ...], transforms [k, J, 4, 4] and the weighted sum, scalar.
     """
+    triples = len(poses.quats) == 3 * len(rows)
     if fits(poses.quats):
-        cosine = math.cos(math.radians(config.limit_degrees) / 2)
-        weights = Weights(config.limit, cosine, config.attach, config.temporal, OBJECT_DIAGONAL)
-        *own, transforms, total = stand(*poses, rows, model.pivots, model.parents, weights)
+        *own, transforms, total = stand(*poses, rows, model.pivots, model.parents, _weights(config, triples))
         return Pose(*own), transforms, total
     transforms = model.transforms(poses)
-    total = skeleton_losses(model, poses, transforms, config)
+    total = skeleton_losses(model, poses, transforms, config, triples)
     return Pose(*(tensor[rows] for tensor in poses)), transforms[rows], total
 
 
-def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geometry) -> Tensor:
+def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geometry, triples: bool) -> Tensor:
     """Weighted sum of joint limits, attachment and (over triples) temporal smoothness, scalar.
 
     Args:
         model: gives the skeleton.
-        pose: [B, J, ...]; in triples of neighbouring frames where ``config.temporal`` is above zero.
+        pose: [B, J, ...].
         transforms: of the same poses, [B, J, 4, 4].
         config: the weights.
+        triples: whether the poses are those of triples of neighbouring frames; of others no bend is known.
     """
     if fits(pose.quats):
-        return stance(model, pose, [], config)[2]
+        return stand(*pose, [], model.pivots, model.parents, _weights(config, triples))[-1]
     total = pose.shifts.sum() * 0.0
     if config.limit:
         total = total + config.limit * limit_loss(pose, model.parents, config.limit_degrees)
     if config.attach:
         total = total + config.attach * attach_loss(transforms, model.pivots, model.parents)
-    if config.temporal and len(pose.quats) % 3 == 0:
+    if config.temporal and triples:
         total = total + config.temporal * temporal_loss(pose)
     return total
+
+
+def _weights(config: Geometry, triples: bool) -> Weights:
+    cosine = math.cos(math.radians(config.limit_degrees) / 2)
+    return Weights(config.limit, cosine, config.attach, config.temporal if triples else 0.0, OBJECT_DIAGONAL)

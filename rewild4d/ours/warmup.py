@@ -61,7 +61,7 @@ class WarmUp:
             transforms = self.model.transforms(pose)
             silhouette = torch.stack([self._silhouette(keys[row], transforms[row], progress) for row in own]).mean()
             loss = silhouette + stage.pull * (1 - progress) * distance
-            loss = loss + skeleton_losses(self.model, pose, transforms, self.config.geometry)
+            loss = loss + skeleton_losses(self.model, pose, transforms, self.config.geometry, len(keys) > len(own))
             figures = {"silhouette": float(silhouette.detach())}
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()

@@ -131,6 +131,8 @@ def seen_rgb(
     Returns:
         Not below 0, [n, 3].
     """
+    if not 1 <= degree <= 3:
+        raise ValueError(f"expected a degree from 1 to 3, got {degree}")
     return _Seen.apply(colors, means, quats, rest, eye, degree, gain)
 
 

@@ -114,7 +114,7 @@ def read_query(
         for i in range(4):
             query[(tail + i) * BLOCK + lane] = sign * quats[n, i]
     cosines = code + 3 * reach.frequencies
-    for axis in range(3):
+    for axis in range(3 if reach.frequencies > 0 else 0):
         _sines(query, reach.parts + axis, code + axis, cosines + axis)
         for octave in range(1, reach.frequencies):
             row = 3 * octave + axis

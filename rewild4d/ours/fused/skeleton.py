@@ -23,7 +23,7 @@ class Weights(NamedTuple):
         limit: of the joint limits.
         cosine: of half the angle at which they begin.
         attach: of the gaps between a joint and its parent.
-        temporal: of second differences over triples.
+        temporal: of second differences over triples; 0 where the poses are none.
         unit: length that distances are divided by.
     """
 
@@ -142,7 +142,7 @@ def _regularise(
     if weights.attach:
         weight = weights.attach / (weights.unit * weights.unit)
         total += _gaps(quats, shifts, pivots, parents, weight, on_quats, on_shifts)
-    if weights.temporal and len(quats) % 3 == 0:
+    if weights.temporal:
         total += _second_differences(quats, shifts, weights.temporal, weights.unit, on_quats, on_shifts)
     return total
 
