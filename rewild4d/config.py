@@ -6,7 +6,7 @@ import io
 import re
 import tomllib
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib import resources
 from typing import Any, TypeVar
 
@@ -16,6 +16,7 @@ import tyro
 from rewild4d.errors import UserError, unknown_name
 
 T = TypeVar("T")
+PRESETS = ("default", "quick", "standard", "paper")
 
 
 def preset_names(method: str) -> list[str]:
@@ -24,13 +25,15 @@ def preset_names(method: str) -> list[str]:
 
 
 def load_preset(method: str, config_type: type[T], preset: str) -> T:
-    """A method's settings under a preset; a method without a preset file has its defaults under every name.
+    """A method's settings under a preset; a method without a preset file has its defaults under each of `PRESETS`.
 
     Raises:
         UserError: no such preset, or the file does not fit the method's settings.
     """
     presets = _preset_file(method)
     if not presets:
+        if preset not in PRESETS:
+            raise unknown_name("preset", preset, PRESETS)
         return config_type()
     if preset not in presets:
         raise unknown_name(f"preset of '{method}'", preset, presets)
@@ -45,7 +48,9 @@ def _preset_file(method: str) -> dict[str, Any]:
     return tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
 
 
-def parse_flags(options_type: type[T], arguments: list[str], *, prog: str, description: str) -> T:
+def parse_flags(
+    options_type: type[T], arguments: list[str], *, prog: str, description: str, also: Iterable[str] = ()
+) -> T:
     """Parse a command's flags; a misspelt one is a sentence with the nearest name, not a page.
 
     Args:
@@ -53,6 +58,7 @@ def parse_flags(options_type: type[T], arguments: list[str], *, prog: str, descr
         arguments: what came after the command's name.
         prog: how the command is called, for help.
         description: shown on top of the help.
+        also: flags that the command knows under other circumstances, for the nearest name.
 
     Raises:
         UserError: a flag that does not exist, or a value of the wrong type.
@@ -67,9 +73,9 @@ def parse_flags(options_type: type[T], arguments: list[str], *, prog: str, descr
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise UserError(f"{_first_words(said.getvalue())}; see {prog} --help.") from None
+        raise UserError(f"{_first_words(said.getvalue()).rstrip('.')}; see {prog} --help.") from None
     if unknown and unknown[0].startswith("-"):
-        raise unknown_name("option", unknown[0].split("=")[0], _flags(options_type))
+        raise unknown_name("option", unknown[0].split("=")[0], [*_flags(options_type), *also])
     if unknown:
         raise UserError(f"{prog}: expected options only, got '{unknown[0]}'; see {prog} --help.")
     if isinstance(config := getattr(options, "config", None), msgspec.Struct):

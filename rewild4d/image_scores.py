@@ -18,7 +18,10 @@ from rewild4d.metrics.silhouette import boundary_f, mask_dice, mask_iou
 FOREGROUND = 0.5
 """A pixel belongs to the animal where its matte is at least this."""
 REGIONS = ("full", "fg", "union", "crop")
-COLOR_METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
+COLOR_METRICS = {
+    "psnr": ("dB", "higher"), "ssim": ("1", "higher"), "lpips_alex": ("1", "lower"), "lpips_vgg": ("1", "lower"),
+}  # fmt: skip
+"""Metric -> its unit, and which way is better."""
 SILHOUETTES: dict[str, Callable[[Tensor, Tensor, float], Tensor]] = {
     "iou": mask_iou,
     "dice": mask_dice,
@@ -90,7 +93,7 @@ def measure(name: str, shown: Beside, networks: Mapping[str, PairDistance]) -> l
 def summarize(name: str, items: Sequence[float | None]) -> Score:
     """The mean over the images that have a value; a score without any says so instead of a number."""
     metric, _ = split_name(name)
-    unit, better = "dB" if metric == "psnr" else "1", "lower" if metric.startswith("lpips") else "higher"
+    unit, better = ("1", "higher") if metric in SILHOUETTES else COLOR_METRICS[metric]
     present = [item for item in items if item is not None]
     if not present:
         reason = "no image in which it is defined" if items else "no image"

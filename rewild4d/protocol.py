@@ -1,7 +1,8 @@
 """Evaluation protocols: a TOML file says what is held out and measured; this renders, composites and scores."""
 
 from collections.abc import Iterable, Iterator
-from importlib import resources
+from importlib import metadata, resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -106,14 +107,31 @@ class Evaluation(NamedTuple):
 
 
 def load_protocols() -> dict[str, Protocol]:
-    """All protocols that ship with the package, by name."""
+    """All protocols by name: our own, then those of packages that installed some (entry point `rewild4d.protocols`).
+
+    Raises:
+        UserError: a package's protocol cannot be read, or has a name that is taken.
+    """
     folder = resources.files("rewild4d.leaderboard") / "protocols"
-    found = {}
-    for file in sorted(folder.iterdir(), key=lambda entry: entry.name):
-        if file.name.endswith(".toml"):
-            protocol = msgspec.toml.decode(file.read_bytes(), type=Protocol)
-            found[protocol.name] = protocol
+    found = {protocol.name: protocol for protocol in map(_decode, _tomls(folder))}
+    for entry in metadata.entry_points(group="rewild4d.protocols"):
+        try:
+            added = [_decode(file) for file in _tomls(resources.files(entry.value))]
+        except (ImportError, OSError, msgspec.DecodeError) as error:
+            raise UserError(f"protocols '{entry.name}': {entry.value}: {error}.") from error
+        for protocol in added:
+            if found.setdefault(protocol.name, protocol) is not protocol:
+                raise UserError(f"protocols '{entry.name}': {entry.value}: the name '{protocol.name}' is taken.")
     return found
+
+
+def _tomls(folder: Traversable) -> list[Traversable]:
+    files = (entry for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    return sorted(files, key=lambda entry: entry.name)
+
+
+def _decode(file: Traversable) -> Protocol:
+    return msgspec.toml.decode(file.read_bytes(), type=Protocol)
 
 
 def find_protocol(dataset: str, name: str | None) -> Protocol:

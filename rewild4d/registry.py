@@ -7,7 +7,7 @@ import importlib
 from importlib import metadata
 from typing import Any
 
-from rewild4d.errors import unknown_name
+from rewild4d.errors import UserError, unknown_name
 
 METHODS = {
     "ours": "rewild4d.ours.method:Ours",
@@ -38,7 +38,7 @@ def load_method(name: str) -> Any:
     """An instance of the method called ``name`` (contracts.Method).
 
     Raises:
-        UserError: no such method, with the nearest name.
+        UserError: no such method, with the nearest name; one of another package that cannot be imported.
     """
     return _load("methods", name)()
 
@@ -47,7 +47,7 @@ def load_dataset(name: str) -> Any:
     """The reader class of the data set called ``name``: reader(root) -> contracts.DatasetReader.
 
     Raises:
-        UserError: no such data set, with the nearest name.
+        UserError: no such data set, with the nearest name; one of another package that cannot be imported.
     """
     return _load("datasets", name)
 
@@ -62,7 +62,12 @@ def _load(kind: str, name: str) -> Any:
     table = _table(kind)
     if name not in table:
         raise unknown_name(kind.removesuffix("s"), name, table)
-    return _resolve(table[name])
+    try:
+        return _resolve(table[name])
+    except (ImportError, AttributeError) as error:
+        raise UserError(
+            f"{kind.removesuffix('s')} '{name}': expected an object at {table[name]}, but {error}."
+        ) from error
 
 
 def _table(kind: str) -> dict[str, str]:

@@ -1,8 +1,10 @@
 """`list`: methods, data sets, protocols, presets and tables."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from rewild4d.config import parse_flags, preset_names
+from rewild4d.errors import UserError
 from rewild4d.leaderboard.specs import load_specs
 from rewild4d.protocol import find_protocol, load_protocols
 from rewild4d.registry import BUILTIN, load_dataset, load_method, names
@@ -17,15 +19,13 @@ def main(arguments: list[str]) -> int:
     parse_flags(Options, arguments, prog="rewild4d-bench list", description="List all that can be named in a run.")
     print("methods")
     for name in names("methods"):
-        info = load_method(name).info
-        presets = ", ".join(preset_names(name))
-        print(f"  {name:<12} {info.title}" + (f" ({info.paper})" if info.paper else "") + f"; licence {info.licence}")
-        if presets:
+        print(f"  {name:<12} {_said(_method, name)}")
+        if presets := ", ".join(preset_names(name)):
             print(f"  {'':<12} presets: {presets}")
     print("data sets")
     for name in names("datasets"):
         made = "; built-in animals are made where --data is left out" if name in BUILTIN else ""
-        print(f"  {name:<12} {(load_dataset(name).__doc__ or '').strip().splitlines()[0].rstrip('.')}{made}")
+        print(f"  {name:<12} {_said(_dataset, name)}{made}")
     print("protocols")
     for name, protocol in load_protocols().items():
         chosen = protocol.default and find_protocol(protocol.dataset, None).name == name
@@ -34,3 +34,21 @@ def main(arguments: list[str]) -> int:
     for name, spec in load_specs().items():
         print(f"  {name:<24} {spec.title}")
     return 0
+
+
+def _said(describe: Callable[[str], str], name: str) -> str:
+    """A line on what a name stands for; a package that cannot be imported must not hide the others."""
+    try:
+        return describe(name)
+    except UserError as error:
+        return f"cannot be used: {error}"
+
+
+def _method(name: str) -> str:
+    info = load_method(name).info
+    return info.title + (f" ({info.paper})" if info.paper else "") + f"; licence {info.licence}"
+
+
+def _dataset(name: str) -> str:
+    first, *_ = (load_dataset(name).__doc__ or "no description").strip().splitlines()
+    return first.rstrip(".")

@@ -83,13 +83,15 @@ class Options:
 
 def main(arguments: list[str]) -> int:
     """Run the command; 0 where every run has scores, 1 where one failed."""
-    if _peek(arguments, "--table") is not None:
+    if any(word.split("=")[0] == "--table" for word in arguments):
         return run_table.main(arguments)
     wanted = _peek(arguments, "--method") or Options.method
     preset = _peek(arguments, "--preset") or Options.preset
     method = load_method(wanted)
     options_type = with_method_flags(Options, load_preset(wanted, method.Config, preset))
-    options: Any = parse_flags(options_type, arguments, prog="rewild4d-bench run", description=DESCRIPTION)
+    options: Any = parse_flags(
+        options_type, arguments, prog="rewild4d-bench run", description=DESCRIPTION, also=["--table"]
+    )
     records = execute(make_plan(options, options.config))
     if options.json:
         print("[" + ",\n".join(to_json(record) for record in records) + "]")

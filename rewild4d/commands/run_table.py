@@ -13,10 +13,11 @@ from rewild4d.commands.choice import cases_of, chosen
 from rewild4d.commands.shared import check_numbers, choose_prior, floor_entry, open_dataset, require_writable
 from rewild4d.config import parse_flags
 from rewild4d.contracts import DatasetReader
+from rewild4d.errors import UserError
 from rewild4d.leaderboard.formats import markdown
 from rewild4d.leaderboard.layout import Table
 from rewild4d.leaderboard.records import RunRecord, to_json
-from rewild4d.leaderboard.specs import Spec, find_spec
+from rewild4d.leaderboard.specs import Spec, find_spec, load_specs
 from rewild4d.leaderboard.tables import named_table
 from rewild4d.machine import pick_device
 from rewild4d.protocol import Protocol
@@ -75,6 +76,11 @@ class Options:
 
 def main(arguments: list[str]) -> int:
     """Run the command; 0 where every run has scores, 1 where one failed."""
+    place = arguments.index("--table") if "--table" in arguments else None
+    if place is not None and (place + 1 == len(arguments) or arguments[place + 1].startswith("--")):
+        if "--help" not in arguments:
+            raise UserError(f"--table: expected the name of a table, got none; available: {', '.join(load_specs())}.")
+        arguments = ["--help"]
     options = parse_flags(Options, arguments, prog="rewild4d-bench run", description=DESCRIPTION)
     found = find_spec(options.table)
     spec = chosen(options.table, found, planning.Choice(options.preset, options.protocol))
