@@ -15,6 +15,7 @@ import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from rewild4d.errors import UserError
+from rewild4d.files import natural
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VOID = 255
@@ -137,20 +138,22 @@ def read_transparency(file: Path) -> np.ndarray | None:
     Raises:
         UserError: the file cannot be read.
     """
-    with _opened(file) as image:
+    with _opened(file, "an image") as image:
         if "A" not in image.getbands() and "transparency" not in image.info:
             return None
         return np.asarray(ImageOps.exif_transpose(image).convert("RGBA").getchannel("A"))
 
 
 @contextmanager
-def _opened(file: Path) -> Iterator[Image.Image]:
+def _opened(file: Path, what: str = "a mask image") -> Iterator[Image.Image]:
     """An image file, decoded in the block."""
     try:
         with Image.open(file) as image:
             yield image
     except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise UserError(f"{file}: expected a mask image that can be read, got a damaged or another file.") from error
+        reason = getattr(error, "strerror", None)
+        came = f"but: {reason}" if reason else "got a damaged or another file"
+        raise UserError(f"{file}: expected {what} that can be read, {came}.") from error
 
 
 def _from_channels(values: np.ndarray, mode: str) -> np.ndarray:
@@ -223,7 +226,7 @@ def list_images(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> list[Path]:
         twin = by_stem.setdefault(entry.stem, entry)
         if twin is not entry:
             raise UserError(f"{folder}: expected one image of each name, got {twin.name} and {entry.name}.")
-    return sorted(found, key=lambda entry: [int(w) if w.isdigit() else w for w in re.split(r"([0-9]+)", entry.name)])
+    return sorted(found, key=natural)
 
 
 def match_masks(masks: Sequence[Path], stems: Sequence[str], folder: Path) -> tuple[list[Path | None], str]:

@@ -88,9 +88,24 @@ def test_one_frame_in_two_files_is_one_sentence(tmp_path: Path) -> None:
     moving.save(masks / "00005.bmp", moving.mask(5))
     with pytest.raises(UserError, match="m: expected one image of each name, got 00005.bmp and 00005.png"):
         Online(frames, masks=masks).video("f")
-    with pytest.raises(UserError, match="expected one image of each name"):
-        list_images(masks)
     root = moving.davis(tmp_path / "davis")
     moving.save(root / "JPEGImages" / "480p" / "camel" / "00000.png", moving.image(0))
     with pytest.raises(UserError, match="camel: expected one image of each name, got 00000.jpg and 00000.png"):
         Davis(root).load("camel", SELECTION)
+
+
+def test_a_frame_that_is_a_link_to_nothing(tmp_path: Path) -> None:
+    root = moving.davis(tmp_path)
+    frame = root / "JPEGImages" / "480p" / "camel" / "00003.jpg"
+    for target, reason in ((tmp_path / "none", "No such file"), (frame, "Too many levels of symbolic links")):
+        frame.unlink()
+        frame.symlink_to(target)
+        with pytest.raises(UserError, match=f"00003.jpg: expected a file that can be read, but: {reason}"):
+            Davis(root).load("camel", SELECTION)
+
+
+def test_files_are_in_natural_order_whatever_digits_they_hold(tmp_path: Path) -> None:
+    names = ["a2.png", "a10.png", "x1²2.png"]
+    for name in reversed(names):
+        (tmp_path / name).touch()
+    assert [file.name for file in list_images(tmp_path)] == names

@@ -64,7 +64,7 @@ def test_a_hundredth_of_the_longer_side_is_the_limit(prior, tmp_path, shift, agr
 
 def test_a_file_for_another_clip_and_masks_that_are_empty(prior: Prior, tmp_path: Path) -> None:  # noqa: F811
     clip = two_frames()
-    with pytest.raises(UserError, match="expected a prior that knows its 2 frames from 0.000 to 0.042 s"):
+    with pytest.raises(UserError, match="p.npz: made/up: expected a prior that knows its 2 frames from 0.000 to 0.042"):
         chosen(replace(prior, times=prior.times + 7.0), clip, tmp_path)
     empty = tuple(replace(frame, mask=0 * frame.mask) for frame in clip.frames)
     with pytest.raises(UserError, match="made/up: expected at least one mask that shows the animal"):

@@ -57,7 +57,10 @@ def in_world(prior: Prior, clip: Clip, file: str) -> Prior:
     """
     if not any((frame.mask > 0.5).any() for frame in clip.frames):
         raise UserError(f"{clip.name}: expected at least one mask that shows the animal, but all are empty.")
-    found = at_times(prior, clip.times, clip)
+    try:
+        found = at_times(prior, clip.times, clip)
+    except UserError as error:
+        raise UserError(f"{file}: {error}") from error
     cameras, flipped = [], []
     for row, frame in enumerate(clip.frames):
         assert frame.camera is not None
