@@ -237,7 +237,7 @@ class Online:
         place = self.masks or (beside if beside and beside.is_dir() else None)
         if place is None and not self._material.has_alpha:
             raise UserError(
-                f"{self.root}: expected masks of the animal, but the frames have no alpha channel and no --masks was "
+                f"{self.root}: expected masks of the animal, but no frame is transparent anywhere and no --masks was "
                 "given; `rewild4d-bench masks` makes some."
             )
         return place

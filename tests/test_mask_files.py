@@ -69,7 +69,7 @@ def test_opaque_frames_carry_no_mask(tmp_path: Path) -> None:
     opaque = np.full_like(moving.mask(0), 255)
     for i in range(5):
         moving.save(tmp_path / "rgba" / f"{i}.png", np.dstack((moving.image(i), opaque)))
-    with pytest.raises(UserError, match="the frames have no alpha channel and no --masks was given"):
+    with pytest.raises(UserError, match="no frame is transparent anywhere and no --masks was given"):
         Online(tmp_path / "rgba").video("rgba")
     # the animal may fill the first frame
     moving.save(tmp_path / "rgba" / "4.png", np.dstack((moving.image(4), moving.mask(4))))

@@ -221,7 +221,7 @@ def test_check_tells_what_a_person_should_look_at(walk: Path, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("case", "sentence"),
     [
-        ("no masks", "expected masks of the animal, but the frames have no alpha channel and no --masks was given"),
+        ("no masks", "expected masks of the animal, but no frame is transparent anywhere and no --masks was given"),
         ("empty masks", "expected at least 4 frames with a mask of the animal, got 0 of 12 (12 an empty one)"),
         ("one frame", "expected at least 4 frames with a mask of the animal, got 1 of 1"),
         ("other size", "00000.png: expected a mask of 96x64 pixels like its frame (or of that shape), got 64x64"),
