@@ -26,7 +26,7 @@ from rewild4d.baselines.external_profiles import PROFILES, Profile
 from rewild4d.baselines.external_reading import Moment, moved, moved_discs, painted, read_moments
 from rewild4d.contracts import Log, MethodInfo
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.files import atomic, digest, write_text
+from rewild4d.files import atomic, digest, load_tensors, write_text
 from rewild4d.meshes import Discs
 from rewild4d.priors.motion import pose_at
 from rewild4d.transforms import skin_points, split_similarity
@@ -129,7 +129,7 @@ class External:
             return _read(work / "out", clip, prior, profile, config, seed, log)
 
     def load(self, folder: Path, device: torch.device) -> ExternalReconstruction:
-        state = torch.load(folder / STATE, weights_only=True)
+        state = load_tensors(folder / STATE)
         cameras = {time: values and Camera(*values) for time, values in state["cameras"].items()}
         moments = tuple(Splats(*values) for values in state["moments"])
         return ExternalReconstruction(state["times"], moments, cameras, tuple(state["marks"]), state["notes"])

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.contracts import Log, MethodInfo
+from rewild4d.files import load_tensors
 from rewild4d.ours.config import Count, Positive
 from rewild4d.priors.io import load_prior, save_prior
 from rewild4d.priors.motion import (
@@ -108,7 +109,7 @@ class PriorOnly:
         return PriorOnlyReconstruction(prior, sample, colors, cameras, config.thickness)
 
     def load(self, folder: Path, device: torch.device) -> PriorOnlyReconstruction:
-        state = torch.load(folder / "surface.pt", weights_only=True)
+        state = load_tensors(folder / "surface.pt")
         cameras = {time: Camera(*values) for time, values in state["cameras"].items()}
         prior, sample = load_prior(folder / "prior.npz"), SurfaceSample(**state["sample"])
         return PriorOnlyReconstruction(prior, sample, state["colors"], cameras, state["thickness"])

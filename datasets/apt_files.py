@@ -101,7 +101,7 @@ def _add(path: Path, table: dict[str, Any], subjects: dict[str, Subject], seen: 
             seen.add(pair)
             if not _sight(entry, image, kinds.get(entry.get("category_id"), "animal"), subjects):
                 counts["have no box inside their image"] += 1
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise UserError(f"{path}: expected COCO-like annotations, but an entry does not fit ({error!r}).") from error
     total = len(table["annotations"])
     return [f"{path.name}: {count} of {total} annotations {what}" for what, count in counts.items() if count]
@@ -113,7 +113,7 @@ def _sight(entry: dict[str, Any], image: dict[str, Any], species: str, subjects:
     left, top, width, height = map(float, entry["bbox"])
     right, bottom = min(left + width, size[0]), min(top + height, size[1])
     left, top = max(left, 0.0), max(top, 0.0)
-    if right <= left or bottom <= top:
+    if not (right > left and bottom > top):  # also where a number is NaN
         return False
     values = entry.get("keypoints") or [0] * (3 * len(APT))
     keypoints, outside = coco_keypoints(values, APT, size)

@@ -105,8 +105,7 @@ class AptV2:
         if case not in subjects:
             raise unknown_name("case", case, subjects)
         subject = subjects[case]
-        files = [self._image(sighting) for sighting in subject.sightings]
-        size = image_size(files[0])
+        files, size = self._images(subject)
         masks = open_masks([self._mask(subject, sighting) for sighting in subject.sightings])
         if not self._masked(subject):
             place = list(self._mask_places(subject, subject.sightings[0]))[1]
@@ -147,15 +146,27 @@ class AptV2:
         """
         if case not in self._annotations.subjects:
             raise unknown_name("case", case, self._annotations.subjects)
-        sightings = self._annotations.subjects[case].sightings
-        files = [self._image(sighting) for sighting in sightings]
-        size, stems = image_size(files[0]), tuple(file.stem for file in files)
-        boxes = {index: sighting.box for index, sighting in enumerate(sightings)}
+        subject = self._annotations.subjects[case]
+        files, size = self._images(subject)
+        stems = tuple(file.stem for file in files)
+        boxes = {index: sighting.box for index, sighting in enumerate(subject.sightings)}
         return Unmasked(str(files[0].parent), stems, size, partial(read_images, files, size), boxes)
 
     @cached_property
     def _annotations(self) -> Annotations:
         return read_annotations(self.root)
+
+    def _images(self, subject: Subject) -> tuple[list[Path], tuple[int, int]]:
+        """The frames of a subject, and their width and height, which all of its annotations must state."""
+        files = [self._image(sighting) for sighting in subject.sightings]
+        size = image_size(files[0])
+        for file, sighting in zip(files, subject.sightings, strict=True):
+            if sighting.size != size:
+                raise UserError(
+                    f"{file}: expected {sighting.size[0]}x{sighting.size[1]} pixels, for which its boxes and keypoints "
+                    f"are, got {size[0]}x{size[1]}."
+                )
+        return files, size
 
     def _image(self, sighting: Sighting) -> Path:
         places = list(image_places(self.root, sighting.file))

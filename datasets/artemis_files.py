@@ -143,7 +143,7 @@ def read_sequences(path: Path) -> dict[str, int]:
         if not line.strip():
             continue
         name, _, count = line.strip().rpartition(" ")
-        if not name or not count.isdigit():
+        if not name or not count.isdecimal():
             raise UserError(f"{path}: expected '<motion> <number of frames>' in line {number}, got '{line.strip()}'.")
         motions[name.strip()] = int(count)
     return motions
@@ -184,7 +184,7 @@ def list_frames(motion: Path) -> list[Path]:
     Raises:
         UserError: no frame folders, or one is missing.
     """
-    frames = {int(path.name): path for path in motion.iterdir() if path.name.isdigit() and path.is_dir()}
+    frames = {int(path.name): path for path in motion.iterdir() if path.name.isdecimal() and path.is_dir()}
     if not frames:
         raise UserError(f"{motion}: expected frame folders 0, 1, 2, ..., got none.")
     missing = [number for number in range(max(frames) + 1) if number not in frames]

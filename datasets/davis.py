@@ -160,7 +160,7 @@ class Davis:
 
     def _frames(self, sequence: str) -> list[Path]:
         folder = self.root / "JPEGImages" / str(self.resolution) / sequence
-        files = [file for file in list_images(folder) if file.suffix.lower() in FRAME_SUFFIXES]
+        files = list_images(folder, FRAME_SUFFIXES)
         if not files:
             raise UserError(f"{folder}: expected frames ({', '.join(FRAME_SUFFIXES)}), got none.")
         return files

@@ -4,7 +4,6 @@ A folder holds either images, or clips: subfolders of frames, or video files. An
 [h, w], [h, w, 3] or [h, w, 4] (floats in [0, 1], or unsigned integers over their full range).
 """
 
-import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from torch import Tensor
 
 from rewild4d.datasets.images import read_picture
 from rewild4d.errors import UserError
+from rewild4d.files import natural
 
 IMAGES = (".png", ".jpg", ".jpeg", ".npy")
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
@@ -196,7 +196,7 @@ def _entries(folder: Path) -> list[Path]:
         found = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
         raise UserError(f"{folder}: expected a folder of images or clips, but: {error.strerror}.") from error
-    return sorted(found, key=lambda entry: [int(w) if w.isdigit() else w for w in re.split(r"([0-9]+)", entry.name)])
+    return sorted(found, key=natural)
 
 
 def _of_kind(entries: Sequence[Path], suffixes: Sequence[str]) -> list[Path]:

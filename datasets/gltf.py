@@ -6,6 +6,8 @@ Follows the glTF 2.0 specification (Khronos): accessors 3.6.2, animations 3.11 a
 import base64
 import binascii
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -209,6 +211,20 @@ def _parse(path: Path) -> pygltflib.GLTF2:
     if tree is None or tree.asset is None or not str(tree.asset.version or "").startswith("2"):
         raise UserError(f"{path}: expected glTF version 2, but it is another format or version.")
     return tree
+
+
+@contextmanager
+def consistent(path: Path) -> Iterator[None]:
+    """Read a file in the block: a reference to what is not there, or numbers that do not fit, end in one sentence.
+
+    Raises:
+        UserError: the block met one.
+    """
+    try:
+        with np.errstate(divide="ignore", invalid="ignore"):  # what comes of it is looked at
+            yield
+    except (IndexError, KeyError, TypeError, ValueError, AttributeError) as error:  # a singular matrix is a ValueError
+        raise UserError(f"{path}: expected a consistent glTF, but what it says does not fit ({error}).") from error
 
 
 def sample(keys: Floats, values: Floats, interpolation: str | None, times: Floats, is_rotation: bool) -> Floats:

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from rewild4d.contracts import Selection
 from rewild4d.datasets.artemis_files import ImagePair
 from rewild4d.errors import UserError
-from rewild4d.files import atomic, cache_folder, digest
+from rewild4d.files import atomic, cache_folder, digest, file_state
 from rewild4d.types import Camera
 
 BOX_ALPHA = 25
@@ -228,9 +228,7 @@ def _key(pairs: Sequence[Sequence[ImagePair]], selection: Selection) -> str:
     parts = [_CACHE_VERSION, selection.framing, str(selection.size), str(len(pairs))]
     for frame in pairs:
         for pair in frame:
-            for path in (pair.rgb, pair.alpha):
-                state = path.stat()
-                parts.append(f"{path.resolve()} {state.st_size} {state.st_mtime_ns}")
+            parts += [file_state(path) for path in (pair.rgb, pair.alpha)]
     return digest(*parts)[:32]
 
 

@@ -7,6 +7,7 @@ template is said by a mapping file (`priors.landmarks.load_mapping`), never here
 import csv
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,7 @@ def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int]) -> l
             found = _json(json.loads(path.read_text(encoding="utf-8")), size)
     except OSError as error:
         raise UserError(f"{path}: expected a keypoint file, but: {error.strerror}.") from error
-    except (KeyError, TypeError, IndexError, ValueError, AttributeError, StopIteration) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, StopIteration, RecursionError, csv.Error) as error:
         raise UserError(
             f"{path}: expected keypoints as BADJA, COCO, DeepLabCut or SLEAP write them, got others ({error!r})."
         ) from error
@@ -146,7 +147,7 @@ def _deeplabcut(rows: list[list[str]], stems: Sequence[str]) -> dict[str, Points
     found = {}
     for row in rows[rows.index(coords) + 1 :]:
         # labels by hand spread the path of an image over the first columns
-        label = next((cell for cell in reversed(row[:start]) if cell.strip()), row[0])
+        label = "/".join(cell for cell in row[:start] if cell.strip())
         found[_counted(label, stems)] = [
             _detected(name, row[at["x"]], row[at["y"]], _number(row[at["likelihood"]]) if "likelihood" in at else 1.0)
             for name, at in columns.items()
@@ -164,12 +165,12 @@ def _number(text: str) -> float:
 
 
 def _counted(label: str, stems: Sequence[str]) -> str:
-    """The frame that a row is about: its number from 0, or the name of its image."""
-    stem = _stem(label)
-    if stem in stems or not stem.replace(".0", "").isdigit():
-        return stem
-    index = int(float(stem))
-    return stems[index] if index < len(stems) else stem
+    """The frame that a row is about: a bare number counts from 0, all else is the name or path of an image."""
+    number = re.fullmatch(r"([0-9]+)(\.0)?", label.strip())
+    if number is None:
+        return _stem(label)
+    index = int(number[1])
+    return stems[index] if index < len(stems) else f"number {index}"
 
 
 def _stem(path: str) -> str:

@@ -4,6 +4,7 @@ A maker gets the frames one after the other and gives a mask for each. Another p
 frames/00000.png, ..., it writes masks/00000.png, ..., and a command line joins the two.
 """
 
+import math
 import shlex
 import subprocess
 import tempfile
@@ -78,8 +79,8 @@ def run_program(command: str) -> MaskMaker:
     """
     try:
         words = shlex.split(command)
-        said = [word.format(frames="", masks="", boxes="") for word in words]
-    except (KeyError, IndexError, ValueError) as error:
+        said = [word.format(**dict.fromkeys(PLACES, Path())) for word in words]
+    except (KeyError, IndexError, ValueError, AttributeError, TypeError) as error:
         names = ", ".join(f"{{{name}}}" for name in PLACES)
         raise UserError(f"--command: expected a command line with {names} in it, got '{command}' ({error}).") from error
     if not said or not all(f"{{{name}}}" in command for name in PLACES[:2]):
@@ -136,7 +137,8 @@ def parse_boxes(texts: tuple[str, ...], count: int) -> dict[int, Box]:
             left, top, width, height = (float(number) for number in numbers.split(","))
         except ValueError as error:
             raise UserError(f"--box: expected left,top,width,height or frame:left,..., got '{text}'.") from error
-        if not (0 <= frame < count and width > 0 and height > 0):
+        is_finite = all(map(math.isfinite, (left, top, width, height)))
+        if not (0 <= frame < count and is_finite and width > 0 and height > 0):
             raise UserError(f"--box: expected a box with a size, in a frame from 0 to {count - 1}, got '{text}'.")
         boxes[frame] = (left, top, width, height)
     return boxes

@@ -5,7 +5,8 @@ DAVIS 2017 (indexed images whose values are object ids). So a folder is read as 
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,11 +15,14 @@ import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from rewild4d.errors import UserError
+from rewild4d.files import natural
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VOID = 255
 MOST_OBJECTS = 32
-"""Grey images whose values all lie below this are ids, not shades."""
+"""Grey images whose values all lie below this, but for `VOID`, are ids, not shades."""
+BLACK = 31
+"""Colours without a channel above this are background: a JPEG's black is not quite black."""
 NOISE = 0.04
 """Parts smaller than this share of the largest one do not widen the animal's box."""
 CUT_SHARE = 0.1
@@ -96,40 +100,60 @@ def open_masks(files: Sequence[Path | None]) -> MaskFiles:
         if file is not None:
             seen |= set(np.flatnonzero(np.bincount(read_values(file).ravel(), minlength=256)).tolist())
             indexed |= _is_indexed(file)
-    named = sorted(seen - {0})
-    if named in ([], [VOID]):
-        ids: tuple[int, ...] = ()
-    elif indexed:
-        ids = tuple(value for value in named if value != VOID)
-    else:
-        ids = tuple(named) if max(named) < MOST_OBJECTS else ()
-    return MaskFiles(tuple(files), ids)
+    named = tuple(sorted(seen - {0, VOID}))
+    is_named = indexed or (bool(named) and named[-1] < MOST_OBJECTS)
+    return MaskFiles(tuple(files), named if is_named else ())
 
 
 def read_values(file: Path) -> np.ndarray:
     """The values of a mask file as they are stored, uint8 [h, w]: indices, not colours, of an indexed image.
 
-    An alpha channel that varies is the mask; colours are taken as foreground unless black; 16 bits become 8 where they
-    are shades.
+    An alpha channel that varies is the mask; colours are taken as foreground unless nearly black; 16 bits become 8
+    where they are shades, and so do fractions up to 1.
 
     Raises:
-        UserError: the file cannot be read.
+        UserError: the file cannot be read, or holds numbers that are not finite.
     """
-    try:
-        with Image.open(file) as opened:
-            image = ImageOps.exif_transpose(opened)
-            values = np.asarray(image)
-            mode = image.mode
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise UserError(f"{file}: expected a mask image that can be read, got a damaged or another file.") from error
+    with _opened(file) as stored:
+        image = ImageOps.exif_transpose(stored)
+        if image.mode in ("CMYK", "YCbCr", "LAB", "HSV"):
+            image = image.convert("RGB")
+        values, mode = np.asarray(image), image.mode
     if values.dtype == bool:
         return values.astype(np.uint8) * 255
     if values.ndim == 3:
         return _from_channels(values, mode)
     if values.dtype != np.uint8:
-        shades = values.max(initial=0) > 255
-        return (values / 65535 * 255 if shades else values).clip(0, 255).astype(np.uint8)
+        if not np.isfinite(values).all():
+            raise UserError(f"{file}: expected a mask of finite numbers, got some that are not.")
+        most = values.max(initial=0)
+        whole = 65535 if most > 255 else 1 if values.dtype.kind == "f" and most <= 1 else 255
+        return np.rint((values / whole * 255).clip(0, 255)).astype(np.uint8)
     return values
+
+
+def read_transparency(file: Path) -> np.ndarray | None:
+    """The alpha channel of an image, turned upright as its EXIF says, uint8 [h, w]; None where it has none.
+
+    Raises:
+        UserError: the file cannot be read.
+    """
+    with _opened(file, "an image") as image:
+        if "A" not in image.getbands() and "transparency" not in image.info:
+            return None
+        return np.asarray(ImageOps.exif_transpose(image).convert("RGBA").getchannel("A"))
+
+
+@contextmanager
+def _opened(file: Path, what: str = "a mask image") -> Iterator[Image.Image]:
+    """An image file, decoded in the block."""
+    try:
+        with Image.open(file) as image:
+            yield image
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        reason = getattr(error, "strerror", None)
+        came = f"but: {reason}" if reason else "got a damaged or another file"
+        raise UserError(f"{file}: expected {what} that can be read, {came}.") from error
 
 
 def _from_channels(values: np.ndarray, mode: str) -> np.ndarray:
@@ -138,12 +162,12 @@ def _from_channels(values: np.ndarray, mode: str) -> np.ndarray:
     colors = values[..., :3] if mode in ("RGB", "RGBA") else values[..., :1]
     if (colors == colors[..., :1]).all():
         return np.ascontiguousarray(colors[..., 0])
-    return np.where(colors.any(axis=2), 255, 0).astype(np.uint8)
+    return np.where(colors.max(axis=2) > BLACK, 255, 0).astype(np.uint8)
 
 
 def _is_indexed(file: Path) -> bool:
-    with Image.open(file) as opened:
-        return opened.mode == "P"
+    with _opened(file) as image:
+        return image.mode == "P"
 
 
 def fit_size(mask: np.ndarray, size: tuple[int, int], title: str) -> np.ndarray:
@@ -187,17 +211,22 @@ def _holes(solid: np.ndarray) -> int:
     return int(((padded > 0) & (labels != labels[0, 0])).sum())
 
 
-def list_images(folder: Path) -> list[Path]:
+def list_images(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> list[Path]:
     """The image files of a folder in natural order (2 before 10).
 
     Raises:
-        UserError: no such folder.
+        UserError: no such folder, or two files that differ in their ending alone.
     """
     try:
-        found = [entry for entry in folder.iterdir() if entry.suffix.lower() in SUFFIXES and entry.name[0] != "."]
+        found = [entry for entry in folder.iterdir() if entry.suffix.lower() in suffixes and entry.name[0] != "."]
     except OSError as error:
         raise UserError(f"{folder}: expected a folder of images, but: {error.strerror}.") from error
-    return sorted(found, key=lambda entry: [int(w) if w.isdigit() else w for w in re.split(r"([0-9]+)", entry.name)])
+    by_stem: dict[str, Path] = {}
+    for entry in sorted(found):
+        twin = by_stem.setdefault(entry.stem, entry)
+        if twin is not entry:
+            raise UserError(f"{folder}: expected one image of each name, got {twin.name} and {entry.name}.")
+    return sorted(found, key=natural)
 
 
 def match_masks(masks: Sequence[Path], stems: Sequence[str], folder: Path) -> tuple[list[Path | None], str]:

@@ -14,11 +14,10 @@ import numpy as np
 
 from rewild4d.contracts import Finding, Selection
 from rewild4d.datasets.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
-from rewild4d.datasets.images import read_picture
 from rewild4d.datasets.keypoint_files import read_keypoints, told_outside
 from rewild4d.datasets.mask_check import check_videos
 from rewild4d.datasets.mask_makers import Unmasked
-from rewild4d.datasets.masks import MaskFiles, fit_size, list_images, match_masks, open_masks
+from rewild4d.datasets.masks import MaskFiles, fit_size, list_images, match_masks, open_masks, read_transparency
 from rewild4d.datasets.video_file import ASSUMED_FPS, SUFFIXES, read_video, video_facts
 from rewild4d.datasets.wild import Masks, Moment, Video, files_identity, original_images, split_video
 from rewild4d.errors import UserError, unknown_name
@@ -39,7 +38,7 @@ class Material:
         files: empty for a video file.
         times: seconds of every frame, ascending.
         size: width and height.
-        has_alpha: whether the frames carry a mask of their own.
+        has_alpha: whether the frames carry a mask of their own: any is transparent anywhere.
         notes: what was found wrong, a sentence each.
     """
 
@@ -89,7 +88,8 @@ class Online:
         if self.fps is not None and not 0 < self.fps <= 1000:
             raise UserError(f"--fps: expected a number above 0, got {self.fps:g}.")
         if (self.start or 0) < 0 or (self.end is not None and self.end <= (self.start or 0)):
-            raise UserError(f"--start and --end: expected 0 <= start < end, got {self.start or 0:g} and {self.end:g}.")
+            end = "no end" if self.end is None else f"{self.end:g}"
+            raise UserError(f"--start and --end: expected 0 <= start < end, got {self.start or 0:g} and {end}.")
 
     @property
     def settings(self) -> dict[str, str]:
@@ -194,16 +194,17 @@ class Online:
             order = f"time stamps are missing or out of order: {ASSUMED_FPS:g} frames a second assumed"
             notes = (*((fault,) if facts.faults else ()), *(() if facts.is_stamped else (order,)))
             return Material((), facts.times, (facts.width, facts.height), facts.has_alpha, notes)
-        files = tuple(f for f in list_images(self._frames_root) if f.suffix.lower() in FRAME_SUFFIXES)
+        files = tuple(list_images(self._frames_root, FRAME_SUFFIXES))
         if not files:
             expected = f"frames ({', '.join(FRAME_SUFFIXES)})"
             videos = [entry.name for entry in self._frames_root.iterdir() if entry.suffix.lower() in SUFFIXES]
             hint = f", but there is {videos[0]}: name that file" if videos else ", got none"
             raise UserError(f"{self._frames_root}: expected {expected}{hint}.")
         rate = self.fps or FOLDER_FPS
-        has_alpha = files[0].suffix.lower() == ".png" and _file_alpha(files[0]) is not None
+        size = image_size(files[0])
+        has_alpha = any(alpha is not None and bool((alpha < 255).any()) for alpha in map(read_transparency, files))
         notes = () if self.fps else (f"a folder of frames has no frame rate: {FOLDER_FPS:g} a second assumed (--fps)",)
-        return Material(files, tuple(i / rate for i in range(len(files))), image_size(files[0]), has_alpha, notes)
+        return Material(files, tuple(i / rate for i in range(len(files))), size, has_alpha, notes)
 
     @cached_property
     def _chosen(self) -> tuple[list[int], str]:
@@ -236,7 +237,7 @@ class Online:
         place = self.masks or (beside if beside and beside.is_dir() else None)
         if place is None and not self._material.has_alpha:
             raise UserError(
-                f"{self.root}: expected masks of the animal, but the frames have no alpha channel and no --masks was "
+                f"{self.root}: expected masks of the animal, but no frame is transparent anywhere and no --masks was "
                 "given; `rewild4d-bench masks` makes some."
             )
         return place
@@ -297,7 +298,7 @@ class Online:
     def _alphas(self) -> Iterator[np.ndarray | None]:
         indices = self._chosen[0]
         if self._material.files:
-            return (_file_alpha(self._material.files[i]) for i in indices)
+            return (_file_alpha(self._material.files[i], self._material.size) for i in indices)
         return (frame[..., 3] for frame in _picked(read_video(self.root), indices))
 
     def _label(self, index: int) -> str:
@@ -330,7 +331,7 @@ def _mask_stream(path: Path, indices: Sequence[int], size: tuple[int, int], alph
         yield fit_size(np.ascontiguousarray(values), size, str(path))
 
 
-def _file_alpha(file: Path) -> np.ndarray | None:
+def _file_alpha(file: Path, size: tuple[int, int]) -> np.ndarray | None:
     """The alpha channel of an image that has one, uint8 [h, w]."""
-    alpha = read_picture(file)[1]
-    return None if alpha is None else np.rint(alpha * 255).astype(np.uint8)
+    alpha = read_transparency(file)
+    return None if alpha is None else fit_size(alpha, size, str(file))

@@ -13,8 +13,8 @@ import pygltflib
 from numpy.typing import NDArray
 
 from rewild4d.datasets.animal import AnimatedAnimal, Surface
-from rewild4d.datasets.gltf import Document, Floats
-from rewild4d.errors import unknown_name
+from rewild4d.datasets.gltf import Document, Floats, consistent
+from rewild4d.errors import UserError, unknown_name
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
 MIRRORED, CLAMPED = 33648, 33071
@@ -26,7 +26,8 @@ def clips(path: Path) -> list[str]:
     Raises:
         UserError: the file is missing or is no glTF.
     """
-    return _clip_names(Document(path))
+    with consistent(path):
+        return _clip_names(Document(path))
 
 
 def load_rig(path: Path, clip: str, frames: int = 24) -> AnimatedAnimal:
@@ -41,8 +42,20 @@ def load_rig(path: Path, clip: str, frames: int = 24) -> AnimatedAnimal:
         The animal in the file's own world (metres by the specification, +y up).
 
     Raises:
-        UserError: the file is missing or no glTF, holds no skinned mesh, or has no such clip.
+        UserError: the file is missing or no glTF, contradicts itself, holds no skinned mesh, or has no such clip.
     """
+    with consistent(path):
+        animal = _read_rig(path, clip, frames)
+        if not any(len(surface.faces) for surface in animal.surfaces):
+            raise UserError(f"{path}: expected a mesh of triangles, but the file has none.")
+        points = np.concatenate([surface.vertices for surface in animal.surfaces])
+        posed = (np.concatenate(animal.posed(frame)) for frame in range(frames))
+        if not all(np.isfinite(each).all() for each in (points, *posed)) or not np.ptp(points, axis=0).any():
+            raise UserError(f"{path}: expected a mesh of some size in every pose, but scales or turns of it are zero.")
+    return animal
+
+
+def _read_rig(path: Path, clip: str, frames: int) -> AnimatedAnimal:
     document = Document(path)
     names = _clip_names(document)
     visible = document.scene_nodes()

@@ -19,7 +19,7 @@ from rewild4d.datasets.keypoints import in_crop
 from rewild4d.datasets.masks import MaskFacts, mask_facts
 from rewild4d.datasets.travel import TravelMeter
 from rewild4d.errors import UserError
-from rewild4d.files import atomic, cache_folder, digest
+from rewild4d.files import atomic, cache_folder, digest, file_state
 from rewild4d.types import Clip, Crop, Frame, Keypoints, Truth
 
 LEAST_FRAMES = 4
@@ -283,8 +283,7 @@ def _key(video: Video, selection: Selection) -> str:
 
 def files_identity(*files: Path | None) -> str:
     """Path, size and time of change of some files, as text."""
-    states = [(file.resolve(), file.stat()) for file in files if file is not None]
-    return digest(*(f"{path} {state.st_size} {state.st_mtime_ns}" for path, state in states))
+    return digest(*(file_state(file) for file in files if file is not None))
 
 
 class _Frames(Sequence[Frame]):

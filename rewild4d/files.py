@@ -2,11 +2,13 @@
 
 import hashlib
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import platformdirs
@@ -90,6 +92,38 @@ def digest(*parts: bytes | str | np.ndarray | torch.Tensor) -> str:
         sha.update(part.encode() if isinstance(part, str) else part)
         sha.update(b"\0")
     return sha.hexdigest()
+
+
+def file_state(path: Path) -> str:
+    """Path, size and time of change of a file, as text.
+
+    Raises:
+        UserError: there is no such file, or only a link to nothing.
+    """
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise UserError(f"{path}: expected a file that can be read, but: {error.strerror}.") from error
+    return f"{path.resolve()} {state.st_size} {state.st_mtime_ns}"
+
+
+def natural(path: Path) -> list[str | int]:
+    """Sorts files by name so that 2 comes before 10."""
+    return [int(part) if index % 2 else part for index, part in enumerate(re.split(r"([0-9]+)", path.name))]
+
+
+def load_tensors(path: Path) -> Any:
+    """What torch saved, on the CPU.
+
+    Raises:
+        UserError: it is missing, damaged, or holds more than tensors and numbers.
+    """
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: expected a saved reconstruction, but there is no such file.") from error
+    except Exception as error:  # an unpickler that meets other bytes fails in any way
+        raise UserError(f"{path}: expected a saved reconstruction, but it is cut off or another file.") from error
 
 
 def cache_folder() -> Path:

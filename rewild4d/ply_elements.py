@@ -70,7 +70,7 @@ def _header(path: Path, lines: list[str]) -> tuple[str, list[tuple[str, int, lis
                 pass
             case ["format", name, "1.0"] if name in ORDERS:
                 order = ORDERS[name]
-            case ["element", name, count] if count.isdigit():
+            case ["element", name, count] if count.isdecimal():
                 elements.append((name, int(count), []))
             case ["property", "list", length, kind, name] if elements:
                 elements[-1][2].append(_Property(name, _type(path, kind), _type(path, length)))

@@ -17,6 +17,7 @@ from rewild4d.errors import UserError
         ({"image_id": 5000}, "12 of 12 annotations name an image that is not listed"),
         ({"bbox": [200, 200, 5, 5]}, "12 of 12 annotations have no box inside their image"),
         ({"keypoints": [1, 2]}, "expected COCO-like annotations, but an entry does not fit"),
+        ({"bbox": [float("nan"), 0, 5, 5]}, "12 of 12 annotations have no box inside their image"),
         ({"bbox": None}, "expected COCO-like annotations, but an entry does not fit"),
     ],
 )
@@ -37,9 +38,34 @@ def test_annotations_without_tracks(tmp_path: Path) -> None:
     file.write_text(json.dumps(table))
     with pytest.raises(UserError, match="expected annotations with video_id and track_id, got none with track_id"):
         AptV2(tmp_path).cases(SELECTION)
-    file.write_text(file.read_text()[:100])
-    with pytest.raises(UserError, match="expected JSON, but it cannot be parsed"):
-        AptV2(tmp_path).cases(SELECTION)
+    for text in (file.read_text()[:100], 100000 * "["):
+        file.write_text(text)
+        with pytest.raises(UserError, match="expected JSON, but it cannot be parsed"):
+            AptV2(tmp_path).cases(SELECTION)
+
+
+def resized(root: Path, width: float, height: float) -> AptV2:
+    """A reader of annotations that state another size of their images."""
+    file = moving.apt(root) / "annotations" / "train_annotations.json"
+    table = json.loads(file.read_text())
+    for image in table["images"]:
+        image |= {"width": width, "height": height}
+    file.write_text(json.dumps(table))
+    return AptV2(root)
+
+
+def test_images_of_another_size_than_their_annotations_state(tmp_path: Path) -> None:
+    reader = resized(tmp_path, 192, 128)
+    sentence = "0000.jpg: expected 192x128 pixels, for which its boxes and keypoints are, got 96x64"
+    with pytest.raises(UserError, match=sentence):
+        reader.load("easy/29wolf/v1C1@3", SELECTION)
+    with pytest.raises(UserError, match=sentence):
+        reader.unmasked("easy/29wolf/v1C1@3")
+
+
+def test_an_image_of_infinite_width(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="expected COCO-like annotations, but an entry does not fit .OverflowError"):
+        resized(tmp_path, float("inf"), 64).cases(SELECTION)
 
 
 def test_keypoints_outside_the_frame_are_not_visible(tmp_path: Path) -> None:

@@ -145,6 +145,18 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda a: (a / "sequences").write_text("walk\n"),
         r"sequences: expected '<motion> <number of frames>' in line 1, got 'walk'\.",
     ),
+    "sequences superscript": (
+        lambda a: (a / "sequences").write_text("walk ³\n"),
+        r"sequences: expected '<motion> <number of frames>' in line 1, got 'walk ³'\.",
+    ),
+    "frame superscript": (
+        lambda a: (a / "img/walk/1").rename(a / "img/walk/¹"),
+        r"img/walk: expected frame folders 0 to 2 without a gap, but folder 1 is missing\.",
+    ),
+    "link to nothing": (
+        lambda a: [(a / f"{IMAGE}_alpha.png").unlink(), (a / f"{IMAGE}_alpha.png").symlink_to(a / "none")],
+        r"img/walk/1/img_0002_alpha\.png: expected an? (file|image) that can be read, but: No such file or directory\.",
+    ),
     "view missing": (
         lambda a: (a / f"{IMAGE}.png").unlink(),
         r"img/walk/1/img_0002\.png: expected an image \(png or jpg\) of view 2, got none\.",

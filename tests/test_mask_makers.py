@@ -72,6 +72,8 @@ def test_any_program_through_folders(tmp_path: Path) -> None:
     ("command", "sentence"),
     [
         ("mytool {frames}", "expected a command line with {frames} and {masks} in it, got 'mytool {frames}'"),
+        ("mytool {frames} {masks} {frames.y}", "expected a command line with {frames}, {masks}, {boxes} in it"),
+        ("mytool {frames} {masks} {boxes[0]}", "expected a command line with {frames}, {masks}, {boxes} in it"),
         ("mytool {frames} {out}", "expected a command line with {frames}, {masks}, {boxes} in it"),
         ("/no/such/tool {frames} {masks}", "/no/such/tool: expected a program that can be run, but: No such file"),
         ("sh -c 'echo no GPU >&2; exit 3' {frames} {masks}", "ended with status 3 and said: no GPU"),
@@ -90,7 +92,7 @@ def test_boxes_of_the_command_line() -> None:
     for text in ("1,2,3", "x:1,2,3,4", "1,2,3,y"):
         with pytest.raises(UserError, match="--box: expected left,top,width,height or frame:left"):
             parse_boxes((text,), 9)
-    for text in ("1,2,0,4", "9:1,2,3,4"):
+    for text in ("1,2,0,4", "9:1,2,3,4", "nan,2,3,4", "1,-inf,3,4", "1,2,inf,4"):
         with pytest.raises(UserError, match="expected a box with a size, in a frame from 0 to 8"):
             parse_boxes((text,), 9)
 

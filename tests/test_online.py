@@ -221,7 +221,7 @@ def test_check_tells_what_a_person_should_look_at(walk: Path, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("case", "sentence"),
     [
-        ("no masks", "expected masks of the animal, but the frames have no alpha channel and no --masks was given"),
+        ("no masks", "expected masks of the animal, but no frame is transparent anywhere and no --masks was given"),
         ("empty masks", "expected at least 4 frames with a mask of the animal, got 0 of 12 (12 an empty one)"),
         ("one frame", "expected at least 4 frames with a mask of the animal, got 1 of 1"),
         ("other size", "00000.png: expected a mask of 96x64 pixels like its frame (or of that shape), got 64x64"),
@@ -233,6 +233,9 @@ def test_check_tells_what_a_person_should_look_at(walk: Path, tmp_path: Path) ->
         ("damaged video", "expected a video that ffmpeg can read, got"),
         ("late start", "expected frames between 90 and inf s, but the last is at 0.44 s"),
         ("backwards", "--start and --end: expected 0 <= start < end, got 2 and 1"),
+        ("before", "--start and --end: expected 0 <= start < end, got -1 and no end"),
+        ("link to nothing", "00004.png: expected an image that can be read, but: No such file or directory"),
+        ("link to itself", "00004.png: expected an image that can be read, but: Too many levels of"),
         ("no rate", "--fps: expected a number above 0, got -1"),
         ("missing", "expected a video file or a folder of images, but there is no such thing"),
     ],
@@ -289,6 +292,11 @@ def spoil(case: str, walk: Path, tmp_path: Path) -> list[object]:
             return ["--video", walk, "--start", 90]
         case "backwards":
             return ["--video", walk, "--start", 2, "--end", 1]
+        case "before":
+            return ["--video", walk, "--start=-1"]
+        case "link to nothing" | "link to itself":
+            (frames / "00004.png").unlink()
+            (frames / "00004.png").symlink_to(tmp_path / "none" if case == "link to nothing" else "00004.png")
         case "no rate":
             return ["--video", walk, "--fps", -1]
         case "missing":

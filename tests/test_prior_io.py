@@ -15,20 +15,24 @@ from rewild4d.transforms import look_at, mirror_points, similarity, skin_points
 from rewild4d.types import Camera, Clip, Frame, Prior
 
 
-@pytest.fixture
-def prior() -> Prior:
-    """Two frames of a bent template, seen by one camera whose mask is the left half of the image."""
+def two_frames() -> Clip:
+    """Two frames of one camera; the mask is the left half of the image."""
     up = torch.tensor((0.0, 1.0, 0.0), dtype=torch.float64)
     view = look_at(torch.tensor((6.0, 1.0, 2.0), dtype=torch.float64), torch.zeros(3, dtype=torch.float64), up)
     intrinsics = torch.tensor(((60.0, 0.0, 30.0), (0.0, 60.0, 20.0), (0.0, 0.0, 1.0)), dtype=torch.float64)
     mask = torch.zeros(1, 40, 64)
     mask[:, :, :32] = 1.0
     frames = tuple(Frame(t / 24, Camera(view, intrinsics, 64, 40), mask.expand(3, -1, -1), mask) for t in range(2))
-    clip = Clip("made/up", "none", frames, 24.0, "CC0", "")
+    return Clip("made/up", "none", frames, 24.0, "CC0", "")
+
+
+@pytest.fixture
+def prior() -> Prior:
+    """A bent template in `two_frames`."""
     angles = 0.3 * torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(0))
     matrix = similarity(0.5, torch.eye(3, dtype=torch.float64), 0.1 * torch.ones(3, dtype=torch.float64))
     animal = Animal(Proportions.average(), matrix.expand(2, 4, 4).contiguous(), angles, {"cost": 0.25})
-    return make_prior(animal, clip, "template", "Made by a test.")
+    return make_prior(animal, two_frames(), "template", "Made by a test.")
 
 
 def test_what_was_saved_is_loaded_with_the_same_digest(prior: Prior, tmp_path: Path) -> None:
@@ -46,7 +50,7 @@ def test_what_was_saved_is_loaded_with_the_same_digest(prior: Prior, tmp_path: P
 def test_digest_covers_poses_cameras_and_name(prior: Prior, tmp_path: Path) -> None:
     save_prior(prior, tmp_path / "a.npz")
     changed = [
-        replace(prior, transforms=prior.transforms + 1e-3),
+        replace(prior, transforms=prior.transforms.roll(1, dims=1)),
         replace(prior, cameras=(replace(prior.cameras[0], width=65), prior.cameras[1])),
         replace(prior, name="other"),
     ]
@@ -101,6 +105,14 @@ def nan(array: np.ndarray) -> np.ndarray:
         ("mirror", lambda a: np.roll(a, 1), "expected 'mirror' to be its own inverse"),
         ("times", lambda a: a[::-1], "expected 'times' to increase"),
         ("object_to_world", lambda a: -a, "expected 'object_to_world' to keep handedness"),
+        ("object_to_world", lambda a: a @ np.diag((1.1, 1, 1, 1)), "expected similarities in 'object_to_world'"),
+        ("object_to_world", lambda a: 0.9 * a, "expected similarities in 'object_to_world', got some that are 0.1 off"),
+        ("world_to_camera", lambda a: a @ np.diag((2.0, 2, 2, 1)), "expected rigid matrices in 'world_to_camera', got"),
+        ("world_to_camera", lambda a: a @ np.diag((-1.0, 1, 1, 1)), "expected rigid matrices in 'world_to_camera'"),
+        ("world_to_camera_flip", lambda a: 0 * a, "expected rigid matrices in 'world_to_camera_flip'"),
+        ("transforms", lambda a: 1e20 * a, "expected rigid matrices in 'transforms'"),
+        ("intrinsics", lambda a: np.diag((-1.0, -1, 1)) @ a, "expected positive focal lengths and a last row 0 0 1"),
+        ("intrinsics", lambda a: 2 * a, "expected positive focal lengths and a last row 0 0 1 in 'intrinsics', got"),
         ("intrinsics_flip", None, "expected all or none of world_to_camera_flip"),
         ("quality", lambda a: np.array("[1]"), "expected 'quality' to be a JSON object of numbers"),
     ],
@@ -124,3 +136,15 @@ def test_no_file_and_no_npz_are_told_apart(tmp_path: Path) -> None:
     (tmp_path / "text.npz").write_text("hello")
     with pytest.raises(UserError, match="cannot be read as one"):
         load_prior(tmp_path / "text.npz")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    with pytest.raises(UserError, match="array.npy: .* cannot be read as one: it holds a single array"):
+        load_prior(tmp_path / "array.npy")
+
+
+def test_flipped_bytes_are_one_sentence(prior: Prior, tmp_path: Path) -> None:
+    save_prior(prior, tmp_path / "prior.npz")
+    data = bytearray((tmp_path / "prior.npz").read_bytes())
+    data[3000:3050] = bytes(255 - value for value in data[3000:3050])
+    (tmp_path / "prior.npz").write_bytes(data)
+    with pytest.raises(UserError, match="cannot be read as one"):
+        load_prior(tmp_path / "prior.npz")

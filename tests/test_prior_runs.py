@@ -167,7 +167,7 @@ def test_a_file_of_keypoints_is_read_with_the_frames(dataset: str, tmp_path: Pat
     assert points is not None and crop is not None and points.names == ("nose", "tail_end")
     assert torch.allclose(crop.to_original(points.points[0], 64), torch.tensor((20.5 + index, 30.5)), atol=1e-3)
     (tmp_path / "k.csv").write_text("\n".join((head, "400,1,2,0.9,3,4,0.9")))
-    with pytest.raises(UserError, match=r"k.csv: expected keypoints of the frames 00000 to 00011, got those of 400\."):
+    with pytest.raises(UserError, match=r"expected keypoints of the frames 00000 to 00011, got those of number 400\."):
         (
             Davis(tmp_path, keypoints=tmp_path / "k.csv")
             if dataset == "davis"

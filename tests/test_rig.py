@@ -186,6 +186,40 @@ def test_bad_files(tmp_path: Path) -> None:
         load_rig(tmp_path / "cut.glb", "Trot")
 
 
+BROKEN = "expected a consistent glTF, but what it says does not fit"
+
+
+def without(tree: dict, key: str) -> None:
+    del tree[key]
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda t: without(t, "skins"), "expected a consistent glTF, but what it says does not fit (list index out of"),
+        (lambda t: t["nodes"][5].update(mesh=7), BROKEN),
+        (lambda t: t["nodes"][0].update(children=[999]), BROKEN),
+        (lambda t: t["accessors"][0].update(bufferView=99), BROKEN),
+        (lambda t: t["accessors"][0].update(count=-5), BROKEN),
+        (lambda t: t["skins"][0].update(joints=[1, 99]), BROKEN),
+        (lambda t: t["meshes"][0]["primitives"][0]["attributes"].pop("POSITION"), "expected a consistent glTF, but"),
+        (lambda t: t["nodes"][0].update(scale=[0, 0, 0]), BROKEN),
+        (lambda t: t["nodes"][1].update(rotation=[0, 0, 0, 0]), "expected a mesh of some size in every pose, but"),
+        (lambda t: [m["primitives"][0].update(mode=1) for m in t["meshes"]], "expected a mesh of triangles, but"),
+    ],
+)  # fmt: skip
+def test_a_file_that_contradicts_itself_is_one_sentence(tmp_path: Path, change, sentence: str) -> None:  # type: ignore[no-untyped-def]
+    data = build(tmp_path / "a.glb").read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    tree = json.loads(data[20 : 20 + length])
+    change(tree)
+    builder = Builder()
+    builder.data = data[28 + length :]
+    with pytest.raises(UserError) as error:
+        load_rig(builder.write(tmp_path / "b.glb", tree), "Trot")
+    assert str(error.value).startswith(f"{tmp_path / 'b.glb'}: {sentence}")
+
+
 @pytest.mark.parametrize("name", ["horse", "wolf", "fox", "cow", "khronos_fox"])
 def test_real_rigs(rigs: Path, name: str) -> None:
     animal = load_rig(rigs / f"{name}.glb", "Walk", frames=3)

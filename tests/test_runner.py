@@ -162,6 +162,11 @@ def test_evaluate_gives_the_same_scores(plan: runner.Plan, monkeypatch: pytest.M
     folder = next(plan.out.rglob(f"prior-only-quick-seed0-{record.run_id[:8]}"))
     monkeypatch.setattr("rewild4d.commands.evaluate.load_dataset", lambda _: lambda _: plan.reader)
     assert still(score_again(folder, EvaluateOptions(runs=(folder,)))) == still(record)
+    state = folder / "reconstruction" / "surface.pt"
+    for data in (state.read_bytes()[: state.stat().st_size // 2], b"text"):
+        state.write_bytes(data)
+        with pytest.raises(UserError, match="surface.pt: expected a saved reconstruction, but it is cut off or"):
+            score_again(folder, EvaluateOptions(runs=(folder,)))
     shutil.rmtree(folder / "reconstruction")
     with pytest.raises(UserError, match="reconstruction: expected a saved reconstruction, but there is no such folder"):
         score_again(folder, EvaluateOptions(runs=(folder,)))

@@ -78,7 +78,7 @@ def test_reading_twice_gives_the_same_digests(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "mode", "cases"),
     [((0, 255), "L", ["camel"]), ((0, 1), "P", ["camel"]), ((0, 1), "L", ["camel"]), ((0, 255), "P", ["camel"]),
-     ((2, 1), "P", ["camel", "camel@1", "camel@2"])],
+     ((2, 1), "P", ["camel", "camel@1", "camel@2"]), ((2, 1), "L", ["camel", "camel@1", "camel@2"])],
 )  # fmt: skip
 def test_what_a_mask_means(tmp_path: Path, values: tuple[int, int], mode: str, cases: list[str]) -> None:
     reader = Davis(moving.davis(tmp_path, values=values, mode=mode))
@@ -87,11 +87,12 @@ def test_what_a_mask_means(tmp_path: Path, values: tuple[int, int], mode: str, c
     assert found is not None and (found == moving.mask(0)).all()
 
 
-def test_void_is_no_animal_in_2017(tmp_path: Path) -> None:
+@pytest.mark.parametrize("mode", ["P", "L"])
+def test_void_is_no_animal_in_2017(tmp_path: Path, mode: str) -> None:
     file = tmp_path / "00000.png"
     values = moving.mask(0) // 255
     values[:4] = 255
-    masks = open_masks([moving.save(file, values, "P")])
+    masks = open_masks([moving.save(file, values, mode)])
     assert masks.ids == (1,)
     read = masks.read(0, None, moving.SIZE)
     assert read is not None and (read == moving.mask(0)).all()

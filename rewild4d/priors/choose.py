@@ -1,5 +1,6 @@
 """Which prior a run starts from: fitted to its clip, made from the truth with noise, or read from a file."""
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -18,7 +19,7 @@ from rewild4d.priors.footage import Evidence, fit_footage
 from rewild4d.priors.io import load_prior, save_prior, seal
 from rewild4d.priors.judge import doubts, joint_scores, measured
 from rewild4d.priors.landmarks import Marks, load_mapping, marks
-from rewild4d.priors.placing import placed
+from rewild4d.priors.placing import in_world, placed
 from rewild4d.priors.steady import without_hops
 from rewild4d.types import Clip, Prior, Truth
 
@@ -56,9 +57,12 @@ class PriorChoice:
         if kind != "coarse":
             return None
         try:
-            return float(level or 1.0)
+            noise = float(level or 1.0)
         except ValueError as error:
             raise UserError(f"--prior {self.name}: expected coarse:<number>, got '{level}'.") from error
+        if not 0 <= noise < math.inf:
+            raise UserError(f"--prior {self.name}: expected a finite noise of 0 or more, got '{level}'.")
+        return noise
 
     def identity(self, clip: Clip, truth: Truth) -> str:
         """Digest of all that decides the prior, before it is made: sixteen hex digits."""
@@ -104,12 +108,12 @@ def make_prior(choice: PriorChoice, clip: Clip, truth: Truth, path: Path, log: L
     footage = not _has_cameras(clip)
     if choice.name != "template" and choice.noise is None:
         prior = load_prior(Path(choice.name))
-        if footage:
-            prior = placed(prior, clip)
-            prior = replace(
-                prior, quality=prior.quality | measured(prior, clip.frames), notes=(*prior.notes, ELSEWHERE)
-            )
-            prior = _scored(prior, clip, choice.keypoints(clip)[1])
+        prior = placed(prior, clip) if footage else in_world(prior, clip, choice.name)
+        figures = measured(prior, clip.frames)
+        if not footage:  # known cameras may jump
+            figures = {name: value for name, value in figures.items() if not name.startswith("hops")}
+        prior = seal(replace(prior, quality=prior.quality | figures, notes=(*prior.notes, ELSEWHERE)))
+        prior = _scored(prior, clip, choice.keypoints(clip)[1])
     else:
         if not path.is_file():
             save_prior(_fitted(choice, clip, truth, log), path)

@@ -99,7 +99,7 @@ def _stems(folder: Path) -> dict[str, str]:
                 found[match["frame"]] = (step, file.name.removesuffix("_mesh.obj"))
     if not found:
         raise UserError(f"{folder}: expected files named <step>_<frame>_mesh.obj as 3D-Fauna's test run writes them.")
-    ordered = sorted(found, key=lambda name: (int(name) if name.isdigit() else 0, name))
+    ordered = sorted(found, key=lambda name: (int(name) if name.isdecimal() else 0, name))
     return {frame: found[frame][1] for frame in ordered}
 
 

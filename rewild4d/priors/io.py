@@ -14,7 +14,7 @@ Keys (T frames, J bones, n vertices, f faces; lengths in object units, the rest 
     world_to_camera     [T, 4, 4]        rigid, object frame -> OpenCV camera, in object units
     intrinsics          [T, 3, 3]        pixels of the clip's images, pixel centres at +0.5
     sizes               [T, 2]           integers, image width and height
-    transforms          [T, J, 4, 4]     rest -> posed in the object frame, identity at rest
+    transforms          [T, J, 4, 4]     rigid, rest -> posed in the object frame, identity at rest
     quality             text             JSON object of figures (optional)
 
     world_to_camera_flip, intrinsics_flip, transforms_flip   the same for the horizontally flipped images (optional:
@@ -22,6 +22,7 @@ Keys (T frames, J bones, n vertices, f faces; lengths in object units, the rest 
 """
 
 import json
+import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -58,6 +59,9 @@ FLIPPED: dict[str, tuple[str | int, ...]] = {
 }
 INTEGERS = ("faces", "parents", "mirror", "sizes")
 SINGLE = ("vertices", "weights", "bones", "transforms", "transforms_flip")
+RIGID = ("world_to_camera", "world_to_camera_flip", "transforms", "transforms_flip")
+OFF_ROTATION = 0.01
+"""How far R R^T may be from the identity: data sets give rotations to three digits."""
 
 
 def seal(prior: Prior) -> Prior:
@@ -131,11 +135,14 @@ def load_prior(path: Path) -> Prior:
 
 def _read(path: Path) -> Mapping[str, np.ndarray]:
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        archive = np.load(path, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ValueError("it holds a single array")
+        with archive:
             return {key: archive[key] for key in archive.files}
     except FileNotFoundError as error:
         raise UserError(f"{path}: expected a prior file, but there is no such file.") from error
-    except (OSError, ValueError, BadZipFile, EOFError, AttributeError) as error:
+    except (OSError, ValueError, BadZipFile, EOFError, AttributeError, zlib.error) as error:
         raise UserError(f"{path}: expected a prior file (npz), but it cannot be read as one: {error}.") from error
 
 
@@ -208,9 +215,32 @@ def _check_values(path: Path, arrays: Mapping[str, Tensor], flipped: Mapping[str
         (bool((arrays["sizes"] > 0).all()), "'sizes' above zero", f"{int(arrays['sizes'].min())}"),
         (len(flipped) in (0, len(FLIPPED)), f"all or none of {', '.join(FLIPPED)}", f"only {', '.join(flipped)}"),
     ]
+    for key, array in {**arrays, **flipped}.items():
+        if key in RIGID:
+            fault = _off_similarity(array, rigid=True)
+            promises.append((fault <= OFF_ROTATION, f"rigid matrices in '{key}'", f"some that are {fault:.2g} off"))
+        elif key.startswith("intrinsics"):
+            promises.append((_is_pinhole(array), f"positive focal lengths and a last row 0 0 1 in '{key}'", "others"))
+    fault = _off_similarity(arrays["object_to_world"], rigid=False)
+    promises.append((fault <= OFF_ROTATION, "similarities in 'object_to_world'", f"some that are {fault:.2g} off"))
     for kept, expected, came in promises:
         if not kept:
             raise UserError(f"{path}: expected {expected}, got {came}.")
+
+
+def _off_similarity(matrices: Tensor, *, rigid: bool) -> float:
+    """How far matrices are from rotation, translation and (unless rigid) one scale, [..., 4, 4]; 0 where they are."""
+    linear, last = matrices[..., :3, :3].double(), matrices[..., 3, :].double()
+    scale = linear.det().sign().clamp_min(0) if rigid else linear.det().clamp_min(0) ** (1 / 3)
+    turn = linear / scale[..., None, None]
+    gram = turn @ turn.transpose(-1, -2) - torch.eye(3, dtype=torch.float64)
+    off = torch.maximum(gram.abs().amax(), (last - last.new_tensor((0, 0, 0, 1))).abs().amax())
+    return float(off.nan_to_num(nan=torch.inf))
+
+
+def _is_pinhole(intrinsics: Tensor) -> bool:
+    last = torch.equal(intrinsics[:, 2], intrinsics.new_tensor((0, 0, 1)).expand(len(intrinsics), 3))
+    return last and bool((intrinsics[:, (0, 1), (0, 1)] > 0).all())
 
 
 def _is_forest(parents: Tensor) -> bool:

@@ -9,10 +9,13 @@ from torch import Tensor
 from rewild4d.errors import UserError
 from rewild4d.priors.io import seal
 from rewild4d.priors.motion import camera_at, pose_at, world_camera
+from rewild4d.transforms import camera_in_object
 from rewild4d.types import Camera, Clip, Prior
 
 SAME = 0.1
 """Two moments are one where they lie closer than this share of the clip's frame interval."""
+NEAR = 0.01
+"""A prior's camera is the clip's where it puts every joint within this share of the image's longer side."""
 
 
 def resized(prior: Prior, width: int, height: int) -> Prior:
@@ -43,6 +46,43 @@ def placed(prior: Prior, clip: Clip) -> Prior:
             f"{first.width}x{first.height}."
         )
     return in_crops(at_times(prior, [time + clip.start for time in clip.times], clip), clip)
+
+
+def in_world(prior: Prior, clip: Clip, file: str) -> Prior:
+    """A prior from a file, for a clip whose cameras are known: at its moments, seen by its cameras.
+
+    Raises:
+        UserError: it is for other moments, or its cameras and `object_to_world` contradict the clip's cameras, or no
+            mask shows the animal.
+    """
+    if not any((frame.mask > 0.5).any() for frame in clip.frames):
+        raise UserError(f"{clip.name}: expected at least one mask that shows the animal, but all are empty.")
+    try:
+        found = at_times(prior, clip.times, clip)
+    except UserError as error:
+        raise UserError(f"{file}: {error}") from error
+    cameras, flipped = [], []
+    for row, frame in enumerate(clip.frames):
+        assert frame.camera is not None
+        width, height = frame.camera.width, frame.camera.height
+        cameras.append(camera_in_object(frame.camera, found.object_to_world[row]))
+        flipped.append(found.cameras_flip[row].resized(width, height))
+        apart = _apart(found, row, found.cameras[row].resized(width, height), cameras[-1])
+        is_known = float((prior.times - frame.time).abs().min()) * clip.fps <= SAME
+        if is_known and not apart <= NEAR * max(width, height):
+            raise UserError(
+                f"{file}: expected a prior whose cameras agree with those of {clip.name}, but at {frame.time:.3f} s "
+                f"they put the template's joints up to {apart:.3g} pixels apart (was it made for this clip, and with "
+                "known cameras?)."
+            )
+    return seal(replace(found, cameras=tuple(cameras), cameras_flip=tuple(flipped)))
+
+
+def _apart(prior: Prior, row: int, first: Camera, second: Camera) -> float:
+    """The largest distance between the images of a posed bone's end under two cameras, pixels."""
+    transforms = prior.transforms[row].double()
+    ends = prior.bones.double() @ transforms[:, :3, :3].transpose(1, 2) + transforms[:, None, :3, 3]
+    return float((first.project(ends)[0] - second.project(ends)[0]).norm(dim=-1).max())
 
 
 def at_times(prior: Prior, times: Sequence[float], clip: Clip) -> Prior:
