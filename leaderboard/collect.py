@@ -36,6 +36,12 @@ _OPEN = re.compile(r"cc0|cc[ -]by(?![ -]n)|mit\b|apache|bsd|public domain", re.I
 Found = tuple[Path, RunRecord]
 
 
+class _Titled(msgspec.Struct):
+    """What `title_of` reads of a collection's own file."""
+
+    title: str
+
+
 @dataclass
 class Collection:
     """What was collected.
@@ -83,9 +89,18 @@ def collect(found: Sequence[Found], out: Path, *, title: str, pictures: str = "o
 
 
 def title_of(folder: Path) -> str:
-    """The title of a collected folder; the name of any other."""
+    """The title of a collected folder; the name of any other.
+
+    Raises:
+        UserError: the file that should hold the title does not.
+    """
     path = folder / MARKER
-    return json.loads(path.read_text(encoding="utf-8"))["title"] if path.is_file() else folder.resolve().name
+    if not path.is_file():
+        return folder.resolve().name
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=_Titled).title
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: expected the title of a collection, but {error}.") from error
 
 
 def _write(found: Sequence[Found], folder: Path, pictures: str, made: Collection) -> None:

@@ -46,6 +46,7 @@ def latex(table: Table) -> str:
         lines.append(r"\midrule")
         for row in rows:
             stubs = [_tex(stub) for stub in row.stubs]
+            stubs[0] = rf"\textbf{{{stubs[0]}}}" if row.summary else stubs[0]
             stubs[-1] += _tex_number(table.number(*row.notes))
             lines.append(" & ".join([*stubs, *(_latex_cell(cell, table) for cell in row.cells)]) + r" \\")
     lines += [r"\bottomrule", r"\end{tabular}"]
@@ -105,9 +106,10 @@ def _head(column: Column, between: str) -> str:
 
 
 def _first_with(row: Row, table: Table, pattern: str) -> list[str]:
-    """The stubs, the numbers of the row's notes behind the last."""
+    """The stubs, the first bold where the row sums up others, the numbers of the row's notes behind the last."""
     number = table.number(*row.notes)
-    return [*row.stubs[:-1], row.stubs[-1] + (pattern.format(number) if number else "")]
+    stubs = [f"**{row.stubs[0]}**" if row.summary else row.stubs[0], *row.stubs[1:]]
+    return [*stubs[:-1], stubs[-1] + (pattern.format(number) if number else "")]
 
 
 def _no_bars(cells: list[str]) -> Iterator[str]:

@@ -56,6 +56,7 @@ class Row:
         kind: rules are drawn between kinds.
         notes: sentences on the whole row.
         flags: those of the notes that keep the row out of the ranking, to be seen at once.
+        summary: whether it sums up rows above it; where a format has bold titles, its first one is bold.
     """
 
     stubs: tuple[str, ...]
@@ -63,6 +64,7 @@ class Row:
     kind: Kind = "method"
     notes: tuple[str, ...] = ()
     flags: tuple[str, ...] = ()
+    summary: bool = False
 
 
 @dataclass(frozen=True)

@@ -127,18 +127,18 @@ def _sets(record: RunRecord, kind: str, folder: Path) -> Compared:
     """
     if record.status != "ok":
         raise NotPooled(f"{record.case}, {record.method}: failed: {record.error}")
+    try:
+        sets = read_features(folder / FILE, record.features) if record.features else {}
+    except UserError as error:
+        raise NotPooled(str(error).removesuffix(".")) from error
+    if kind in sets:  # also where they are too few for a distance of this case alone
+        return sets[kind]
     score = record.scores.get(kind)
     if score is not None and score.value is None:
         raise NotPooled(f"{record.case}: {score.note.removeprefix('not computed: ')}")
     if not record.features:
         raise NotPooled(f"{record.case}: no features are kept beside its record; `rewild4d-bench evaluate` makes them")
-    try:
-        sets = read_features(folder / FILE, record.features)
-    except UserError as error:
-        raise NotPooled(str(error).removesuffix(".")) from error
-    if kind not in sets:
-        raise NotPooled(f"{record.case}: its features are not of {TITLES[kind]}")
-    return sets[kind]
+    raise NotPooled(f"{record.case}: its features are not of {TITLES[kind]}")
 
 
 def _cells(by_seed: dict[int, list[Distance]], names: Sequence[str], cases: int) -> dict[str, Cell]:
@@ -150,7 +150,8 @@ def _cells(by_seed: dict[int, list[Distance]], names: Sequence[str], cases: int)
         first = next(iter(found.values()))
         values = {seed: each.value for seed, each in found.items() if each.value is not None}
         if len(values) < len(found):
-            cells[name] = Cell("n/a", note=first.note or "not computed")
+            reason = next(each.note for each in found.values() if each.value is None)
+            cells[name] = Cell("n/a", note=reason or "not computed")
             continue
         mean, digits = estimate({"pooled": values}), digits_of(name, "1")
         interval = first.interval if len(found) == 1 else None

@@ -7,10 +7,14 @@ import msgspec
 
 from rewild4d.leaderboard.records import RunRecord
 
-_START = r"(?<![\w.:/\\~<])"
-_PATH = re.compile(rf"{_START}(?:~[\w.-]*(?=/)|/(?=[\w.~])|[A-Za-z]:[\\/])[^\s\"'`,;()\[\]{{}}<>|:]*")
-"""An absolute path inside of a text: POSIX, ~user/..., or with a drive. It ends at a space or at punctuation."""
-_HOMES = re.compile(r"(?:[A-Za-z]:)?[\\/](?:home|Users)[\\/][^\\/]+|~[\w.-]*|/root")
+_URL = r"(?P<url>https?://[^\s\"'`<>]*)"
+_FLAG = r"(?:(?<!\S)(?P<flag>-[A-Za-z]+)(?=/[\w.~-]+/))"
+"""Before a path that is glued to it, as in -I/usr/include."""
+_START = r"(?:(?:file:)?/+(?=[\w.~])|~[\w.-]*(?=/)|[A-Za-z]:[\\/]|\\{2,}(?=\w))"
+_PATH = re.compile(rf"{_URL}|(?:{_FLAG}|(?<![\w./\\~<])){_START}[^\s\"'`,;()\[\]{{}}<>|:]*")
+"""An absolute path inside of a text: POSIX, ~user/..., file:///..., with a drive, or of a server. It ends at a space or
+at punctuation, so that each folder of a list with colons is one; addresses of the web are no paths."""
+_HOMES = re.compile(r"(?:[A-Za-z]:|[\\/]{2}[^\\/]+|/*)[\\/](?:home|Users)[\\/][^\\/]+|~[\w.-]*|/+root")
 
 
 def without_paths(record: RunRecord) -> RunRecord:
@@ -20,7 +24,7 @@ def without_paths(record: RunRecord) -> RunRecord:
 
 def last_part(path: str) -> str:
     """The name of a file or folder without where it lies."""
-    bare = path.rstrip("\\/.")
+    bare = path.removeprefix("file:").rstrip("\\/.")
     return "~" if _HOMES.fullmatch(bare) else re.split(r"[\\/]", bare)[-1] + path[len(path.rstrip(".")) :]
 
 
@@ -31,6 +35,14 @@ def _cleaned(tree: Any) -> Any:
         return [_cleaned(value) for value in tree]
     if not isinstance(tree, str):
         return tree
-    if re.match(r"(?:~[\w.-]*)?/|[A-Za-z]:[\\/]", tree) and not re.search(r"[:;,\n\"']\s|\s[-/~{]", tree[2:]):
+    if re.match(_START, tree) and not re.search(r"[:;,\n\"']\s|\s[-/~{]", tree[2:]):
         return last_part(tree)  # a text that is one path may have spaces in it
-    return _PATH.sub(lambda found: last_part(found[0]), tree)
+    return _PATH.sub(_shortened, tree)
+
+
+def _shortened(found: re.Match[str]) -> str:
+    """What a path inside of a text is cut to."""
+    if found["url"]:
+        return found[0]
+    flag = found["flag"] or ""
+    return flag + last_part(found[0].removeprefix(flag))

@@ -1,5 +1,7 @@
 """Run records: one JSON file a run, strict to read, written atomically, traceable from any table cell."""
 
+import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +98,15 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     features: str = ""
 
 
+class _Protocol(msgspec.Struct):
+    """What every table asks of a record's protocol; the rest is for people."""
+
+    name: str
+    title: str
+    scores: list[str]
+    floors: list[str] = []
+
+
 def make_run_id(**parts: Any) -> str:
     """Sixteen hex digits of the SHA-256 over the JSON of all parts, in a fixed order."""
     return digest(msgspec.json.encode(parts, order="deterministic"))[:16]
@@ -109,7 +120,13 @@ def write_record(record: RunRecord, folder: Path) -> Path:
 
 
 def to_json(record: RunRecord) -> str:
-    """The record as indented JSON; non-finite numbers are an error, never written."""
+    """The record as indented JSON.
+
+    Raises:
+        ValueError: a number that is not finite; the text says where.
+    """
+    if found := next(_not_finite(msgspec.to_builtins(record)), None):
+        raise ValueError(f"expected finite numbers in the record of a run, got {found}")
     return msgspec.json.format(msgspec.json.encode(record, order="sorted"), indent=1).decode()
 
 
@@ -117,17 +134,35 @@ def read_record(path: Path) -> RunRecord:
     """Read one record file.
 
     Raises:
-        UserError: missing, not JSON, or not of this schema.
+        UserError: missing, cannot be read, not JSON, or not of this schema.
     """
     try:
         record = msgspec.json.decode(path.read_bytes(), type=RunRecord)
     except FileNotFoundError as error:
         raise UserError(f"{path}: expected a run record, but there is no such file.") from error
-    except (msgspec.DecodeError, msgspec.ValidationError) as error:
+    except OSError as error:
+        raise UserError(f"{path}: expected a run record, but it cannot be read: {error.strerror}.") from error
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: expected a run record of schema {SCHEMA}, but {error}.") from error
     if record.schema != SCHEMA:
         raise UserError(f"{path}: expected a run record of schema {SCHEMA}, got schema {record.schema}.")
+    try:
+        msgspec.convert(record.protocol, _Protocol)
+    except msgspec.ValidationError as error:
+        raise UserError(f"{path}: expected the protocol of a run, but in `protocol`: {error}.") from error
     return record
+
+
+def _not_finite(tree: Any, place: str = "") -> Iterator[str]:
+    """Numbers that JSON has no word for, with where they are: "nan at scores.psnr.value"."""
+    if isinstance(tree, dict):
+        for name, value in tree.items():
+            yield from _not_finite(value, f"{place}.{name}" if place else str(name))
+    elif isinstance(tree, list | tuple):
+        for index, value in enumerate(tree):
+            yield from _not_finite(value, f"{place}[{index}]")
+    elif isinstance(tree, float) and not math.isfinite(tree):
+        yield f"{tree} at {place}"
 
 
 def find_records(folder: Path) -> list[tuple[Path, RunRecord]]:

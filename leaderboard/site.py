@@ -13,11 +13,12 @@ from markupsafe import Markup
 
 from rewild4d.errors import UserError
 from rewild4d.files import replaced_folder
+from rewild4d.leaderboard.cells import cell
 from rewild4d.leaderboard.curves import curve, moments
 from rewild4d.leaderboard.formats import ARROWS, html
 from rewild4d.leaderboard.layout import Table
 from rewild4d.leaderboard.records import FILE, RunRecord
-from rewild4d.leaderboard.tables import by_protocol, cell, columns_of, standings
+from rewild4d.leaderboard.tables import by_protocol, columns_of, standings
 from rewild4d.leaderboard.variants import variants
 
 TITLE = "Reconstructing 4D animals from one video"

@@ -59,8 +59,9 @@ def estimate(values: Cases) -> Estimate:
 def paired(values: Cases, reference: Cases) -> Difference:
     """Difference to a reference, case by case, with a bootstrap interval.
 
-    Cases are drawn with replacement, then the seeds of either side within each, so that the interval holds both what
-    another set of animals and what another set of seeds would change. With one case only the seeds vary.
+    Cases are drawn with replacement, then the seeds of either side within each drawn one (a case that is drawn twice
+    gets new seeds the second time), so that the interval holds both what another set of animals and what another set
+    of seeds would change. With one case only the seeds vary.
 
     Args:
         values: of one method.
@@ -77,15 +78,27 @@ def paired(values: Cases, reference: Cases) -> Difference:
     if len(shared) == 1 and all(len(side[0]) == 1 for side in sides):
         return Difference(mean, None, 1)
     generator = np.random.default_rng(0)
-    drawn = np.zeros((len(shared), DRAWS))
-    for sign, side in zip((1.0, -1.0), sides, strict=True):
-        for row, seeds in enumerate(side):
-            picks = generator.integers(len(seeds), size=(DRAWS, len(seeds)))
-            drawn[row] += sign * seeds[picks].mean(axis=1)
-    rows = generator.integers(len(shared), size=(len(shared), DRAWS))
-    means = np.take_along_axis(drawn, rows, axis=0).mean(axis=0)
-    low, high = np.quantile(means, (0.025, 0.975))
+    total = np.zeros(DRAWS)
+    for _ in shared:
+        rows = generator.integers(len(shared), size=DRAWS)
+        total += _redrawn(sides[0], rows, generator) - _redrawn(sides[1], rows, generator)
+    low, high = np.quantile(total / len(shared), (0.025, 0.975))
     return Difference(mean, (float(low), float(high)), len(shared))
+
+
+def _redrawn(side: Sequence[np.ndarray], rows: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Of each drawn case the mean of as many seeds as it has, drawn with replacement anew for every draw.
+
+    Args:
+        side: the seeds' values of each case, [seeds] each.
+        rows: indices of the drawn cases, [draws].
+    """
+    means = np.empty(len(rows))
+    for row, seeds in enumerate(side):
+        places = np.flatnonzero(rows == row)
+        picks = generator.integers(len(seeds), size=(len(places), len(seeds)))
+        means[places] = seeds[picks].mean(axis=1)
+    return means
 
 
 def ranks(estimates: Sequence[Estimate | None], better: str, digits: int) -> list[str]:

@@ -6,17 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from rewild4d.errors import unknown_name
+from rewild4d.leaderboard.cells import cell, difference, values_of
 from rewild4d.leaderboard.formats import markdown as to_markdown
 from rewild4d.leaderboard.layout import Cell, Column, Row, Table
-from rewild4d.leaderboard.records import RunRecord, Score
+from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.specs import Reported, ReportedCell
-from rewild4d.leaderboard.statistics import Estimate, estimate, paired, ranks
+from rewild4d.leaderboard.statistics import Estimate, estimate, ranks
 from rewild4d.leaderboard.titles import LESS_IS_BETTER, TITLES, digits_of
 from rewild4d.leaderboard.variants import Variant, coverage_text, is_floor, latest, marks, variants
 from rewild4d.metrics.sets import KINDS
 
-Values = dict[str, dict[int, float]]
-"""Case -> seed -> value."""
 POOLED = "KID and FVD in rows of the mean are means over cases; `table --pooled` computes them over all cases at once."
 
 
@@ -83,7 +82,7 @@ def protocol_tables(records: Sequence[RunRecord]) -> list[Table]:
             if any(record.case == case for record in variant.records)
         ]
         if len(cases) > 1:
-            rows += [_timed_row("**mean**", variant, cases, frame.scores) for variant in named]
+            rows += [_timed_row("mean", variant, cases, frame.scores) for variant in named]
             if any(name in scores for scores in KINDS.values() for name in frame.scores):
                 frame = replace(frame, remarks=(*frame.remarks, POOLED))
         tables.append(
@@ -151,7 +150,7 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
         if entrant is reference:
             continue
         pairs = zip(entrant.records, reference.records, strict=True)
-        cells = [_difference(*pair, name) for pair in pairs for name in frame.scores]
+        cells = [difference(*pair, name, entrant.absent) for pair in pairs for name in frame.scores]
         flags = marks([record for under in entrant.records for record in under])
         if not flags:
             cells = [_leading(cell, column.better) for cell, column in zip(cells, columns, strict=True)]
@@ -189,18 +188,27 @@ def _frame(records: Sequence[RunRecord], remarks: Sequence[str]) -> Frame:
 
 
 def _floors(records: Sequence[RunRecord], scores: Sequence[str]) -> list[str]:
-    """One sentence on what a perfect shape would get, averaged over the cases; none where no score has a floor."""
+    """One sentence on what a perfect shape would get; none where no score has a floor.
+
+    A floor is of as many points as its row has, so that rows have floors of their own: the sentence gives the lowest
+    and the highest of the rows' means, and whose they are.
+    """
+    shapes = {variant.label: [run for run in variant.records if _has_shape(run)] for variant in variants(records)}
     parts = []
     for name in scores:
-        floors = {
-            record.case: found.floor
-            for record in records
-            if (found := record.scores.get(name)) is not None and found.floor is not None
-        }
-        if floors:
-            parts.append(f"{TITLES.get(name, name)} {statistics.fmean(floors.values()):.{digits_of(name, '1')}f}")
-    words = "A second sampling of the true surface, which is what a perfect shape gets"
+        found = {label: values_of(runs, name, lambda score: score.floor) for label, runs in shapes.items()}
+        means = sorted((estimate(values).mean, label) for label, values in found.items() if values)
+        if means:
+            low, high = (f"{mean:.{digits_of(name, '1')}f}" for mean, _ in (means[0], means[-1]))
+            shown = low if low == high else f"{low} ({means[0][1]}) to {high} ({means[-1][1]})"
+            parts.append(f"{TITLES.get(name, name)} {shown}")
+    words = "A second sampling of the true surface by as many points as a row has, which is what a perfect shape gets"
     return [f"{words}: {', '.join(parts)}."] if parts else []
+
+
+def _has_shape(record: RunRecord) -> bool:
+    """Whether points stood behind its scores of the shape; the floor of a row without any says nothing."""
+    return all(score.value is not None for score in record.scores.values() if score.floor is not None)
 
 
 def _columns(frame: Frame, records: Sequence[RunRecord]) -> tuple[Column, ...]:
@@ -224,7 +232,7 @@ def _timed_row(title: str, variant: Variant, cases: list[str], scores: Sequence[
     seconds = f"{statistics.fmean(run.timing.fit_seconds for run in good):.0f}" if whole else "-"
     cells = (*(cell(runs, cases, name) for name in scores), Cell(seeds), Cell(seconds))
     kind = "floor" if variant.is_floor else "method"
-    return Row((title, variant.label), cells, kind, variant.marks, variant.marks)
+    return Row((title, variant.label), cells, kind, variant.marks, variant.marks, summary=len(cases) > 1)
 
 
 def _named_row(entrant: Entrant, entrants: Sequence[Entrant], columns: Sequence[Column], frame: Frame) -> Row:
@@ -267,68 +275,6 @@ def _ranked(rows: list[Row], columns: Sequence[Column]) -> list[Row]:
             marked[place] = replace(marked[place], mark=mark)
             rows[index] = replace(rows[index], cells=tuple(marked))
     return rows
-
-
-def cell(records: Sequence[RunRecord], cases: Sequence[str], name: str) -> Cell:
-    """Mean and spread of a score over cases, or why there is none: unequal sets are not averaged.
-
-    Args:
-        records: of one row under one condition.
-        cases: every one must have a value.
-        name: of the score.
-    """
-    wanted = [record for record in records if record.case in cases]
-    good = [record for record in wanted if record.status == "ok"]
-    for case in cases:
-        failed = next((record for record in wanted if record.case == case and record.status != "ok"), None)
-        if failed and not any(record.case == case for record in good):
-            return Cell("failed", note=f"{case}, {failed.method}: failed: {failed.error}")
-    missing = [case for case in cases if not any(record.case == case for record in good)]
-    if missing:
-        whole = len(missing) == len(cases)
-        return Cell("n/a", note="no record yet" if whole else f"not computed: no result for {', '.join(missing)}")
-    found = [(record, record.scores.get(name)) for record in good]
-    values, unit = _values(good, name)
-    for record, score in found:
-        if record.case not in values:
-            reason = score.note if score else f"not computed: {record.protocol['name']} does not measure it"
-            return Cell("n/a", note=reason)
-    lost = len(wanted) - len(good)
-    note = f"{lost} of {len(wanted)} runs failed: {next(r.error for r in wanted if r.status != 'ok')}" if lost else ""
-    return _number(estimate(values), digits_of(name, unit), note)
-
-
-def _values(records: Sequence[RunRecord], name: str) -> tuple[Values, str]:
-    """Values by case and seed of good records, and their unit."""
-    values: Values = defaultdict(dict)
-    unit = "1"
-    for record in records:
-        score: Score | None = record.scores.get(name) if record.status == "ok" else None
-        if score is not None and score.value is not None:
-            values[record.case][record.seed] = score.value
-            unit = score.unit
-    return dict(values), unit
-
-
-def _difference(records: Sequence[RunRecord], reference: Sequence[RunRecord], name: str) -> Cell:
-    (values, unit), (others, _) = _values(records, name), _values(reference, name)
-    shared = [case for case in values if case in others]
-    if not shared:
-        return Cell("n/a", note="no case in common")
-    found, digits = paired(values, others), digits_of(name, unit)
-    interval = " [" + ", ".join(_signed(end, digits) for end in found.interval) + "]" if found.interval else ""
-    left = sorted(set(values) ^ set(others))
-    note = f"over {len(shared)} cases; only one side has {', '.join(left)}" if left else ""
-    return Cell(_signed(found.mean, digits) + interval, note=note, value=found.mean, interval=found.interval)
-
-
-def _number(found: Estimate, digits: int, note: str) -> Cell:
-    spread = "" if found.spread is None else f"{found.spread:.{digits}f}"
-    return Cell(f"{found.mean:.{digits}f}", spread, note=note, value=found.mean, deviation=found.spread)
-
-
-def _signed(value: float, digits: int) -> str:
-    return f"{value:+.{digits}f}".replace("-", "−")
 
 
 def _reported_rows(reported: Reported, columns: Sequence[Column]) -> list[Row]:

@@ -44,13 +44,13 @@ class Measured:
     """One quantity of a comparison.
 
     Attributes:
-        value: mean over the moments that have one; None where none has, ``note`` then says why.
+        value: mean over the moments; None where any of them has none, ``note`` then says why.
         unit: "1" for a ratio, "world" for the clouds' own unit of length.
         better: "higher" or "lower".
         per_frame: the value at each moment, None where there is none.
         floor: the same quantity for a second sampling of the truth in the prediction's place, which is what a perfect
             shape gets; ``Comparison.note`` says of how many points. None where there is no second sampling.
-        note: why there is no value, or what was left out.
+        note: why there is no value, or "".
     """
 
     value: float | None
@@ -114,7 +114,10 @@ def compare_sequence(
     points: int = POINTS,
     seed: int = 0,
 ) -> Comparison:
-    """Chamfer distance and F-score of a sequence, each the mean over its moments.
+    """Chamfer distance and F-score of a sequence, each the mean over all its moments.
+
+    A moment without points has an F-score of 0 and no Chamfer distance, and then the sequence has none either: a mean
+    over the others would favour a method that leaves out its worst moments.
 
     Scores: "chamfer" (mean of the directions) with "chamfer_to_truth" and "chamfer_to_prediction", in the clouds' unit;
     "chamfer_relative", over the diagonal; "fscore_1", "fscore_2", "fscore_5" at so many percent of the diagonal. Each
@@ -213,18 +216,16 @@ def _measured(
         return value if value is not None and math.isfinite(value) else None
 
     items = tuple(finite(found) for found in frames)
-    present = [item for item in items if item is not None]
     below = [item for item in map(finite, floors) if item is not None]
     floor = math.fsum(below) / len(below) if below else None
-    if not present:
-        if all(found is not None and not len(found.to_truth) for found in frames):
+    missing = [found for item, found in zip(items, frames, strict=True) if item is None]
+    if missing:
+        if all(found is not None and not len(found.to_truth) for found in missing):
             reason = "the prediction has no points"
+        where = f" at {len(missing)} of {len(items)} moments" if len(missing) < len(items) else ""
         reason = reason or "the truth's diagonal is zero"
-        return Measured(None, unit, better, items, floor, f"not computed: {reason}")
-    note = f"{len(items) - len(present)} of {len(items)} moments left out: not defined there"
-    return Measured(
-        math.fsum(present) / len(present), unit, better, items, floor, note if len(present) < len(items) else ""
-    )
+        return Measured(None, unit, better, items, floor, f"not computed: {reason}{where}")
+    return Measured(math.fsum(filter(None, items)) / len(items), unit, better, items, floor, "")
 
 
 def _floors(

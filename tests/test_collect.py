@@ -73,6 +73,19 @@ def test_only_what_a_page_needs_is_kept(tmp_path: Path) -> None:
     assert (about["runs"], about["with_pictures"]) == (2, 1)
 
 
+def test_a_damaged_collection_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    keep(tmp_path / "runs" / "1", 1, drawn=False)
+    for text, reason in (
+        ("{", "Input data was truncated"), ("{}", "Object missing required field `title`"), ("[]", "Expected `object`"),
+        ('{"title": 5}', "Expected `str`, got `int`"),
+    ):  # fmt: skip
+        (tmp_path / "runs" / MARKER).write_text(text)
+        with pytest.raises(UserError, match=f"collection.json: expected the title of a collection, but {reason}"):
+            title_of(tmp_path / "runs")
+    assert call("leaderboard", "build", "--runs", str(tmp_path / "runs"), "--out", str(tmp_path / "page")) == 2
+    assert "expected the title of a collection" in capsys.readouterr().err and not (tmp_path / "page").exists()
+
+
 def test_means_stay_and_items_are_shortened(tmp_path: Path) -> None:
     for seed in (1, 2):
         keep(tmp_path / "runs" / str(seed), seed, drawn=False)
@@ -111,6 +124,18 @@ def test_a_curve_over_time_is_the_same_after_averaging() -> None:
         ("/usr/bin/python /home/jane/theirs.py {clip}", "python theirs.py {clip}"),
         ('{"masks": "/home/jane/masks"}', '{"masks": "masks"}'),
         ("masks of the input from /home/jane/m; 2 are empty", "masks of the input from m; 2 are empty"),
+        ("file:///home/jane/secret/x.ply", "x.ply"),
+        ("file:///home/jane", "~"),
+        ("see file:///home/jane, then", "see ~, then"),
+        ("PYTHONPATH=/home/jane/a:/home/jane/b python x.py", "PYTHONPATH=a:b python x.py"),
+        ("ssh host:/home/jane/x", "ssh host:x"),
+        ("cc -I/home/jane/inc -o/home/jane/out x.c", "cc -Iinc -oout x.c"),
+        ("-I/home/jane/inc", "-Iinc"),
+        (r"\\server\share\jane\x", "x"),
+        (r"read \\server\share\jane\x twice", "read x twice"),
+        ("//nas/jane/data", "data"),
+        ("see https://a.org/home/b/c, /home/jane/d", "see https://a.org/home/b/c, d"),
+        ("the -x/y plane", "the -x/y plane"),
         ("wolf/Run, 1/2 of it, https://a.org/b/c", "wolf/Run, 1/2 of it, https://a.org/b/c"),
         (
             "CC BY-NC 4.0 (DAVIS, Perazzi et al. 2016): attribute",

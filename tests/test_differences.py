@@ -116,7 +116,8 @@ def test_one_condition_alone(runs: Path, capsys: pytest.CaptureFixture[str]) -> 
     titles = load_specs()["artemis"].scores
     assert cells[titles.index("psnr")] == "−1.00 [−1.00, −1.00]"
     assert cells[titles.index("lpips_alex")] == "**−0.010 [−0.010, −0.010]**"
-    assert cells[titles.index("fscore_1")] == "n/a [1]" and "[1] no case in common" in text
+    assert cells[titles.index("fscore_1")] == "n/a [2]"
+    assert f"[2] not computed: {planning.newest_protocol('artemis-random-256')} does not measure it" in text
 
 
 def test_an_interval_that_holds_0_is_no_lead(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -137,3 +138,21 @@ def test_an_interval_that_holds_0_is_no_lead(tmp_path: Path, capsys: pytest.Capt
     # Of draws of four rigs 31.6 % are without the bad one and 5.1 % have it three times or more, 0.4 % four times.
     assert (-2.0 * 3 + 2.0) / 4 == -1.0 and 0.75**4 > 0.025 and 4 * 0.25**3 * 0.75 + 0.25**4 > 0.025 > 0.25**4
     assert first == f"+{(3 * 2.0 - 2.0) / 4:.2f} [−1.00, +2.00]"
+
+
+def test_a_preset_or_a_case_that_is_not_there_is_said(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def refused(*words: str) -> str:
+        with pytest.raises(SystemExit) as stop:
+            cli.main(list(words))
+        assert stop.value.code == 2
+        return capsys.readouterr().err
+
+    bogus = "unknown preset 'bogus'. Available: paper, quick, standard."
+    assert bogus in refused("table", "sweep-random", "--runs", str(runs), "--preset", "bogus")
+    page = str(runs / "page")
+    assert bogus in refused("leaderboard", "build", "--runs", str(runs), "--out", page, "--preset", "bogus")
+    cases = f"unknown case 'horse/Wal'. Did you mean 'horse/Walk'? Available: {', '.join(sorted(RIGS))}."
+    for name in ((), ("sweep-random",)):
+        assert cases in refused("table", *name, "--runs", str(runs), "--case", "horse/Wal")
+    shown = call(capsys, "table", "--runs", str(runs), "--case", "*o*/*a*")
+    assert "| horse/Walk |" in shown and "| fox/Run |" not in shown and "| wolf/Gallop |" in shown

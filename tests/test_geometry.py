@@ -174,9 +174,15 @@ def test_an_empty_prediction_recalls_nothing() -> None:
     assert found["fscore_5"].value == 0 and found["chamfer"].value is None
     assert found["chamfer"].note == "not computed: the prediction has no points"
     half = compare_sequence([torch.zeros(0, 3), animal(500, 1)], [animal(500, 0)] * 2, up=UP).scores
-    assert half["chamfer"].per_frame[0] is None and half["chamfer"].value == half["chamfer"].per_frame[1]
-    assert half["chamfer"].note == "1 of 2 moments left out: not defined there"
+    first, second = half["chamfer"].per_frame
+    assert first is None and second > 0 and half["chamfer"].value is None, "the moment that is there is not the mean"
+    assert half["chamfer"].note == "not computed: the prediction has no points at 1 of 2 moments"
     assert half["fscore_5"].value == pytest.approx((0 + 1) / 2)
+    line = torch.linspace(0, 1, 9)[:, None] * torch.ones(1, 3)
+    framewise = compare_sequence([line, animal(500, 1)], [animal(500, 0)] * 2, fit="frame", up=UP).scores
+    reason = "the prediction's points lie on one line, so no rotation is unique at 1 of 2 moments"
+    assert {score.value for score in framewise.values()} == {None}
+    assert {score.note for score in framewise.values()} == {f"not computed: {reason}"}
 
 
 def test_bad_clouds_are_named() -> None:

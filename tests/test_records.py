@@ -1,14 +1,16 @@
 """Records: round trip, strict reading, and tables that refuse to average what cannot be averaged."""
 
+import math
+import re
 from pathlib import Path
+from typing import Any
 
-import msgspec
 import pytest
-from records_for_tests import psnr, record
+from records_for_tests import PROTOCOL, psnr, record
 
 from rewild4d.errors import UserError
 from rewild4d.image_scores import summarize
-from rewild4d.leaderboard.records import make_run_id, read_record, to_json, write_record
+from rewild4d.leaderboard.records import Score, find_records, make_run_id, read_record, to_json, write_record
 from rewild4d.leaderboard.tables import markdown
 
 
@@ -32,6 +34,30 @@ def test_reading_is_strict(tmp_path: Path) -> None:
         read_record(path)
     with pytest.raises(UserError, match="no such file"):
         read_record(tmp_path / "other.json")
+    path.write_bytes(b'{"case": "\xff"}')
+    with pytest.raises(UserError, match="expected a run record of schema 1, but 'utf-8' codec can't decode"):
+        read_record(path)
+    path.write_text(to_json(record(config={"a": "DEEP"})).replace('"DEEP"', "[" * 9999 + "]" * 9999))
+    with pytest.raises(UserError, match="expected a run record of schema 1, but"):
+        read_record(path)
+
+
+@pytest.mark.parametrize("name", ["name", "title", "scores"])
+def test_a_protocol_has_what_tables_ask_of_it(tmp_path: Path, name: str) -> None:
+    protocol = {key: value for key, value in PROTOCOL.items() if key != name}
+    path = write_record(record(protocol=protocol), tmp_path)
+    sentence = f"record.json: expected the protocol of a run, but in `protocol`: .*missing required field `{name}`"
+    with pytest.raises(UserError, match=sentence):
+        read_record(path)
+    write_record(record(protocol={**PROTOCOL, name: 5}), tmp_path)
+    with pytest.raises(UserError, match=rf"in `protocol`: Expected `\w+`, got `int` - at `\$.{name}`"):
+        read_record(path)
+
+
+def test_a_folder_is_no_record(tmp_path: Path) -> None:
+    (tmp_path / "run" / "record.json").mkdir(parents=True)
+    with pytest.raises(UserError, match="expected a run record, but it cannot be read: Is a directory"):
+        find_records(tmp_path)
 
 
 def test_run_id_depends_on_every_part() -> None:
@@ -67,7 +93,16 @@ def test_a_score_without_a_value_says_why() -> None:
     assert some.note == "1 images left out: not defined there; 1 identical images counted as 100 dB"
 
 
-def test_not_finite_is_never_written() -> None:
-    text = to_json(record(scores=psnr(float("nan"))))
-    with pytest.raises(msgspec.ValidationError):
-        msgspec.convert(msgspec.json.decode(text)["scores"]["psnr"]["per_item"], list[float])
+@pytest.mark.parametrize(
+    ("changes", "place"),
+    [
+        ({"scores": psnr(math.nan)}, "nan at scores.psnr.value"),
+        ({"scores": {"psnr": Score(1.0, "dB", "higher", 2, [1.0, math.inf])}}, "inf at scores.psnr.per_item[1]"),
+        ({"diagnostics": {"motion": [{"turn": -math.inf}]}}, "-inf at diagnostics.motion[0].turn"),
+        ({"coverage": {"foreground": math.nan}}, "nan at coverage.foreground"),
+    ],
+)
+def test_not_finite_is_never_written(tmp_path: Path, changes: dict[str, Any], place: str) -> None:
+    with pytest.raises(ValueError, match="expected finite numbers in the record of a run, got " + re.escape(place)):
+        write_record(record(**changes), tmp_path)
+    assert not list(tmp_path.iterdir())

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 import torch
 from extractors import LinearNetwork, LinearVideoNetwork
@@ -129,6 +130,27 @@ def test_the_table_pools_all_cases_of_a_method(tmp_path: Path) -> None:
     assert [column.score for column in made.columns] == list(SCORES)
 
 
+def test_cases_too_short_for_a_distance_of_their_own_are_pooled(tmp_path: Path) -> None:
+    """A clip of sixteen frames is one window: sixteen renders against one, of which no distance can be computed."""
+    found, parts = [], []
+    for index in range(8):
+        folder = tmp_path / str(index)
+        ones = [features(rows, 90 * index + rows, "clips", 16) for rows in (16, 1)]
+        parts.append(Compared("fvd_f", *ones, WHITE))
+        scores = novel_views.as_scores(distances(parts[-1]), ("fvd_f", "kvd_f"), {})
+        reason = "not computed: at least 2 samples a side are needed, got 16 and 1"
+        assert {(score.value, score.note) for score in scores.values()} == {(None, reason)}
+        digest = write_features(parts[-1:], folder / FILE)
+        protocol = {**PROTOCOL, "scores": ["fvd_f", "kvd_f"]}
+        found.append((folder, record(case=str(index), protocol=protocol, scores=scores, features=digest)))
+    cells = pooled_tables(found)[0].rows[0].cells
+    expected = distances(pool([read_features(folder / FILE)["fvd_f"] for folder, _ in found]))
+    assert [cell.value for cell in cells] == [one.value for one in expected] and all(cell.value for cell in cells)
+    assert cells[0].note == f"FVD-F: 8 cases pooled, n = {8 * 16}, m = {8 * 1}, T = 16"
+    (alone,) = pooled_tables(found[:1])[0].rows
+    assert [(cell.text, cell.note) for cell in alone.cells] == [("n/a", reason)] * 2
+
+
 def test_seeds_are_pooled_on_their_own(tmp_path: Path) -> None:
     found = [run(tmp_path / f"{case}{seed}", case, seed) for case in ("a", "bb") for seed in (0, 1)]
     values = []
@@ -152,7 +174,12 @@ def test_a_case_without_features_keeps_the_method_from_being_pooled(tmp_path: Pa
         "not computed: bb: no features are kept beside its record; `rewild4d-bench evaluate` makes them"
     )
     missing = {"fvd_f": Score(None, "1", "lower", 0, [], "not computed: weights missing, run: x")}
-    assert note(run(tmp_path / "w", "bb", 0, scores=missing)) == "not computed: bb: weights missing, run: x"
+    bare = run(tmp_path / "w", "bb", 0, scores=missing, features="")
+    assert note(bare) == "not computed: bb: weights missing, run: x"
+    images = write_features(sets(9)[:1], tmp_path / "w" / FILE)
+    for scores, reason in ((missing, "weights missing, run: x"), ({}, "its features are not of FVD-F")):
+        kept_images = msgspec.structs.replace(bare[1], scores=scores, features=images)
+        assert note((tmp_path / "w", kept_images)) == f"not computed: bb: {reason}"
     failed = run(tmp_path / "f", "bb", 0, status="failed", error="it broke", scores={})
     assert note(failed) == "not computed: bb, ours: failed: it broke"
     assert note(run(tmp_path / "s", "bb", 1)).startswith("not computed: no result with seed 0 for bb")

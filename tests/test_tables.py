@@ -85,6 +85,15 @@ def test_the_bootstrap_is_that_of_the_mean() -> None:
     assert high == pytest.approx(noise.mean() + 1.96 * error, abs=0.15 * error)
 
 
+def test_seeds_are_drawn_anew_for_every_drawn_case() -> None:
+    """Cases that are alike, seeds at -1 and 1: a drawn case is a mean of two draws, of variance 1 / 2, whichever case
+    it is, so that the mean over 100 of them has the variance 1 / 200."""
+    one = {str(case): {0: -1.0, 1: 1.0} for case in range(100)}
+    other = {str(case): {0: 0.0} for case in range(100)}
+    low, high = paired(one, other).interval or (math.nan, math.nan)
+    assert (low, high) == pytest.approx((-1.96 * math.sqrt(1 / 200), 1.96 * math.sqrt(1 / 200)), rel=0.06)
+
+
 def test_a_single_case_has_an_interval_from_its_seeds_only() -> None:
     assert paired({"a": {0: 3.0}}, {"a": {0: 1.0}}).interval is None
     low, high = paired({"a": {0: 3.0, 1: 5.0}}, {"a": {0: 1.0}}).interval or (math.nan, math.nan)

@@ -265,8 +265,8 @@ def test_badja_is_row_then_column(tmp_path: Path) -> None:
 @pytest.mark.parametrize("dataset", ["davis", "aptv2", "online"])
 def test_protocols_of_videos(dataset: str) -> None:
     default = find_protocol(dataset, None)
-    assert default.name == f"{dataset}-512-v1"
-    small = find_protocol(dataset, f"{dataset}-256-v1")
+    assert default.name == f"{dataset}-512-v2"
+    small = find_protocol(dataset, f"{dataset}-256-v2")
     assert (default.selection.size, small.selection.size) == (512, 256)
     assert default.selection.split == 5 and default.selection.framing == "crop"
 

@@ -6,7 +6,8 @@ from fnmatch import fnmatchcase
 import msgspec
 
 from rewild4d import planning
-from rewild4d.errors import UserError
+from rewild4d.config import preset_names
+from rewild4d.errors import UserError, unknown_name
 from rewild4d.leaderboard.specs import Spec
 from rewild4d.protocol import load_protocols
 
@@ -15,8 +16,11 @@ def chosen(name: str, spec: Spec, choice: planning.Choice) -> Spec:
     """The table after the command line's changes; a protocol of another data set brings all cases of that data set.
 
     Raises:
-        UserError: as `planning.with_choice`.
+        UserError: a preset that no row has, or as `planning.with_choice`.
     """
+    presets = {preset for row in spec.rows if not row.preset for preset in preset_names(row.method)}
+    if choice.preset and presets and choice.preset not in presets:
+        raise unknown_name("preset", choice.preset, presets)
     if choice.protocol and len(spec.conditions) == 1:
         known = load_protocols().get(planning.newest_protocol(choice.protocol))
         if known is not None and known.dataset != spec.dataset:

@@ -16,6 +16,7 @@ from rewild4d.leaderboard.pooled import pooled_table, pooled_tables
 from rewild4d.leaderboard.records import RunRecord, find_records
 from rewild4d.leaderboard.specs import find_spec
 from rewild4d.leaderboard.tables import difference_table, named_table, protocol_tables
+from rewild4d.runner import choose_cases
 
 DESCRIPTION = """Print what was found, from the records in a folder: with a name one of the tables in leaderboard/tables
 (see `list`), rows averaged over the cases, the best bold, the second underlined; without one everything, a table per
@@ -33,7 +34,7 @@ class Options:
         against: label of a row: adds the difference of all others to it, case by case, with a bootstrap interval.
         protocol: only this protocol's runs; of a table with one condition, that condition.
         preset: of the runs in a named table; the table's own where it is left out.
-        case: only these cases.
+        case: only these cases, names or patterns ("wolf/*").
         pooled: KID and FVD over all cases at once, from the features kept beside the records.
     """
 
@@ -87,5 +88,7 @@ def _named(options: Options) -> list[Table]:
 
 
 def _found(options: Options) -> list[tuple[Path, RunRecord]]:
-    """The records, each with its folder."""
-    return [pair for pair in find_records(options.runs) if not options.case or pair[1].case in options.case]
+    """The records of the chosen cases, each with its folder."""
+    found = find_records(options.runs)
+    cases = choose_cases(list(dict.fromkeys(record.case for _, record in found)), options.case)
+    return [pair for pair in found if pair[1].case in cases]

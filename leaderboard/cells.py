@@ -1,0 +1,121 @@
+"""Figures of tables: the mean of a score over cases and seeds, the difference to another row, or why there is none."""
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from itertools import islice
+
+from rewild4d.leaderboard.layout import Cell
+from rewild4d.leaderboard.records import RunRecord, Score
+from rewild4d.leaderboard.statistics import estimate, paired
+from rewild4d.leaderboard.titles import digits_of
+
+Values = dict[str, dict[int, float]]
+"""Case -> seed -> value."""
+
+
+def cell(records: Sequence[RunRecord], cases: Sequence[str], name: str) -> Cell:
+    """Mean and spread of a score over cases, or why there is none: unequal sets are not averaged.
+
+    Args:
+        records: of one row under one condition.
+        cases: every one must have a value.
+        name: of the score.
+    """
+    wanted = [record for record in records if record.case in cases]
+    good = [record for record in wanted if record.status == "ok"]
+    for case in cases:
+        failed = next((record for record in wanted if record.case == case and record.status != "ok"), None)
+        if failed and not any(record.case == case for record in good):
+            return Cell("failed", note=f"{case}, {failed.method}: failed: {failed.error}")
+    missing = [case for case in cases if not any(record.case == case for record in good)]
+    if missing:
+        whole = len(missing) == len(cases)
+        return Cell("n/a", note="no record yet" if whole else f"not computed: no result for {', '.join(missing)}")
+    values = values_of(good, name)
+    for record in good:
+        if record.case not in values:
+            return Cell("n/a", note=f"not computed: {_reason(record, name)}")
+    found, digits = estimate(values), digits_of(name, _unit(good, name))
+    spread = "" if found.spread is None else f"{found.spread:.{digits}f}"
+    note = _left_out(wanted, name)
+    return Cell(f"{found.mean:.{digits}f}", spread, note=note, value=found.mean, deviation=found.spread)
+
+
+def difference(records: Sequence[RunRecord], reference: Sequence[RunRecord], name: str, absent: str = "") -> Cell:
+    """The mean of the differences of the cases that both rows have, and its interval, or why there is none.
+
+    Args:
+        records: of one row under one condition.
+        reference: of the row that it is compared with, under the same.
+        name: of the score.
+        absent: why the row can have no records, or "".
+    """
+    values, others = values_of(records, name), values_of(reference, name)
+    shared = [case for case in values if case in others]
+    if not shared:
+        return Cell("n/a", note=absent or _no_difference(records, reference, name))
+    found, digits = paired(values, others), digits_of(name, _unit(records, name))
+    interval = " [" + ", ".join(_signed(end, digits) for end in found.interval) + "]" if found.interval else ""
+    left = sorted(set(values) ^ set(others))
+    notes = [f"over {len(shared)} cases; only one side has {', '.join(left)}"] if left else []
+    notes += [_left_out([run for run in side if run.case in shared], name) for side in (records, reference)]
+    note = "; ".join(dict.fromkeys(filter(None, notes)))
+    return Cell(_signed(found.mean, digits) + interval, note=note, value=found.mean, interval=found.interval)
+
+
+def values_of(
+    records: Sequence[RunRecord], name: str, quantity: Callable[[Score], float | None] = lambda score: score.value
+) -> Values:
+    """By case and seed, of good records, a score's value (or another quantity of it) where there is one."""
+    values: Values = defaultdict(dict)
+    for record in records:
+        score = record.scores.get(name) if record.status == "ok" else None
+        found = None if score is None else quantity(score)
+        if found is not None:
+            values[record.case][record.seed] = found
+    return dict(values)
+
+
+def _unit(records: Sequence[RunRecord], name: str) -> str:
+    """The unit of a score; "1" where none of the records has it."""
+    return next((record.scores[name].unit for record in records if name in record.scores), "1")
+
+
+def _reason(record: RunRecord, name: str) -> str:
+    """Why a good record has no value."""
+    score = record.scores.get(name)
+    if score is None:
+        return f"{record.protocol['name']} does not measure it"
+    return score.note.removeprefix("not computed: ")
+
+
+def _left_out(records: Sequence[RunRecord], name: str) -> str:
+    """What the mean is without: runs of cases that have a value all the same, and items; "" where it is whole."""
+    failed = [record for record in records if record.status != "ok"]
+    values = values_of(records, name)
+    empty = [r for r in records if r.status == "ok" and r.seed not in values.get(r.case, {})]
+    notes = [f"{len(failed)} of {len(records)} runs failed: {failed[0].error}"] if failed else []
+    if empty:
+        notes.append(f"{len(empty)} of {len(records)} runs without a value, left out: {_reason(empty[0], name)}")
+    partial = (f"{r.case}: {note}" for r in records if (note := _items_left_out(r.scores.get(name))))
+    return "; ".join([*notes, *islice(partial, 1)])
+
+
+def _items_left_out(score: Score | None) -> str:
+    """The first clause of the note of a mean that some items are not in."""
+    partial = score is not None and score.value is not None and None in score.per_item
+    return score.note.partition("; ")[0] if score is not None and partial else ""
+
+
+def _no_difference(records: Sequence[RunRecord], reference: Sequence[RunRecord], name: str) -> str:
+    """Why no case has a value on both sides: what keeps the first side that lacks one from having it."""
+    cases = [record.case for record in records]
+    common = list(dict.fromkeys(record.case for record in reference if record.case in cases))
+    if not common:
+        return "no case in common" if records and reference else "no record yet"
+    found = (cell(side, common, name) for side in (records, reference))
+    return next(each.note for each in found if each.value is None)
+
+
+def _signed(value: float, digits: int) -> str:
+    return f"{value:+.{digits}f}".replace("-", "−")
