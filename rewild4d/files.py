@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import platformdirs
@@ -76,6 +77,17 @@ def write_text(path: Path, text: str) -> None:
     """Write text atomically."""
     with atomic(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def save_tensors(state: Any, path: Path) -> None:
+    """Write what `torch.load` reads, atomically; see `atomic` for errors."""
+    with atomic(path) as temporary, temporary.open("wb") as file:
+        try:
+            torch.save(state, file)
+        except RuntimeError as error:  # torch complains of its own position and hides that the disk is full
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from None
+            raise
 
 
 def digest(*parts: bytes | str | np.ndarray | torch.Tensor) -> str:
