@@ -29,13 +29,14 @@ def clips(path: Path) -> list[str]:
     return _clip_names(Document(path))
 
 
-def load_rig(path: Path, clip: str, frames: int = 24) -> AnimatedAnimal:
+def load_rig(path: Path, clip: str, frames: int = 24, shares: Floats | None = None) -> AnimatedAnimal:
     """Read one animation of a rig.
 
     Args:
         path: a .glb or .gltf file.
         clip: which animation, one of `clips(path)`.
         frames: how many moments to sample, evenly over [start, end): a looping clip does not repeat its first pose.
+        shares: of the way from start to end, ascending: sample there instead, of a clip that does not loop, [T].
 
     Returns:
         The animal in the file's own world (metres by the specification, +y up).
@@ -55,7 +56,7 @@ def load_rig(path: Path, clip: str, frames: int = 24) -> AnimatedAnimal:
         raise document.error(str(unknown_name("clip", clip, names)).removesuffix("."))
     animation = names.index(clip)
     start, end = document.clip_range(animation)
-    times = start + (end - start) * np.arange(frames) / frames
+    times = start + (end - start) * (np.arange(frames) / frames if shares is None else shares)
     skeleton = _Skeleton(document, animation)
     surfaces = [surface for index in skinned for surface in _skinned_surfaces(document, skeleton, index)]
     for index in visible:
@@ -72,7 +73,7 @@ def load_rig(path: Path, clip: str, frames: int = 24) -> AnimatedAnimal:
             parents=skeleton.parents(),
             bones_rest=np.stack(skeleton.rest),
             bones=bones,
-            fps=frames / (end - start) if end > start else 24.0,
+            fps=len(times) / (end - start) if end > start else 24.0,
             motion=_folder_name(clip),
             up=np.array([0.0, 1.0, 0.0]),
         )
