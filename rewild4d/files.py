@@ -1,8 +1,10 @@
 """Atomic writes and content digests."""
 
+import contextlib
 import hashlib
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +16,11 @@ import platformdirs
 import torch
 
 from rewild4d.errors import UserError
+
+try:
+    import fcntl
+except ImportError:  # Windows has none
+    fcntl = None  # type: ignore[assignment]
 
 
 @contextmanager
@@ -71,6 +78,39 @@ def replaced_folder(folder: Path, marker: str, earlier: str) -> Iterator[Path]:
         raise UserError(f"{folder}: could not be written: {error.strerror or error}.") from error
     finally:
         shutil.rmtree(building, ignore_errors=True)
+
+
+@contextmanager
+def held(folder: Path, waiting: str) -> Iterator[None]:
+    """Hold a folder, made where it is not there, so that other processes that ask for it wait for the block's end.
+
+    Where the system or the file system has no such locks, nothing is held.
+
+    Args:
+        folder: of the work.
+        waiting: said on standard error when another process holds it.
+
+    Raises:
+        UserError: the folder cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: expected a folder that can be written, but: {error.strerror}.") from error
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                print(waiting, file=sys.stderr)
+                fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
 
 
 def write_text(path: Path, text: str) -> None:

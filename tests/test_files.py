@@ -2,15 +2,17 @@
 
 import re
 import resource
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Thread
 
 import pytest
 import torch
 
 from rewild4d.errors import UserError
-from rewild4d.files import save_tensors
+from rewild4d.files import held, save_tensors
 
 
 @contextmanager
@@ -31,3 +33,27 @@ def test_tensors_on_a_full_disk_are_one_sentence_and_leave_what_was_there(tmp_pa
         save_tensors({"a": torch.zeros(100_000)}, tmp_path / "state.pt")
     assert torch.equal(torch.load(tmp_path / "state.pt", weights_only=True)["a"], torch.ones(3))
     assert [path.name for path in tmp_path.iterdir()] == ["state.pt"]
+
+
+def test_a_held_folder_makes_others_wait(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    order = []
+
+    def second() -> None:
+        with held(tmp_path / "run", "waiting"):
+            order.append("second")
+
+    with held(tmp_path / "run", "waiting"):
+        assert (tmp_path / "run").is_dir()
+        other = Thread(target=second)
+        other.start()
+        while not capsys.readouterr().err:
+            time.sleep(0.01)
+        order.append("first")
+    other.join()
+    assert order == ["first", "second"]
+    (tmp_path / "file").touch()
+    with (
+        pytest.raises(UserError, match="file/run: expected a folder that can be written"),
+        held(tmp_path / "file/run", ""),
+    ):
+        pass
