@@ -21,13 +21,14 @@ import torch
 from torch import Tensor
 
 from rewild4d.baselines.external_alignment import UPS, Placement, place_by_search, place_fauna
-from rewild4d.baselines.external_folder import crop_box, find_outputs, run_program, write_clip
+from rewild4d.baselines.external_folder import crop_box, find_outputs, program_digest, run_program, write_clip
 from rewild4d.baselines.external_profiles import PROFILES, Profile
 from rewild4d.baselines.external_reading import Moment, moved, moved_discs, painted, read_moments
 from rewild4d.contracts import Log, MethodInfo
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.files import atomic, digest, load_tensors, write_text
+from rewild4d.files import digest, load_tensors, save_tensors, write_text
 from rewild4d.meshes import Discs
+from rewild4d.ours.motion import camera_between, frame_position
 from rewild4d.priors.motion import pose_at
 from rewild4d.transforms import skin_points, split_similarity
 from rewild4d.types import Camera, Clip, Frame, Prior, Splats
@@ -45,7 +46,8 @@ class ExternalConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     profile: str = "frames"
     """Layout of its files: frames, glb, gvfdiffusion, dreammesh4d or 3d-fauna."""
     command: str = ""
-    """Words that start it; {clip} and {out} stand for the two folders, {case} and {seed} for what they say."""
+    """Words that start it; {clip} and {out} stand for the two folders, {case} and {seed} for what they say. A file that
+    a word names counts as a setting: edit it and it is another run. What such a file reads or imports does not."""
     folder: str = ""
     """Where its results are already, instead of a command; {case} stands for <animal>__<motion>."""
     placed: Literal["profile", "yes", "no"] = "profile"
@@ -65,7 +67,7 @@ class ExternalReconstruction:
     Attributes:
         times: of the moments in seconds, ascending.
         moments: Gaussians of each.
-        cameras: input camera by time.
+        cameras: input camera by time, ascending.
         marks: what tables say beside the numbers.
         notes: figures for the record.
     """
@@ -81,7 +83,9 @@ class ExternalReconstruction:
         return self.moments[min(range(len(self.times)), key=lambda i: abs(self.times[i] - time))]
 
     def camera(self, time: float) -> Camera | None:
-        return self.cameras.get(time)
+        """The input camera at a time, in the world; between frames it interpolates."""
+        times = torch.tensor(tuple(self.cameras), dtype=torch.float64)
+        return camera_between(tuple(self.cameras.values()), frame_position(times, time))
 
     def diagnostics(self) -> dict[str, Any]:
         """How it was placed, and how many Gaussians there are."""
@@ -91,8 +95,7 @@ class ExternalReconstruction:
         cameras = {t: c and (c.world_to_camera, c.intrinsics, c.width, c.height) for t, c in self.cameras.items()}
         moments = [(m.means, m.quats, m.scales, m.opacities, m.colors) for m in self.moments]
         state = {"times": self.times, "moments": moments, "cameras": cameras, "marks": self.marks, "notes": self.notes}
-        with atomic(folder / STATE) as path:
-            torch.save(state, path)
+        save_tensors(state, folder / STATE)
 
 
 class External:
@@ -104,9 +107,10 @@ class External:
     Config: ClassVar[type[ExternalConfig]] = ExternalConfig
 
     def inputs(self, config: ExternalConfig, case: str) -> str:
-        """Digest of the files that decide the result beside the settings: those of a folder that is already there."""
+        """Digest of the files that decide the result beside the settings: those that the command names, or those of a
+        folder that is already there."""
         if not config.folder:
-            return ""
+            return program_digest(config.command, _file_name(case))
         folder = _folder(config, case)
         return digest(*(part for path in sorted(folder.rglob("*")) if path.is_file()
                         for part in (str(path.relative_to(folder)), path.read_bytes())))  # fmt: skip
@@ -126,7 +130,11 @@ class External:
         with tempfile.TemporaryDirectory() as spare:
             work = workdir or Path(spare)
             _run(work, clip, prior, profile, config, seed)
-            return _read(work / "out", clip, prior, profile, config, seed, log)
+            try:
+                return _read(work / "out", clip, prior, profile, config, seed, log)
+            except Exception:
+                (work / DONE).unlink(missing_ok=True)  # a mended program must be run, not its old output read again
+                raise
 
     def load(self, folder: Path, device: torch.device) -> ExternalReconstruction:
         state = load_tensors(folder / STATE)
@@ -145,7 +153,11 @@ def _profile(config: ExternalConfig) -> Profile:
 
 
 def _folder(config: ExternalConfig, case: str) -> Path:
-    return Path(config.folder.replace("{case}", case.replace("/", "__")))
+    return Path(config.folder.replace("{case}", _file_name(case)))
+
+
+def _file_name(case: str) -> str:
+    return case.replace("/", "__")
 
 
 def _run(work: Path, clip: Clip, prior: Prior, profile: Profile, config: ExternalConfig, seed: int) -> None:
@@ -158,7 +170,7 @@ def _run(work: Path, clip: Clip, prior: Prior, profile: Profile, config: Externa
         shutil.rmtree(work / name, ignore_errors=True)
     write_clip(work / "clip", clip, prior, profile.crops)
     run_program(
-        config.command, clip=work / "clip", out=work / "out", case=clip.name.replace("/", "__"), seed=seed,
+        config.command, clip=work / "clip", out=work / "out", case=_file_name(clip.name), seed=seed,
         timeout=config.timeout, log=work / "program.log",
     )  # fmt: skip
     write_text(done, json.dumps(identity) + "\n")
@@ -169,7 +181,7 @@ def _read(
 ) -> ExternalReconstruction:
     """Files to Gaussians in the world."""
     paths = find_outputs(folder, profile, len(clip.frames))
-    moments = read_moments(paths, len(clip.frames), config.points, seed)
+    moments = read_moments(paths, clip.times, config.points, seed)
     times = _times(clip, len(moments), profile.spread)
     shots = [(frame, _camera(frame, prior)) for frame in clip.frames]
     nearest = [min(range(len(shots)), key=lambda i: abs(clip.frames[i].time - time)) for time in times]

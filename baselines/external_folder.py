@@ -7,6 +7,7 @@ import re
 import shlex
 import signal
 import subprocess
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -17,12 +18,14 @@ from torch.nn.functional import interpolate
 
 from rewild4d.baselines.external_profiles import Profile
 from rewild4d.errors import UserError
-from rewild4d.files import write_text
+from rewild4d.files import digest, write_text
 from rewild4d.priors.io import save_prior
 from rewild4d.types import Clip, Frame, Prior
 
 CROP = 256
 """Side of the square crops that 3D-Fauna takes, pixels."""
+LARGE = 1 << 26
+"""Bytes from which on a file that a command names (weights, an interpreter) counts by its size and time of change."""
 PAD = 0.15
 """Added to the animal's box on every side of a crop, as a share of its longer side."""
 README = """What this folder is
@@ -33,7 +36,8 @@ clip.json             name, fps, size, and for each frame its time in seconds, i
                       (OpenCV axes, world_to_camera 4x4, intrinsics 3x3 with pixel centres at +0.5; null: not known)
 
 What to write into the output folder: frame_0000.ply ... , one for each frame: 3D Gaussians in the layout of 3DGS, or
-meshes (.ply, .obj, coloured or not), in the world of the cameras; or a single animated .glb (`--profile glb`).
+meshes (.ply, .obj, coloured or not), in the world of the cameras; or a single animated .glb (`--profile glb`), whose
+clip begins at the first frame and ends at the last.
 """
 
 
@@ -82,6 +86,22 @@ def crop_box(mask: Tensor) -> tuple[float, float, float]:
     left, right = float(columns.min()), float(columns.max()) + 1
     side = math.ceil(max(bottom - top, right - left) * (1 + 2 * PAD))
     return round((left + right - side) / 2), round((top + bottom - side) / 2), side
+
+
+def program_digest(command: str, case: str) -> str:
+    """Digest of the files that a command names, in a word or in a part of one ("--config=FILE"); "" for none."""
+    try:
+        words = {*shlex.split(command), *re.split(r"[\s='\";]+", command)}
+    except ValueError:  # a quote that does not end is said when the program is to start
+        return ""
+    named = sorted(word.replace("{case}", case) for word in words)
+    files = [word for word in named if os.path.isfile(word) and os.access(word, os.R_OK)]
+    return digest(*(part for file in files for part in (file, _content(Path(file))))) if files else ""
+
+
+def _content(file: Path) -> bytes | str:
+    about = file.stat()
+    return file.read_bytes() if about.st_size < LARGE else f"{about.st_size} {about.st_mtime_ns}"
 
 
 def run_program(command: str, *, clip: Path, out: Path, case: str, seed: int, timeout: float, log: Path) -> None:
@@ -138,7 +158,7 @@ def find_outputs(folder: Path, profile: Profile, frames: int) -> list[Path]:
     """A program's files in the order of time, by the last number in their names.
 
     Raises:
-        UserError: the folder is not there, no file fits, or their number is not that of the frames.
+        UserError: the folder is not there, no file fits, or they are not numbered like the frames, from 0 or from 1.
     """
     if not folder.is_dir():
         raise UserError(f"{folder}: expected the folder of a program's results, but there is no such folder.")
@@ -150,12 +170,23 @@ def find_outputs(folder: Path, profile: Profile, frames: int) -> list[Path]:
     single = found[0].suffix.lower() in (".glb", ".gltf")
     if single and len(found) > 1:
         raise UserError(f"{folder}: expected one animated file {wanted}, found {len(found)}.")
-    if not single and not profile.spread and len(found) != frames:
-        numbers = {number(path) for path in found}
-        missing = [str(index) for index in range(frames) if index not in numbers]
-        some = f"; the first that is missing is {missing[0]}" if missing and min(numbers) == 0 else ""
-        raise UserError(f"{folder}: expected {frames} files {wanted}, one a frame, found {len(found)}{some}.")
+    if not single and not profile.spread:
+        fault = _fault([number(path) for path in found], frames)
+        if fault is not None:
+            raise UserError(f"{folder}: expected {frames} files {wanted}, one a frame, found {len(found)}{fault}.")
     return found
+
+
+def _fault(numbers: list[int], frames: int) -> str | None:
+    """What keeps ascending numbers from being those of the frames, from 0 or from 1 on; None where nothing does."""
+    first = 1 if numbers[0] == 1 else 0
+    twice = next((one for one, other in pairwise(numbers) if one == other), None)
+    missing = next((wanted for wanted in range(first, first + frames) if wanted not in numbers), None)
+    if twice is not None:
+        return f"; more than one has the number {twice}"
+    if missing is not None:
+        return f"; the first that is missing is {missing}"
+    return "" if len(numbers) != frames else None
 
 
 def number(path: Path) -> int:

@@ -1,5 +1,6 @@
 """An animated glTF file as meshes: skinned, with morph targets, or rigid parts that move."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,12 @@ from rewild4d.errors import UserError
 from rewild4d.meshes import Mesh
 
 
-def read_animation(path: Path, frames: int) -> list[list[Mesh]]:
-    """The parts of an animated file at moments spread evenly over its clip, the first at its start.
+def read_animation(path: Path, times: Sequence[float]) -> list[list[Mesh]]:
+    """The parts of an animated file at the moments of a video: its clip begins at the first and ends at the last.
 
     Args:
         path: a .glb or .gltf file with one animation.
-        frames: how many moments.
+        times: of the moments in seconds on the video's clock, ascending.
 
     Returns:
         For each moment its parts; a part keeps its place in the list.
@@ -29,19 +30,21 @@ def read_animation(path: Path, frames: int) -> list[list[Mesh]]:
     names = clips(path)
     if len(names) != 1:
         raise UserError(f"{path}: expected one animation, got {', '.join(names) or 'none'}.")
+    clock = np.asarray(times, np.float64) - times[0]
+    shares = clock / max(clock[-1], 1e-9)
     document = Document(path)
     nodes = [document.tree.nodes[i] for i in document.scene_nodes()]
     if any(node.mesh is not None and node.skin is not None for node in nodes):
-        animal = load_rig(path, names[0], frames)
-        posed = [animal.posed(frame) for frame in range(frames)]
+        animal = load_rig(path, names[0], shares=shares)
+        posed = [animal.posed(frame) for frame in range(len(times))]
         return [[_mesh(s, v) for s, v in zip(animal.surfaces, each, strict=True)] for each in posed]
     start, end = document.clip_range(0)
-    times = start + (end - start) * np.arange(frames) / frames
-    world = document.global_matrices(document.local_matrices(0, times))
-    parts = [part for index in document.scene_nodes() for part in _parts(document, index, times, world[:, index])]
+    moments = start + (end - start) * shares
+    world = document.global_matrices(document.local_matrices(0, moments))
+    parts = [part for index in document.scene_nodes() for part in _parts(document, index, moments, world[:, index])]
     if not parts:
         raise UserError(f"{path}: expected a mesh, but the file's scene has none.")
-    return [[part[frame] for part in parts] for frame in range(frames)]
+    return [[part[frame] for part in parts] for frame in range(len(times))]
 
 
 def _parts(document: Document, index: int, times: Floats, world: Floats) -> list[list[Mesh]]:

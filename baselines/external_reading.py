@@ -21,12 +21,12 @@ from rewild4d.types import Camera, Frame, Splats
 Moment = Splats | Discs
 
 
-def read_moments(paths: Sequence[Path], frames: int, count: int, seed: int) -> list[Moment]:
+def read_moments(paths: Sequence[Path], times: Sequence[float], count: int, seed: int) -> list[Moment]:
     """Read a program's files.
 
     Args:
         paths: one a moment, or a single animated .glb.
-        frames: moments to take from an animated file.
+        times: of the video's frames in seconds: those of an animated file lie in the same shares of its clip.
         count: points on a mesh.
         seed: of those points.
 
@@ -34,7 +34,7 @@ def read_moments(paths: Sequence[Path], frames: int, count: int, seed: int) -> l
         UserError: a file that is damaged, empty, or holds a NaN.
     """
     if paths[0].suffix.lower() in (".glb", ".gltf"):
-        parts = read_animation(paths[0], frames)
+        parts = read_animation(paths[0], times)
         return list(_joined(paths[0], parts, count, seed))
     if all(path.suffix.lower() == ".ply" and _holds_splats(path) for path in paths):
         return [_some(path, read_splats(path)) for path in paths]

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.contracts import Log, MethodInfo
-from rewild4d.files import load_tensors
+from rewild4d.files import load_tensors, save_tensors
 from rewild4d.ours.config import Count, Positive
 from rewild4d.priors.io import load_prior, save_prior
 from rewild4d.priors.motion import (
@@ -91,7 +91,7 @@ class PriorOnlyReconstruction:
             "thickness": self.thickness,
             "cameras": {time: (c.world_to_camera, c.intrinsics, c.width, c.height) for time, c in self.cameras.items()},
         }
-        torch.save(state, folder / "surface.pt")
+        save_tensors(state, folder / "surface.pt")
 
 
 class PriorOnly:

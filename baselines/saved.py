@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from rewild4d.errors import UserError
-from rewild4d.files import atomic
+from rewild4d.files import atomic, save_tensors
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.motion import camera_between, frame_position, interpolate_similarity
 from rewild4d.ours.symmetry import match_times
@@ -83,8 +83,7 @@ def gaussians_from_state(state: dict[str, Tensor], max_scale: float) -> Gaussian
 
 def save_state(folder: Path, state: dict[str, Any], config: msgspec.Struct) -> None:
     """Write a state and its settings into an existing folder."""
-    with atomic(folder / STATE) as path:
-        torch.save(state, path)
+    save_tensors(state, folder / STATE)
     with atomic(folder / CONFIG) as path:
         path.write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=2))
 

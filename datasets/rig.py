@@ -30,13 +30,14 @@ def clips(path: Path) -> list[str]:
         return _clip_names(Document(path))
 
 
-def load_rig(path: Path, clip: str, frames: int = 24) -> AnimatedAnimal:
+def load_rig(path: Path, clip: str, frames: int = 24, shares: Floats | None = None) -> AnimatedAnimal:
     """Read one animation of a rig.
 
     Args:
         path: a .glb or .gltf file.
         clip: which animation, one of `clips(path)`.
         frames: how many moments to sample, evenly over [start, end): a looping clip does not repeat its first pose.
+        shares: of the way from start to end, ascending: sample there instead, of a clip that does not loop, [T].
 
     Returns:
         The animal in the file's own world (metres by the specification, +y up).
@@ -44,18 +45,19 @@ def load_rig(path: Path, clip: str, frames: int = 24) -> AnimatedAnimal:
     Raises:
         UserError: the file is missing or no glTF, contradicts itself, holds no skinned mesh, or has no such clip.
     """
+    shares = np.arange(frames) / frames if shares is None else shares
     with consistent(path):
-        animal = _read_rig(path, clip, frames)
+        animal = _read_rig(path, clip, shares)
         if not any(len(surface.faces) for surface in animal.surfaces):
             raise UserError(f"{path}: expected a mesh of triangles, but the file has none.")
         points = np.concatenate([surface.vertices for surface in animal.surfaces])
-        posed = (np.concatenate(animal.posed(frame)) for frame in range(frames))
+        posed = (np.concatenate(animal.posed(frame)) for frame in range(len(shares)))
         if not all(np.isfinite(each).all() for each in (points, *posed)) or not np.ptp(points, axis=0).any():
             raise UserError(f"{path}: expected a mesh of some size in every pose, but scales or turns of it are zero.")
     return animal
 
 
-def _read_rig(path: Path, clip: str, frames: int) -> AnimatedAnimal:
+def _read_rig(path: Path, clip: str, shares: Floats) -> AnimatedAnimal:
     document = Document(path)
     names = _clip_names(document)
     visible = document.scene_nodes()
@@ -68,7 +70,7 @@ def _read_rig(path: Path, clip: str, frames: int) -> AnimatedAnimal:
         raise document.error(str(unknown_name("clip", clip, names)).removesuffix("."))
     animation = names.index(clip)
     start, end = document.clip_range(animation)
-    times = start + (end - start) * np.arange(frames) / frames
+    times = start + (end - start) * shares
     skeleton = _Skeleton(document, animation)
     surfaces = [surface for index in skinned for surface in _skinned_surfaces(document, skeleton, index)]
     for index in visible:
@@ -85,7 +87,7 @@ def _read_rig(path: Path, clip: str, frames: int) -> AnimatedAnimal:
             parents=skeleton.parents(),
             bones_rest=np.stack(skeleton.rest),
             bones=bones,
-            fps=frames / (end - start) if end > start else 24.0,
+            fps=len(times) / (end - start) if end > start else 24.0,
             motion=_folder_name(clip),
             up=np.array([0.0, 1.0, 0.0]),
         )

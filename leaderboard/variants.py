@@ -6,6 +6,7 @@ import statistics
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import PurePath
 from typing import Any
 
 from rewild4d.leaderboard.records import RunRecord
@@ -120,7 +121,8 @@ def _identity(record: RunRecord) -> str:
 
 
 def _label(record: RunRecord, others: Sequence[RunRecord]) -> str:
-    """The method; its preset where there are several; the settings in which it differs from most of its variants."""
+    """The method; its preset where there are several; the settings in which it differs from most of its variants, and
+    a prior that was not fitted to the clip."""
     kin = [other for other in others if other.method == record.method]
     peers = [_settings(other) for other in kin if other.preset == record.preset]
     preset = f" ({record.preset})" if len({other.preset for other in kin}) > 1 else ""
@@ -131,4 +133,6 @@ def _label(record: RunRecord, others: Sequence[RunRecord]) -> str:
         usual = counts[0][0] if alone or counts[0][1] > counts[1][1] else None
         if not alone and json.dumps(value) != usual:
             changed.append(f"{name}={json.dumps(value)}")
+        elif name == "--prior" and record.prior.get("choice", "template") != "template":
+            changed.append(f"{name}={json.dumps(PurePath(value).name)}")
     return record.method + preset + (f" [{', '.join(changed)}]" if changed else "")

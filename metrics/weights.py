@@ -156,6 +156,15 @@ def load_weights(name: str, path: Path | None = None) -> LoadedWeights:
     raise WeightsMissing
 
 
+def is_here(name: str) -> bool:
+    """Whether `load_weights` would find a network or the files that it is made from; nothing is read.
+
+    Raises:
+        UserError: unknown name.
+    """
+    return any((place / f"{name}.safetensors").is_file() or published_copies(place, name) for place in places())
+
+
 def _parse(data: bytes, known: Network) -> LoadedWeights:
     return LoadedWeights(safetensors.torch.load(data), known.sha256)
 

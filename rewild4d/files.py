@@ -1,9 +1,11 @@
 """Atomic writes and content digests."""
 
+import contextlib
 import hashlib
 import os
 import re
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +17,11 @@ import platformdirs
 import torch
 
 from rewild4d.errors import UserError
+
+try:
+    import fcntl
+except ImportError:  # Windows has none
+    fcntl = None  # type: ignore[assignment]
 
 
 @contextmanager
@@ -74,10 +81,54 @@ def replaced_folder(folder: Path, marker: str, earlier: str) -> Iterator[Path]:
         shutil.rmtree(building, ignore_errors=True)
 
 
+@contextmanager
+def held(folder: Path, waiting: str) -> Iterator[None]:
+    """Hold a folder, made where it is not there, so that other processes that ask for it wait for the block's end.
+
+    Where the system or the file system has no such locks, nothing is held.
+
+    Args:
+        folder: of the work.
+        waiting: said on standard error when another process holds it.
+
+    Raises:
+        UserError: the folder cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: expected a folder that can be written, but: {error.strerror}.") from error
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                print(waiting, file=sys.stderr)
+                fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write text atomically."""
     with atomic(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def save_tensors(state: Any, path: Path) -> None:
+    """Write what `torch.load` reads, atomically; see `atomic` for errors."""
+    with atomic(path) as temporary, temporary.open("wb") as file:
+        try:
+            torch.save(state, file)
+        except RuntimeError as error:  # torch complains of its own position and hides that the disk is full
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from None
+            raise
 
 
 def digest(*parts: bytes | str | np.ndarray | torch.Tensor) -> str:

@@ -3,6 +3,7 @@
 import os
 import platform
 import resource
+import sys
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
@@ -12,6 +13,7 @@ import torch
 from rewild4d import __version__
 from rewild4d.errors import UserError
 from rewild4d.files import digest
+from rewild4d.registry import load_method
 
 PACKAGES = (
     "baselines",
@@ -42,6 +44,24 @@ def code_version() -> dict[str, str]:
             if file.name.endswith((".py", ".toml")):
                 parts += [package, file.name, file.read_bytes()]
     return {"version": __version__, "sources": digest(*parts)[:16]}
+
+
+def code_of(method: str) -> dict[str, str]:
+    """`code_version`, and of a method that is not ours a digest over the sources of the package that it is from."""
+    package = type(load_method(method)).__module__.partition(".")[0]
+    return code_version() | ({} if package == __package__ else {"method": _sources(package)})
+
+
+@cache
+def _sources(package: str) -> str:
+    """Digest of a loaded package's sources, or of the one file of a module."""
+    module = sys.modules[package]
+    folders = [Path(folder) for folder in getattr(module, "__path__", ())]
+    files = [(folder, file) for folder in folders for file in folder.rglob("*") if file.suffix in (".py", ".toml")]
+    if not folders and module.__file__:
+        files = [(Path(module.__file__).parent, Path(module.__file__))]
+    named = sorted((str(file.relative_to(folder)), file.read_bytes()) for folder, file in files)
+    return digest(*(part for pair in named for part in pair))[:16]
 
 
 def machine(device: torch.device, rasterizer: str) -> dict[str, str]:

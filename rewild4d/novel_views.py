@@ -8,7 +8,7 @@ carries how many there were.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Literal
 
 import msgspec
@@ -153,7 +153,7 @@ class _Orbit:
         up: Tensor | None,
     ) -> None:  # fmt: skip
         self.times, self.background, self.render = clip.times, background, render
-        self.at = lru_cache(maxsize=24)(reconstruction.at)
+        self.at = lru_cache(maxsize=24)(partial(finite_at, reconstruction))
         known = [input_camera(reconstruction, frame) for frame in clip.frames]
         if not any(known) and not len(self.at(self.times[0])):
             known = [_any_camera(clip.frames[0])]
@@ -202,6 +202,19 @@ class _Lazy:
         if not 0 <= index < self.count:
             raise IndexError(index)
         return self.make(index)
+
+
+def finite_at(reconstruction: Reconstruction, time: float) -> Splats:
+    """The Gaussians at a time.
+
+    Raises:
+        UserError: a NaN or an infinite value among their numbers.
+    """
+    splats = reconstruction.at(time)
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        if not bool(torch.isfinite(getattr(splats, name)).all()):
+            raise UserError(f"the reconstruction's {name} at {time:.4f} s hold a NaN or an infinite value.")
+    return splats
 
 
 def input_camera(reconstruction: Reconstruction, frame: Frame) -> Camera | None:

@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 
 from rewild4d.config import load_preset, preset_names
+from rewild4d.describing import FROM_TRUTH
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.specs import Condition, Line, Spec, load_reported
@@ -107,6 +108,7 @@ def frame(name: str, spec: Spec) -> Frame:
 def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[Entrant], list[str]]:
     """The rows of a table with their records, then the floors of its protocols, and sentences on records left out."""
     kept, remarks = latest([r for r in records if any(_is_under(r, condition, spec) for condition in spec.conditions)])
+    kept = [_beside_equals(record) for record in kept]
     under = [tuple(r for r in kept if _is_under(r, condition, spec)) for condition in spec.conditions]
     rows = []
     for row in spec.rows:
@@ -159,6 +161,11 @@ def _is_under(record: RunRecord, condition: Condition, spec: Spec) -> bool:
     effort = record.prior.get("config")  # records from before it was written have none
     same_effort = effort is None or _equals(effort, PRIOR_PRESETS.get(spec.preset, STANDARD))
     return (record.dataset, record.protocol["name"], choice) == wanted and fits and same_effort
+
+
+def _beside_equals(record: RunRecord) -> RunRecord:
+    """Without the mark of a prior made from the truth: a condition names its prior, and all rows have the same."""
+    return msgspec.structs.replace(record, marks=[mark for mark in record.marks if mark != FROM_TRUTH])
 
 
 def _equals(settings: Any, wanted: msgspec.Struct) -> bool:

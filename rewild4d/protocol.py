@@ -1,6 +1,6 @@
 """Evaluation protocols: a TOML file says what is held out and measured; this renders, composites and scores."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from importlib import metadata, resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -18,9 +18,10 @@ from rewild4d.harmonics import seen_colors
 from rewild4d.leaderboard.records import Score
 from rewild4d.metrics.samples import Distance
 from rewild4d.metrics.sets import FILE, Compared, write_features
-from rewild4d.novel_views import NovelViews, input_camera
+from rewild4d.metrics.weights import WeightsMissing, is_here
+from rewild4d.novel_views import NovelViews, finite_at, input_camera
 from rewild4d.rasterizer import rasterize
-from rewild4d.scoring import Networks, load_networks
+from rewild4d.scoring import NETWORKS, Networks, load_networks
 from rewild4d.types import Camera, Clip, Frame, Splats, Truth
 
 SCORES = (*image_scores.NAMES, *geometry_scores.NAMES, *novel_views.NAMES)
@@ -219,6 +220,13 @@ def _families(scores: Iterable[str]) -> list[str]:
     return sorted(found)
 
 
+def may_be_scored_now(scores: Mapping[str, Score]) -> bool:
+    """Whether any of a record's scores was left out for want of a network that is here now."""
+    missing = str(WeightsMissing())
+    families = _families(name for name, score in scores.items() if score.value is None and score.note.endswith(missing))
+    return any(is_here(NETWORKS[family]) for family in families)
+
+
 def _score_images(
     reconstruction: Reconstruction, truth: Truth, protocol: Protocol, networks: Networks, log: Log
 ) -> tuple[dict[str, Score], list[str]]:
@@ -245,8 +253,7 @@ def _render_frames(reconstruction: Reconstruction, frames: Iterable[Frame]) -> I
     time, splats = None, None
     for frame in frames:
         if splats is None or frame.time != time:
-            time, splats = frame.time, reconstruction.at(frame.time)
-            _require_finite(splats, frame.time)
+            time, splats = frame.time, finite_at(reconstruction, frame.time)
         camera = input_camera(reconstruction, frame)
         if camera is not None:
             yield render(splats, camera)
@@ -257,12 +264,6 @@ def _render_frames(reconstruction: Reconstruction, frames: Iterable[Frame]) -> I
                 f"the held-out frame at {frame.time:.4f} s needs a camera, but neither the data set nor the "
                 "reconstruction knows it."
             )
-
-
-def _require_finite(splats: Splats, time: float) -> None:
-    for name in ("means", "quats", "scales", "opacities", "colors"):
-        if not bool(torch.isfinite(getattr(splats, name)).all()):
-            raise UserError(f"the reconstruction's {name} at {time:.4f} s hold a NaN or an infinite value.")
 
 
 def _beside(frames: list[Frame], rendered: list[tuple[Tensor, Tensor]], background: float) -> image_scores.Beside:

@@ -2,20 +2,16 @@
 
 import contextlib
 import json
-import multiprocessing
 import os
 import shutil
 import sys
 import time
 import traceback
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
-from itertools import repeat
 from pathlib import Path
-from threading import Thread
 from types import MappingProxyType
 from typing import Any
 
@@ -23,20 +19,25 @@ import msgspec
 import torch
 from tqdm import tqdm
 
+from rewild4d import describing
 from rewild4d.contracts import DatasetReader, Reconstruction
 from rewild4d.coverage import coverage
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.files import write_text
+from rewild4d.files import held, write_text
 from rewild4d.leaderboard.records import FILE, SCHEMA, RunRecord, Timing, make_run_id, read_record, write_record
-from rewild4d.machine import code_version, machine, peak_memory_mib
+from rewild4d.machine import code_of, machine, peak_memory_mib
 from rewild4d.original_view import original_frames
 from rewild4d.priors.choose import PriorChoice, make_prior
 from rewild4d.priors.placing import known_frames, with_cameras
-from rewild4d.protocol import Protocol, evaluate
+from rewild4d.protocol import Protocol, evaluate, may_be_scored_now
 from rewild4d.rasterizer import pick_rasterizer, set_default
 from rewild4d.registry import load_method
 from rewild4d.types import Case, Clip, Prior, Truth
 from rewild4d.view import save_pictures
+from rewild4d.workers import Workers
+
+STAMP = "fit.json"
+"""Beside a saved reconstruction: how long the fit took, written last."""
 
 
 @dataclass(frozen=True)
@@ -131,30 +132,16 @@ def execute(plan: Plan) -> list[RunRecord]:
             _prepare(plan, name)
             records += _run_case(plan, name)
         return records
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, _start_worker, (plan.threads, plan.rasterizer, os.getpid())) as pool:
+    with Workers(jobs, plan.threads, plan.rasterizer) as workers:
         # Every fit of a case starts from its prior, so the priors come first.
-        list(pool.map(_prepare, repeat(plan), plan.cases))
-        return list(pool.map(_run_part, repeat(plan), *zip(*parts, strict=True)))
+        workers.map(_prepare, [(plan, name) for name in plan.cases], lambda *_: None)
+        return workers.map(_run_part, [(plan, *part) for part in parts], _lost_part)
 
 
 def pieces(plan: Plan) -> list["Job"]:
     """All that the plan lists, in its order, finished or not; nothing is run."""
     plan = replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device))
     return [job for name in plan.cases for job in _jobs(plan, name, *plan.reader.load(name, plan.protocol.selection))]
-
-
-def _start_worker(threads: int, rasterizer: str, parent: int) -> None:
-    """Threads of its own, and an end with its parent: an orphan would write into the folder of the next start."""
-    torch.set_num_threads(threads)
-    set_default(rasterizer)
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.2)
-        os._exit(1)
-
-    Thread(target=watch, daemon=True).start()
 
 
 def _prepare(plan: Plan, name: str) -> None:
@@ -167,22 +154,32 @@ def _prepare(plan: Plan, name: str) -> None:
 
 
 def _run_part(plan: Plan, name: str, entry: Entry, seed: int) -> RunRecord:
-    (record,) = _run_case(replace(plan, entries=(replace(entry, seeds=(seed,)),)), name)
+    (record,) = _run_case(_part(plan, entry, seed), name)
     return record
+
+
+def _lost_part(plan: Plan, name: str, entry: Entry, seed: int) -> RunRecord:
+    """The record of a run whose process is gone without a word."""
+    (job,) = _jobs(_part(plan, entry, seed), name, *plan.reader.load(name, plan.protocol.selection))
+    return job.fail("the process ended: killed, perhaps for memory")
+
+
+def _part(plan: Plan, entry: Entry, seed: int) -> Plan:
+    return replace(plan, entries=(replace(entry, seeds=(seed,)),))
 
 
 def _run_case(plan: Plan, name: str) -> list[RunRecord]:
     clip, truth = plan.reader.load(name, plan.protocol.selection)
     jobs = _jobs(plan, name, clip, truth)
     if all(job.finished() for job in jobs):
-        return [read_record(job.folder / FILE) for job in jobs]
+        return [job.record() for job in jobs]
     try:
         prior = _prior(plan, clip, truth)
         case = Case(with_cameras(known_frames(clip, prior), prior), prior, truth)
     except (UserError, FloatingPointError) as error:
-        return [job.fail(str(error)) for job in jobs]
+        return [job.record() if job.finished() else job.fail(str(error)) for job in jobs]
     seen = coverage(clip, truth)
-    return [read_record(job.folder / FILE) if job.finished() else job.run(case, seen) for job in jobs]
+    return [job.run(case, seen) for job in jobs]
 
 
 def _jobs(plan: Plan, name: str, clip: Clip, truth: Truth) -> list["Job"]:
@@ -207,20 +204,30 @@ class Job:
         self.plan, self.entry, self.seed, self.clip, self.truth = plan, entry, seed, clip, truth
         self.run_id = make_run_id(
             method=entry.method, config=entry.config, clip=clip.digest, truth=truth.digest, prior=prior_id,
-            protocol=plan.protocol.digest, seed=seed, code=code_version(), device=plan.device.type,
-            rasterizer=plan.rasterizer, **_inputs(entry, clip.name),
+            protocol=plan.protocol.digest, seed=seed, code=code_of(entry.method), device=plan.device.type,
+            rasterizer=plan.rasterizer, **describing.inputs(entry.method, entry.config, clip.name),
         )  # fmt: skip
         self.folder = folder / f"{entry.method}-{entry.preset}-seed{seed}-{self.run_id[:8]}"
         self.title = f"{clip.name}: {entry.method}"
         self.started = datetime.now(UTC).isoformat(timespec="seconds")
 
     def finished(self) -> bool:
-        """Whether a good record is there; a failed one is tried again."""
-        path = self.folder / FILE
-        return path.is_file() and read_record(path).status == "ok"
+        """Whether a good record is there: a failed one is tried again, and so is scoring that lacked a network that
+        has come since."""
+        if not self._is_good():
+            return False
+        return not (self._is_fitted() and may_be_scored_now(self.record().scores))
+
+    def record(self) -> RunRecord:
+        """The record that is there."""
+        return read_record(self.folder / FILE)
 
     def run(self, case: Case, seen: dict[str, float]) -> RunRecord:
-        """Fit, evaluate, draw, record."""
+        """What is there, if it is finished; else fit, evaluate, draw, record. One process at a time."""
+        with held(self.folder, f"{self.title}: waiting for another process that makes {self.folder.name}"):
+            return self.record() if self.finished() else self._run(case, seen)
+
+    def _run(self, case: Case, seen: dict[str, float]) -> RunRecord:
         try:
             reconstruction, fit_seconds = self._fit(case)
             begin = time.perf_counter()
@@ -239,23 +246,26 @@ class Job:
             traceback.print_exc(file=sys.stderr)
             return self.fail(f"{type(error).__name__}: {error}", case)
         record = self._record(case, "ok", "", **found.keep(self.folder), coverage=seen, pictures=pictures,
-                              diagnostics=_diagnostics(reconstruction), marks=_marks(self.entry.method, reconstruction),
+                              diagnostics=describing.diagnostics(reconstruction),
+                              marks=describing.marks(self.entry.method, self.plan.prior.name, reconstruction),
                               timing=self._timing(fit_seconds, seconds))  # fmt: skip
         path = write_record(record, self.folder)
         shutil.rmtree(self.folder / "work", ignore_errors=True)
         return read_record(path)
 
     def fail(self, message: str, case: Case | None = None) -> RunRecord:
-        """Record a failure: it is a finding too."""
+        """Record a failure: it is a finding too, but not in the place of a good record."""
         print(f"{self.title}: failed: {message}", file=sys.stderr)
+        if self._is_good():
+            return self.record()
         record = self._record(case, "failed", message, timing=self._timing(0.0, 0.0))
         return read_record(write_record(record, self.folder))
 
     def _fit(self, case: Case) -> tuple[Reconstruction, float]:
         """The reconstruction, saved; a run killed while scoring reads it back instead of fitting again."""
         method = load_method(self.entry.method)
-        saved, stamp = self.folder / "reconstruction", self.folder / "fit.json"
-        if not (saved.is_dir() and stamp.is_file()):
+        saved = self.folder / "reconstruction"
+        if not self._is_fitted():
             work = self.folder / "work"
             work.mkdir(parents=True, exist_ok=True)
             progress = Progress(f"{self.title}: fit", self.folder / "log.jsonl")
@@ -266,8 +276,15 @@ class Job:
             )  # fmt: skip
             progress.close()
             save_reconstruction(reconstruction, saved)
-            write_text(stamp, json.dumps({"seconds_since_last_start": time.perf_counter() - begin}) + "\n")
-        return method.load(saved, self.plan.device), json.loads(stamp.read_text())["seconds_since_last_start"]
+            stamp = json.dumps({"seconds_since_last_start": time.perf_counter() - begin}) + "\n"
+            write_text(self.folder / STAMP, stamp)
+        return method.load(saved, self.plan.device), fit_seconds(self.folder)
+
+    def _is_good(self) -> bool:
+        return (self.folder / FILE).is_file() and self.record().status == "ok"
+
+    def _is_fitted(self) -> bool:
+        return (self.folder / "reconstruction").is_dir() and (self.folder / STAMP).is_file()
 
     def _timing(self, fit: float, evaluation: float) -> Timing:
         return Timing(self.started, round(fit, 2), round(evaluation, 2), round(peak_memory_mib(), 1))
@@ -280,20 +297,19 @@ class Job:
             "scores": {}, "coverage": {}, "items": [], "pictures": [], "diagnostics": {},
             "config": msgspec.to_builtins(self.entry.config),
             "data": {"root": str(plan.root), "licence": self.clip.licence, "clip": self.clip.digest,
-                     "truth": self.truth.digest, **_said(plan.reader, self.clip)},
+                     "truth": self.truth.digest, **describing.reading(plan.reader, self.clip)},
             "prior": {"choice": plan.prior.name, "config": msgspec.to_builtins(plan.prior.settings(self.clip)),
-                      **_keypoints(plan.prior, self.clip), **_describe(case.prior if case else None)},
+                      **describing.keypoints(plan.prior, self.clip),
+                      **describing.prior_of(case.prior if case else None)},
             "protocol": {"digest": plan.protocol.digest, **msgspec.to_builtins(plan.protocol)},
-            "code": code_version(), "machine": machine(plan.device, plan.rasterizer),
+            "code": code_of(self.entry.method), "machine": machine(plan.device, plan.rasterizer),
         }  # fmt: skip
         return RunRecord(**{**fields, **found})
 
 
-def _said(reader: DatasetReader, clip: Clip) -> dict[str, str]:
-    """How the data was read, for the record: the reader's settings and what it left out; nothing where nothing was."""
-    settings = getattr(reader, "settings", {})
-    found = {"settings": json.dumps(settings) if settings else "", "notes": "; ".join(clip.notes)}
-    return {name: text for name, text in found.items() if text}
+def fit_seconds(folder: Path) -> float:
+    """How long the finished fit in a run's folder took since its last start."""
+    return float(json.loads((folder / STAMP).read_text())["seconds_since_last_start"])
 
 
 def save_reconstruction(reconstruction: Reconstruction, folder: Path) -> None:
@@ -309,35 +325,3 @@ def save_reconstruction(reconstruction: Reconstruction, folder: Path) -> None:
         raise UserError(f"{folder}: the reconstruction could not be written: {error.strerror or error}.") from error
     finally:
         shutil.rmtree(building, ignore_errors=True)
-
-
-def _describe(prior: Prior | None) -> dict[str, Any]:
-    """What a record says of the prior that was made, if any was."""
-    if prior is None:
-        return {"name": "none"}
-    said = {"name": prior.name, "provenance": prior.provenance, "digest": prior.digest, "quality": prior.quality}
-    return said | ({"notes": list(prior.notes)} if prior.notes else {})
-
-
-def _keypoints(choice: PriorChoice, clip: Clip) -> dict[str, str]:
-    """Which annotated keypoints the fit of the prior saw, where the clip has any."""
-    if choice.mapping is None or all(frame.keypoints is None for frame in clip.frames):
-        return {}
-    return {"keypoints": choice.use, "mapping": choice.mapping}
-
-
-def _diagnostics(reconstruction: Reconstruction) -> dict[str, Any]:
-    describe = getattr(reconstruction, "diagnostics", None)
-    return describe() if describe else {}
-
-
-def _inputs(entry: Entry, case: str) -> dict[str, str]:
-    """What decides a result beside the settings: files that a method reads, if it says so."""
-    asked = getattr(load_method(entry.method), "inputs", None)
-    return {"inputs": asked(entry.config, case)} if asked else {}
-
-
-def _marks(method: str, reconstruction: Reconstruction) -> list[str]:
-    """What stands beside the numbers in every table: the method has seen test frames, and what the result says."""
-    seen = ["has seen the test frames"] if load_method(method).info.sees_test_frames else []
-    return seen + list(getattr(reconstruction, "marks", ()))

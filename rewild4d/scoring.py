@@ -22,6 +22,8 @@ from rewild4d.pairing import Inputs, Match, Shown, images_beside, match_inputs
 FAMILIES = ("psnr", "ssim", "lpips-alex", "lpips-vgg", "silhouette", "kid", "fvd")
 """What may be asked for; `score --only` chooses from these."""
 NO_MATTE = ("no true masks: name them with --masks", "no predicted masks: name them with --pred-masks")
+NETWORKS = {"lpips-alex": "lpips-alex", "lpips-vgg": "lpips-vgg", "kid": "inception-fid", "fvd": "i3d-k400"}
+"""Families that need a network, and whose weights they are (`metrics.weights`)."""
 PAIRED = "takes the sets for independent, but they are paired: near a perfect prediction it is negative, KID-u is zero"
 ONE_SIDED = {
     (True, False): "the predictions have alpha, the truths have none: see that they lie on the same background",

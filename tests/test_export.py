@@ -13,6 +13,7 @@ from test_records import record
 
 from rewild4d import cli
 from rewild4d.baselines.empty import EmptyReconstruction
+from rewild4d.baselines.external_gltf import read_animation
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig, PriorOnlyReconstruction
 from rewild4d.conformance import tiny_case
 from rewild4d.contracts import Articulated
@@ -82,6 +83,18 @@ def test_skinning_the_glb_gives_the_posed_points(
         assert float((corners.mean(1) - world[seen]).abs().max()) < 2e-4 * size
         moved = max(moved, float((objects - rest.means).abs().max()))
     assert moved > 0.1
+
+
+def test_an_exported_glb_read_as_a_result_has_the_frames_poses(
+    prior_only: PriorOnlyReconstruction, case: Case, tmp_path: Path
+) -> None:
+    """Frame k of the video lies at frame k of the file, the last one included: a video is no loop."""
+    paths = export(prior_only, case.clip, ["glb"], tmp_path)
+    found = read_animation(paths[0], case.clip.times)
+    for parts, time in zip(found, case.clip.times, strict=True):
+        corners = torch.cat([part.vertices for part in parts]).double()
+        middles = corners.view(-1, 4, 3).mean(1)
+        torch.testing.assert_close(middles, prior_only.at(time).means.double(), atol=1e-4, rtol=0)
 
 
 def test_the_squares_lie_in_their_gaussians(prior_only: PriorOnlyReconstruction) -> None:

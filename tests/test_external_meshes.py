@@ -70,19 +70,20 @@ def glb(path: Path, morph: bool, moving: bool, clips: int = 1) -> None:
 
 
 def test_an_animated_glb_moves_by_morphs_and_by_nodes(tmp_path: Path) -> None:
-    """Four moments of a second: at 0, 1/4, 1/2 and 3/4."""
+    """Moments of a video from 2 s to 8 s in a clip of one second: the first at its start, the last at its end."""
     glb(tmp_path / "morph.glb", morph=True, moving=True)
-    moments = read_animation(tmp_path / "morph.glb", 4)
-    assert [float(parts[0].vertices[2, 0]) for parts in moments] == pytest.approx([1.0, 1.25, 1.5, 1.75])
+    times = [2.0, 4.0, 5.0, 8.0]
+    moments = read_animation(tmp_path / "morph.glb", times)
+    assert [float(parts[0].vertices[2, 0]) for parts in moments] == pytest.approx([1 + (t - 2) / 6 for t in times])
     glb(tmp_path / "node.glb", morph=False, moving=True)
-    moments = read_animation(tmp_path / "node.glb", 4)
-    assert [float(parts[0].vertices[0, 2]) for parts in moments] == pytest.approx([0.0, 2.0, 4.0, 6.0])
+    moments = read_animation(tmp_path / "node.glb", times)
+    assert [float(parts[0].vertices[0, 2]) for parts in moments] == pytest.approx([8 * (t - 2) / 6 for t in times])
     glb(tmp_path / "still.glb", morph=False, moving=False)
     with pytest.raises(UserError, match="still.glb: expected one animation, got none"):
-        read_animation(tmp_path / "still.glb", 4)
+        read_animation(tmp_path / "still.glb", times)
     glb(tmp_path / "two.glb", morph=False, moving=True, clips=2)
     with pytest.raises(UserError, match="two.glb: expected one animation, got clip_0, clip_1"):
-        read_animation(tmp_path / "two.glb", 4)
+        read_animation(tmp_path / "two.glb", times)
 
 
 def test_a_glb_is_a_result(case: Case, tmp_path: Path) -> None:
@@ -90,17 +91,36 @@ def test_a_glb_is_a_result(case: Case, tmp_path: Path) -> None:
     config = ExternalConfig(folder=str(tmp_path), profile="glb", points=500)
     found = fit(case, config)
     sizes = [float(found.at(time).means[:, 0].amax()) for time in case.clip.times]
-    assert sizes == pytest.approx([1.0, 4 / 3, 5 / 3], abs=0.05)
+    assert sizes == pytest.approx([1.0, 1.5, 2.0], abs=0.05)
     glb(tmp_path / "other.glb", morph=True, moving=True)
     with pytest.raises(UserError, match=re.escape("expected one animated file *.glb or *.gltf, found 2")):
         fit(case, config)
 
 
 def test_files_are_ordered_by_their_numbers(tmp_path: Path) -> None:
-    for name in ("frame_10", "frame_9", "frame_2"):
-        (tmp_path / f"{name}.ply").touch()
-    found = find_outputs(tmp_path, PROFILES["frames"], 3)
-    assert [path.stem for path in found] == ["frame_2", "frame_9", "frame_10"]
+    for index in range(1, 12):
+        (tmp_path / f"frame_{index}.ply").touch()
+    found = find_outputs(tmp_path, PROFILES["frames"], 11)
+    assert [path.stem for path in found] == [f"frame_{index}" for index in range(1, 12)]
+
+
+@pytest.mark.parametrize(
+    ("names", "fault"),
+    [
+        (("0000", "0002", "0003"), "found 3; the first that is missing is 1."),
+        (("0001", "0002", "0004"), "found 3; the first that is missing is 3."),
+        (("0002", "0003", "0004"), "found 3; the first that is missing is 0."),
+        (("0000", "0000_final", "0002"), "found 3; more than one has the number 0."),
+        (("0000", "0001", "0002", "0003"), "found 4."),
+    ],
+)
+def test_files_are_numbered_like_the_frames(tmp_path: Path, names: tuple[str, ...], fault: str) -> None:
+    for name in names:
+        (tmp_path / f"frame_{name}.ply").touch()
+    with pytest.raises(
+        UserError, match=re.escape(f"expected 3 files frame_*.ply or frame_*.obj, one a frame, {fault}")
+    ):
+        find_outputs(tmp_path, PROFILES["frames"], 3)
 
 
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"

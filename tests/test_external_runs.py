@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from external_program import CPU, UPPER, OneCase, bodies, coarse_grid, fit, sett
 
 from rewild4d import runner
 from rewild4d.baselines.external import External, ExternalConfig
-from rewild4d.baselines.external_folder import crop_box, write_clip
+from rewild4d.baselines.external_folder import crop_box, program_digest, write_clip
 from rewild4d.conformance import tiny_case
 from rewild4d.errors import UserError
 from rewild4d.leaderboard.tables import standings
@@ -44,23 +45,26 @@ FAILURES = {
 }
 
 
-@pytest.mark.parametrize("what", FAILURES)
-def test_a_failure_is_one_sentence_and_a_failed_record(case: Case, tmp_path: Path, what: str) -> None:
+def a_plan(case: Case, tmp_path: Path, *configs: ExternalConfig) -> runner.Plan:
+    """Runs on the tiny case with its own prior, scored by two quick scores."""
     save_prior(case.prior, tmp_path / "prior.npz")
     protocol = msgspec.structs.replace(find_protocol("artemis", None), scores=("psnr", "iou"))
-    plan = runner.Plan(
+    return runner.Plan(
         dataset="artemis", reader=OneCase(case), root=tmp_path, cases=(case.clip.name,), protocol=protocol,
-        entries=(runner.Entry("external", "default", settings(tmp_path, what, bodies(case)), (7,)),),
+        entries=tuple(runner.Entry("external", "default", config, (7,)) for config in configs),
         prior=PriorChoice(str(tmp_path / "prior.npz"), STANDARD), device=CPU, out=tmp_path / "runs",
     )  # fmt: skip
-    (record,) = runner.execute(plan)
+
+
+@pytest.mark.parametrize("what", FAILURES)
+def test_a_failure_is_one_sentence_and_a_failed_record(case: Case, tmp_path: Path, what: str) -> None:
+    (record,) = runner.execute(a_plan(case, tmp_path, settings(tmp_path, what, bodies(case))))
     assert record.status == "failed" and record.scores == {}
     assert re.search(FAILURES[what], record.error), record.error
     assert "\n" not in record.error
 
 
 def test_a_record_carries_the_mark_and_the_table_does_not_rank_it(case: Case, tmp_path: Path) -> None:
-    save_prior(case.prior, tmp_path / "prior.npz")
     for index, body in enumerate(bodies(case)):
         (tmp_path / "theirs").mkdir(exist_ok=True)
         lines = [f"v {x} {y} {z}" for x, y, z in body["vertices"]]
@@ -69,12 +73,7 @@ def test_a_record_carries_the_mark_and_the_table_does_not_rank_it(case: Case, tm
     folder = str(tmp_path / "theirs")
     entries = [ExternalConfig(folder=folder, points=1000, program="theirs"),
                ExternalConfig(folder=folder, points=1000, program="rotated", placed="no", up="y")]  # fmt: skip
-    protocol = msgspec.structs.replace(find_protocol("artemis", None), scores=("psnr", "iou"))
-    plan = runner.Plan(
-        dataset="artemis", reader=OneCase(case), root=tmp_path, cases=(case.clip.name,), protocol=protocol,
-        entries=tuple(runner.Entry("external", "default", config, (0,)) for config in entries),
-        prior=PriorChoice(str(tmp_path / "prior.npz"), STANDARD), device=CPU, out=tmp_path / "runs",
-    )  # fmt: skip
+    plan = a_plan(case, tmp_path, *entries)
     as_is, rotated = runner.execute(plan)
     assert (as_is.status, as_is.marks) == ("ok", []) and as_is.diagnostics["program"] == "theirs"
     assert rotated.marks == [UPPER]
@@ -86,6 +85,67 @@ def test_a_record_carries_the_mark_and_the_table_does_not_rank_it(case: Case, tm
     assert runner.pieces(replace(plan, entries=(first,)))[0].run_id == as_is.run_id
     (tmp_path / "theirs" / "frame_0000.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     assert runner.pieces(replace(plan, entries=(first,)))[0].run_id != as_is.run_id
+
+
+def test_a_program_is_scored_on_footage_whose_cameras_nobody_knows(tmp_path: Path) -> None:
+    """The frame between the two that it got is held out, and rendered from a camera between theirs."""
+    case = tiny_case(frames=3, views=120)
+    first, middle, last = (replace(frame, camera=None) for frame in case.clip.frames)
+    footage = replace(
+        case,
+        clip=replace(case.clip, frames=(first, last)),
+        truth=replace(case.truth, held_out=[replace(middle, view="input")]),
+    )
+    content = bodies(case)
+    (record,) = runner.execute(a_plan(footage, tmp_path, settings(tmp_path, "plain", [content[0], content[2]])))
+    assert record.status == "ok", record.error
+    assert record.scores["psnr"].count == 1 and (record.scores["psnr"].value or 0) > 20
+
+
+def program(path: Path, *, of: str, edge: str = "1") -> ExternalConfig:
+    """A script that writes three triangles with two edges of some length and notes that it ran."""
+    path.write_text(
+        f"import sys\nfrom pathlib import Path\nopen('{path.parent}/runs.txt', 'a').write('{of} ')\n"
+        f"for i in range(3):\n    (Path(sys.argv[2]) / f'frame_{{i:04d}}.obj').write_text("
+        f"'v 0 0 0\\nv {edge} 0 0\\nv 0 {edge} 0\\nf 1 2 3\\n')\n"
+    )
+    return ExternalConfig(command=f"{sys.executable} {path} {{clip}} {{out}}", points=200, timeout=60.0)
+
+
+def test_a_mended_program_is_run_again(case: Case, tmp_path: Path) -> None:
+    """Its output was bad, so the same settings start it anew, whether or not its file is named."""
+    (tmp_path / "work").mkdir()
+    config = program(tmp_path / "a.py", of="bad", edge="nan")
+    with pytest.raises(UserError, match="expected finite coordinates"):
+        fit(case, config, tmp_path / "work")
+    program(tmp_path / "a.py", of="good")
+    assert len(fit(case, config, tmp_path / "work").at(0.0)) == 200
+    fit(case, config, tmp_path / "work")
+    assert (tmp_path / "runs.txt").read_text() == "bad good "
+
+
+def test_an_edited_program_is_another_run(case: Case, tmp_path: Path) -> None:
+    plan = a_plan(case, tmp_path, program(tmp_path / "a.py", of="first"))
+    (first,) = runner.execute(plan)
+    assert runner.execute(plan) == [first]
+    program(tmp_path / "a.py", of="second", edge="2")
+    (second,) = runner.execute(plan)
+    assert (tmp_path / "runs.txt").read_text() == "first second "
+    assert first.run_id != second.run_id and {first.status, second.status} == {"ok"}
+
+
+def test_the_files_that_a_command_names(tmp_path: Path) -> None:
+    for name in ("run.py", "a.json", "tiny__walk.toml", "x y.sh"):
+        (tmp_path / name).write_text(name)
+    words = [f"python {tmp_path}/run.py", f"--config={tmp_path}/a.json", f"bash -c '{tmp_path}/{{case}}.toml --fast'",
+             f"'{tmp_path}/x y.sh'"]  # fmt: skip
+    command = " ".join([*words, "{clip} {out}"])
+    found = [program_digest(command, "tiny__walk")]
+    for name in ("run.py", "a.json", "tiny__walk.toml", "x y.sh"):
+        (tmp_path / name).write_text("edited")
+        found.append(program_digest(command, "tiny__walk"))
+    assert len(set(found)) == 1 + 4
+    assert program_digest("theirs {clip} {out}", "tiny__walk") == program_digest("'theirs {clip}", "tiny__walk") == ""
 
 
 @pytest.mark.parametrize(
@@ -138,9 +198,15 @@ def test_saved_and_loaded_it_gives_the_same_gaussians(case: Case, tmp_path: Path
     assert (loaded.times, loaded.marks, loaded.notes) == (found.times, found.marks, found.notes)
     for name in ("means", "quats", "scales", "opacities", "colors"):
         assert torch.equal(getattr(loaded.at(0.1), name), getattr(found.at(0.1), name))
-    camera = loaded.camera(case.clip.times[0])
-    assert camera is not None and camera.width == 96
-    assert loaded.camera(17.0) is None
+    first, second = case.clip.frames[0].camera, case.clip.frames[1].camera
+    assert first is not None and second is not None
+    # Between two frames the camera lies between theirs, and after the last frame it stays.
+    for time, expected in ((0.0, first), (0.1, second), (17.0, case.clip.frames[2].camera)):
+        assert expected is not None
+        assert torch.equal(loaded.camera(time).world_to_camera, expected.world_to_camera)  # type: ignore[union-attr]
+    between = loaded.camera(0.05)
+    assert between is not None and between.width == 96
+    torch.testing.assert_close(between.intrinsics, (first.intrinsics + second.intrinsics) / 2)
 
 
 def test_the_written_clip_is_the_clip(case: Case, tmp_path: Path) -> None:

@@ -15,12 +15,15 @@ from rewild4d.commands import run_table, table
 from rewild4d.config import load_preset
 from rewild4d.conformance import tiny_case
 from rewild4d.contracts import Selection
+from rewild4d.describing import FROM_TRUTH
 from rewild4d.errors import UserError
 from rewild4d.leaderboard.records import FILE, RunRecord, write_record
 from rewild4d.leaderboard.specs import Condition, Line, Spec, load_reported, load_specs
+from rewild4d.leaderboard.tables import kind_of
 from rewild4d.ours.config import Config
 from rewild4d.priors.config import QUICK, STANDARD
 from rewild4d.priors.io import save_prior
+from rewild4d.registry import load_method
 from rewild4d.types import Case, Clip, Truth
 
 
@@ -112,6 +115,21 @@ def test_rows_take_the_records_with_their_settings() -> None:
     entrants, _ = planning.entrants("t", found, records)
     cases = {entrant.label: [r.case for r in entrant.records[0]] for entrant in entrants}
     assert cases == {"Ours": ["a"], "w/o": ["b"], "empty": ["a"]}
+
+
+def test_a_condition_with_a_prior_from_the_truth_ranks_its_rows() -> None:
+    """All rows of a condition start from its prior, so that it was made from the truth sets none of them apart."""
+    conditions = (Condition(protocol="p-v1", prior="coarse:0"), Condition(protocol="p-v1"))
+    found = spec([Line(label="Ours", method="ours"), Line(label="Other", method="d3dgs")], conditions=conditions)
+    records = [
+        record(method=method, config=msgspec.to_builtins(load_preset(method, load_method(method).Config, "quick")),
+               prior={"choice": prior}, marks=[*seen, *([FROM_TRUTH] if prior == "coarse:0" else [])])
+        for method, seen in (("ours", []), ("d3dgs", ["upper bound: it has seen more"]))
+        for prior in ("coarse:0", "template")
+    ]  # fmt: skip
+    entrants, _ = planning.entrants("t", found, records)
+    assert [[len(under) for under in entrant.records] for entrant in entrants] == [[1, 1], [1, 1]]
+    assert [kind_of(entrant) for entrant in entrants] == ["method", "unranked"]
 
 
 def test_a_row_that_cannot_be_planned_is_a_sentence() -> None:
@@ -241,7 +259,7 @@ def test_parts_of_a_case_are_run_side_by_side(demo: Spec, tmp_path: Path, monkey
     asked: list[tuple[str, int, int]] = []
 
     class InOrder:
-        """Stands in for the pool of processes."""
+        """Stands in for the processes."""
 
         def __init__(self, jobs: int, *_: object) -> None:
             assert jobs == 3
@@ -252,14 +270,13 @@ def test_parts_of_a_case_are_run_side_by_side(demo: Spec, tmp_path: Path, monkey
         def __exit__(self, *_: object) -> None:
             return None
 
-        def map(self, function: Any, plans: Any, *columns: Any) -> list[Any]:
+        def map(self, function: Any, pieces: Any, lost: Any) -> list[Any]:
             if function is runner._prepare:
                 return []
-            parts = list(zip(*columns, strict=True))
-            asked.extend((entry.method, getattr(entry.config, "gaussians", 0), seed) for _, entry, seed in parts)
-            return [function(plan, *part) for plan, part in zip(plans, parts, strict=False)]
+            asked.extend((entry.method, getattr(entry.config, "gaussians", 0), seed) for _, _, entry, seed in pieces)
+            return [function(*piece) for piece in pieces]
 
-    monkeypatch.setattr(runner, "ProcessPoolExecutor", InOrder)
+    monkeypatch.setattr(runner, "Workers", InOrder)
     options = run_table.Options(table="demo", out=tmp_path / "runs", jobs=3)
     full = planning.with_choice("demo", demo, planning.Choice())
     (plan,) = run_table.make_plans(options, full)

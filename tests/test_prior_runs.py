@@ -15,7 +15,7 @@ from test_prior_files import a_prior
 from test_wild import SELECTION, cache  # noqa: F401
 from test_wild_evaluation import PROTOCOL
 
-from rewild4d import runner
+from rewild4d import describing, runner
 from rewild4d.cli import main
 from rewild4d.commands.shared import choose_prior
 from rewild4d.datasets.aptv2 import AptV2
@@ -101,7 +101,7 @@ def test_a_run_fits_with_travel_and_with_the_keypoints_of_aptv2(tmp_path: Path) 
     prior = make_prior(choose_prior("template", "quick", reader), clip, truth, tmp_path / "p.npz", silent)
     assert prior.provenance.endswith("cameras unknown, with 170 keypoints, with the animal's travel, seed 0.")
     assert "pck" not in prior.quality  # nothing is left to score
-    assert runner._keypoints(choose_prior("template", "quick", reader), clip) == {
+    assert describing.keypoints(choose_prior("template", "quick", reader), clip) == {
         "keypoints": "all",
         "mapping": "aptv2",
     }

@@ -14,6 +14,7 @@ from rewild4d import novel_views, protocol
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig
 from rewild4d.conformance import tiny_case
 from rewild4d.contracts import Reconstruction
+from rewild4d.errors import UserError
 from rewild4d.leaderboard.records import Score
 from rewild4d.metrics.sets import FILE, KINDS, distances, read_features
 from rewild4d.novel_views import NovelViews
@@ -223,6 +224,21 @@ def test_a_ball_against_itself_is_at_distance_zero(case: Case) -> None:
     assert [(one.kind, len(one.prediction.values), len(one.truth.values)) for one in sets] == [
         ("kid_v", found.n, len(frames))
     ]
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "colors"])
+def test_a_nan_at_a_moment_that_is_not_held_out_is_one_sentence(case: Case, name: str) -> None:
+    class Broken(Ball):
+        def at(self, time: float) -> Splats:
+            values = getattr(super().at(time), name).clone()
+            values[0] = torch.nan
+            return replace(super().at(time), **{name: values})
+
+    with pytest.raises(UserError, match=f"^the reconstruction's {name} at 0.0000 s hold a NaN or an infinite value.$"):
+        novel_views.novel_view_distances(
+            Broken(), case.clip, NovelViews(frames=2), names=("kid_v",), background=1.0, render=protocol.render,
+            images=LinearNetwork(), videos=None, log=quiet,
+        )  # fmt: skip
 
 
 def test_scores_of_sets_say_how_many_they_are_over() -> None:

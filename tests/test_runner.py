@@ -28,6 +28,7 @@ from rewild4d.protocol import find_protocol
 from rewild4d.rasterizer.backends import resolve
 from rewild4d.registry import load_method
 from rewild4d.types import Camera, Case, Clip, Truth
+from rewild4d.workers import start_worker
 
 SETTINGS = PriorOnlyConfig(gaussians=2000)
 
@@ -140,7 +141,7 @@ def test_the_rasterizer_is_named_and_another_one_is_another_run(plan: runner.Pla
 
 def test_worker_processes_render_with_the_rasterizer_of_the_plan() -> None:
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, context, runner._start_worker, (1, "reference", os.getpid())) as pool:
+    with ProcessPoolExecutor(1, context, start_worker, (1, "reference", os.getpid())) as pool:
         assert pool.submit(resolve, "auto", torch.device("cpu"), torch.float32).result() == "reference"
 
 

@@ -291,6 +291,14 @@ def test_presets_and_priors_tell_variants_apart() -> None:
     assert any('--prior="coarse:1"' in label for label in labels)
 
 
+def test_a_prior_from_elsewhere_is_named_even_where_all_have_it() -> None:
+    for choice, said in (("coarse:0", "coarse:0"), ("/home/her/dog.npz", "dog.npz")):
+        (made,) = protocol_tables([record(prior={"choice": choice}), record(method="gart", prior={"choice": choice})])
+        assert [row.stubs[1] for row in made.rows] == [f'{name} [--prior="{said}"]' for name in ("ours", "gart")]
+    (made,) = protocol_tables([record(prior={"choice": "template"})])
+    assert [row.stubs[1] for row in made.rows] == ["ours"]
+
+
 def test_the_latest_of_equal_runs_counts() -> None:
     def at(day: int, value: float, code: str) -> RunRecord:
         timing = Timing(f"2026-01-{day:02d}T00:00:00+00:00", 1.0, 1.0, 1.0)

@@ -1,22 +1,25 @@
 """`evaluate`: score a saved reconstruction again, by the protocol it was fitted for."""
 
 import json
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 import tyro
 
+from rewild4d import describing
 from rewild4d.config import parse_flags
+from rewild4d.coverage import coverage
 from rewild4d.errors import UserError
-from rewild4d.leaderboard.records import FILE, RunRecord, read_record, to_json, write_record
+from rewild4d.leaderboard.records import FILE, RunRecord, Timing, read_record, to_json, write_record
 from rewild4d.leaderboard.tables import markdown
-from rewild4d.machine import code_version, machine, pick_device
+from rewild4d.machine import code_of, machine, peak_memory_mib, pick_device
 from rewild4d.original_view import original_frames
 from rewild4d.protocol import evaluate, find_protocol
 from rewild4d.rasterizer import pick_rasterizer, set_default
 from rewild4d.registry import load_dataset, load_method
-from rewild4d.runner import Progress
+from rewild4d.runner import STAMP, Progress, fit_seconds
 from rewild4d.view import save_pictures
 
 DESCRIPTION = """Score saved reconstructions again, with the protocol that they were fitted for (another one could hold
@@ -73,14 +76,25 @@ def score_again(folder: Path, options: Options) -> RunRecord:
             raise UserError(f"{root}: the {name} of {record.case} is not the one that {folder} was fitted to.")
     reconstruction = load_method(record.method).load(saved, device)
     set_default(rasterizer)
+    begin = time.perf_counter()
     progress = Progress(f"{record.case}: evaluate")
     found = evaluate(reconstruction, clip, truth, protocol, progress, device)
     progress.close()
+    seconds = time.perf_counter() - begin
     whole = original_frames(reader, clip, protocol.selection)
     pictures = save_pictures(reconstruction, clip, truth, folder, whole)
     described = {"digest": protocol.digest, **msgspec.to_builtins(protocol)}
     renewed = msgspec.structs.replace(
-        record, status="ok", error="", **found.keep(folder), pictures=pictures, protocol=described,
-        code=code_version(), machine=machine(device, rasterizer),
+        record, status="ok", error="", **found.keep(folder), coverage=coverage(clip, truth), pictures=pictures,
+        diagnostics=describing.diagnostics(reconstruction), protocol=described,
+        marks=describing.marks(record.method, record.prior.get("choice", ""), reconstruction),
+        code=code_of(record.method), machine=machine(device, rasterizer), timing=_timing(record, folder, seconds),
     )  # fmt: skip
     return read_record(write_record(renewed, folder))
+
+
+def _timing(record: RunRecord, folder: Path, seconds: float) -> Timing:
+    """When and how long it was fitted, which a failed record does not say, and how long scoring took now."""
+    fit = round(fit_seconds(folder), 2) if (folder / STAMP).is_file() else record.timing.fit_seconds
+    memory = max(record.timing.peak_memory_mib, round(peak_memory_mib(), 1))
+    return Timing(record.timing.started, fit, round(seconds, 2), memory)

@@ -81,7 +81,7 @@ def require_writable(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe.touch()
-        probe.unlink()
+        probe.unlink(missing_ok=True)  # another run may have taken it away
     except OSError as error:
         raise UserError(f"--out {folder}: expected a folder that can be written, but: {error.strerror}.") from error
 

@@ -7,7 +7,7 @@ import msgspec
 import torch
 
 from rewild4d.errors import UserError
-from rewild4d.files import atomic, digest
+from rewild4d.files import digest, save_tensors
 from rewild4d.types import Clip, Prior
 
 NAME = "checkpoint.pt"
@@ -20,8 +20,7 @@ def fit_digest(config: msgspec.Struct, clip: Clip, prior: Prior, seed: int) -> s
 
 def save_checkpoint(folder: Path, identity: str, state: dict[str, Any]) -> None:
     """Write the state to ``folder``/checkpoint.pt; a kill at any moment leaves the previous one."""
-    with atomic(folder / NAME) as path:
-        torch.save({"digest": identity, "state": state}, path)
+    save_tensors({"digest": identity, "state": state}, folder / NAME)
 
 
 def load_checkpoint(folder: Path, identity: str) -> tuple[dict[str, Any] | None, str | None]:

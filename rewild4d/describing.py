@@ -1,0 +1,62 @@
+"""What a record says of a run beside its scores: data, prior, inputs, marks and the method's own figures."""
+
+import json
+from typing import Any
+
+import msgspec
+
+from rewild4d.contracts import DatasetReader, Reconstruction
+from rewild4d.priors.choose import PriorChoice
+from rewild4d.registry import load_method
+from rewild4d.types import Clip, Prior
+
+FROM_TRUTH = "upper bound: its prior was made from the truth"
+
+
+def reading(reader: DatasetReader, clip: Clip) -> dict[str, str]:
+    """How the data was read: the reader's settings and what it left out; nothing where nothing was."""
+    settings = getattr(reader, "settings", {})
+    found = {"settings": json.dumps(settings) if settings else "", "notes": "; ".join(clip.notes)}
+    return {name: text for name, text in found.items() if text}
+
+
+def prior_of(prior: Prior | None) -> dict[str, Any]:
+    """The prior that was made, if any was."""
+    if prior is None:
+        return {"name": "none"}
+    said = {"name": prior.name, "provenance": prior.provenance, "digest": prior.digest, "quality": prior.quality}
+    return said | ({"notes": list(prior.notes)} if prior.notes else {})
+
+
+def keypoints(choice: PriorChoice, clip: Clip) -> dict[str, str]:
+    """Which annotated keypoints the fit of the prior saw, where the clip has any."""
+    if choice.mapping is None or all(frame.keypoints is None for frame in clip.frames):
+        return {}
+    return {"keypoints": choice.use, "mapping": choice.mapping}
+
+
+def diagnostics(reconstruction: Reconstruction) -> dict[str, Any]:
+    """What the method says of its result, if it does."""
+    describe = getattr(reconstruction, "diagnostics", None)
+    return describe() if describe else {}
+
+
+def inputs(method: str, config: msgspec.Struct, case: str) -> dict[str, str]:
+    """What decides a result beside the settings: files that a method reads, if it says so."""
+    asked = getattr(load_method(method), "inputs", None)
+    return {"inputs": asked(config, case)} if asked else {}
+
+
+def marks(method: str, prior: str, reconstruction: Reconstruction) -> list[str]:
+    """What stands beside the numbers in every table, and keeps a row out of the ranking.
+
+    Args:
+        method: its name.
+        prior: what `--prior` said.
+        reconstruction: it may have marks of its own.
+    """
+    info = load_method(method).info
+    found = ["has seen the test frames"] if info.sees_test_frames else []
+    if info.uses_prior and prior.partition(":")[0] == "coarse":
+        found.append(FROM_TRUTH)
+    return found + list(getattr(reconstruction, "marks", ()))

@@ -1,0 +1,77 @@
+"""Pieces of work in processes of their own: one that is killed takes nothing but its piece with it."""
+
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any, TypeVar
+
+import torch
+
+from rewild4d.rasterizer import set_default
+
+T = TypeVar("T")
+
+
+class Workers:
+    """Some processes that work side by side, each with threads of its own; they end with the `with` block.
+
+    Each is a pool of one: a pool of several is lost as a whole, with all that is under way, when one of them dies.
+    """
+
+    def __init__(self, jobs: int, threads: int, rasterizer: str) -> None:
+        self._jobs, self._setup = jobs, (threads, rasterizer, os.getpid())
+        self._free: SimpleQueue[ProcessPoolExecutor] = SimpleQueue()
+        for _ in range(jobs):
+            self._free.put(self._pool())
+
+    def __enter__(self) -> "Workers":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for _ in range(self._jobs):
+            self._free.get().shutdown()
+
+    def map(self, function: Callable[..., T], pieces: Sequence[tuple[Any, ...]], lost: Callable[..., T]) -> list[T]:
+        """Results of function(*piece), in the order of the pieces; what a call raises ends the map.
+
+        Args:
+            function: called in a worker.
+            pieces: arguments of each call.
+            lost: called here with the piece whose process ended under it; its result stands for the piece's.
+        """
+
+        def work(piece: tuple[Any, ...]) -> T:
+            pool = self._free.get()
+            try:
+                return pool.submit(function, *piece).result()
+            except BrokenProcessPool:
+                pool.shutdown()
+                pool = self._pool()
+                return lost(*piece)
+            finally:
+                self._free.put(pool)
+
+        with ThreadPoolExecutor(self._jobs) as threads:
+            return list(threads.map(work, pieces))
+
+    def _pool(self) -> ProcessPoolExecutor:
+        """A process that starts with its first piece."""
+        return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), start_worker, self._setup)
+
+
+def start_worker(threads: int, rasterizer: str, parent: int) -> None:
+    """Threads of its own, and an end with its parent: an orphan would write into the folder of the next start."""
+    torch.set_num_threads(threads)
+    set_default(rasterizer)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.2)
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()
