@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.datasets.animal import Surface
-from rewild4d.datasets.gltf import Document, Floats, sample
+from rewild4d.datasets.gltf import Document, Floats, consistent, sample
 from rewild4d.datasets.rig import clips, load_rig, read_surface
 from rewild4d.errors import UserError
 from rewild4d.meshes import Mesh
@@ -32,11 +32,15 @@ def read_animation(path: Path, times: Sequence[float]) -> list[list[Mesh]]:
         raise UserError(f"{path}: expected one animation, got {', '.join(names) or 'none'}.")
     clock = np.asarray(times, np.float64) - times[0]
     shares = clock / max(clock[-1], 1e-9)
-    document = Document(path)
+    with consistent(path):
+        return _moments(Document(path), path, names[0], shares)
+
+
+def _moments(document: Document, path: Path, clip: str, shares: Floats) -> list[list[Mesh]]:
     nodes = [document.tree.nodes[i] for i in document.scene_nodes()]
     if any(node.mesh is not None and node.skin is not None for node in nodes):
-        animal = load_rig(path, names[0], shares=shares)
-        posed = [animal.posed(frame) for frame in range(len(times))]
+        animal = load_rig(path, clip, shares=shares)
+        posed = [animal.posed(frame) for frame in range(len(shares))]
         return [[_mesh(s, v) for s, v in zip(animal.surfaces, each, strict=True)] for each in posed]
     start, end = document.clip_range(0)
     moments = start + (end - start) * shares
@@ -44,7 +48,7 @@ def read_animation(path: Path, times: Sequence[float]) -> list[list[Mesh]]:
     parts = [part for index in document.scene_nodes() for part in _parts(document, index, moments, world[:, index])]
     if not parts:
         raise UserError(f"{path}: expected a mesh, but the file's scene has none.")
-    return [[part[frame] for part in parts] for frame in range(len(times))]
+    return [[part[frame] for part in parts] for frame in range(len(shares))]
 
 
 def _parts(document: Document, index: int, times: Floats, world: Floats) -> list[list[Mesh]]:

@@ -10,8 +10,8 @@ with `vertices`, `faces`, `weights`, `joints`, `parents`; it then takes its firs
 A run's settings name the path, so the file should not change between runs.
 
 `gart-star` then fits the pose of each frame once more to that frame, everything else frozen: SGD, 160 steps, at a rate
-of 2e-2 halved every 50. Only the training camera's image at that moment is used, never another view. Every table flags
-it, because in an input-view score the fitted image is the scored one.
+of 2e-2 halved every 50. The original does so with the image it is scored on. Here that is the training camera's image
+at each of the clip's moments, never a held-out view or moment; every table says that there was this second fit.
 
 What differs from the original: positions get no gradient through the skinning grid, a Gaussian turns with the blended
 quaternion of its joints instead of the blended matrix (which would shrink it), the grid is a cube, neighbours are
@@ -282,6 +282,9 @@ class GartStar(Gart):
 
     name: ClassVar[str] = "gart-star"
     info: ClassVar[MethodInfo] = MethodInfo(
-        title="GART* (20 bones)", paper=PAPER, licence="MIT (written anew from the paper)", sees_test_frames=True
+        title="GART* (20 bones)",
+        paper=PAPER,
+        licence="MIT (written anew from the paper)",
+        mark="poses fitted once more to each input image",
     )
     Config: ClassVar[type[GartConfig]] = GartStarConfig

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any, TypeVar
 
 import msgspec
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from rewild4d.errors import UserError
-from rewild4d.files import atomic, save_tensors
+from rewild4d.files import atomic, load_tensors, save_tensors
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.motion import camera_between, frame_position, interpolate_similarity
 from rewild4d.ours.symmetry import match_times
@@ -99,8 +98,8 @@ def load_state(folder: Path, method: str, config_type: type[C]) -> tuple[dict[st
             raise UserError(f"{folder}: expected a reconstruction by '{method}', but it has no {name}.")
     try:
         config = msgspec.json.decode((folder / CONFIG).read_bytes(), type=config_type)
-        return torch.load(folder / STATE, map_location="cpu", weights_only=True), config
-    except (msgspec.MsgspecError, UnpicklingError, RuntimeError, EOFError, ValueError) as error:
+    except (msgspec.MsgspecError, ValueError) as error:
         raise UserError(
             f"{folder}: expected a reconstruction by '{method}', but it cannot be read ({error})."
         ) from error
+    return load_tensors(folder / STATE), config

@@ -14,6 +14,7 @@ import torch
 
 from rewild4d.datasets.artemis_files import write_intrinsics, write_matrices
 from rewild4d.errors import UserError
+from rewild4d.files import save_tensors
 from rewild4d.types import Camera
 
 
@@ -127,9 +128,9 @@ class ArtemisWriter:
         np.save(build / "bones" / "bone_parents.npy", self._parents)
         volumes = build / "volumes"
         volumes.mkdir()
-        torch.save(torch.from_numpy(self._voxels), volumes / "coords_init.pth")
-        torch.save(torch.from_numpy(self._indices), volumes / "volume_indices.pth")
-        torch.save(torch.from_numpy(self._weights), volumes / "volume_weights.pth")
+        save_tensors(torch.from_numpy(self._voxels), volumes / "coords_init.pth")
+        save_tensors(torch.from_numpy(self._indices), volumes / "volume_indices.pth")
+        save_tensors(torch.from_numpy(self._weights), volumes / "volume_weights.pth")
         (volumes / "radius.txt").write_text(" ".join(f"{value:.9g}" for value in self._radius) + "\n")
         (build / "sequences").write_text("".join(f"{name} {count}\n" for name, count in self._frames.items()))
         if self._licence:

@@ -68,12 +68,21 @@ class Articulated(Reconstruction, Protocol):
 
 @dataclass(frozen=True)
 class MethodInfo:
-    """What a table prints about a method: pure data."""
+    """What a table prints about a method: pure data.
+
+    Attributes:
+        title: of its rows.
+        paper: where it is from.
+        licence: of the code here.
+        mark: what stands beside all of its numbers and keeps its rows out of the ranking: an advantage of its kind.
+        is_floor: whether it is a floor, printed beside the others and never ranked.
+        uses_prior: whether it starts from the prior.
+    """
 
     title: str
     paper: str
     licence: str
-    sees_test_frames: bool = False
+    mark: str = ""
     is_floor: bool = False
     uses_prior: bool = True
 

@@ -56,7 +56,7 @@ def marks(method: str, prior: str, reconstruction: Reconstruction) -> list[str]:
         reconstruction: it may have marks of its own.
     """
     info = load_method(method).info
-    found = ["has seen the test frames"] if info.sees_test_frames else []
+    found = [info.mark] if info.mark else []
     if info.uses_prior and prior.partition(":")[0] == "coarse":
         found.append(FROM_TRUTH)
     return found + list(getattr(reconstruction, "marks", ()))

@@ -240,16 +240,18 @@ class Job:
                 reconstruction, clip, case.truth, self.folder,
                 original_frames(self.plan.reader, clip, self.plan.protocol.selection),
             )  # fmt: skip
+            record = self._record(
+                case, "ok", "", **found.keep(self.folder), coverage=seen, pictures=pictures,
+                diagnostics=describing.diagnostics(reconstruction),
+                marks=describing.marks(self.entry.method, self.plan.prior.name, reconstruction),
+                timing=self._timing(fit_seconds, seconds),
+            )  # fmt: skip
+            path = write_record(record, self.folder)
         except UserError as error:
             return self.fail(str(error), case)
         except Exception as error:  # a bug or a diverged fit: the record keeps the message, the terminal the traceback
             traceback.print_exc(file=sys.stderr)
             return self.fail(f"{type(error).__name__}: {error}", case)
-        record = self._record(case, "ok", "", **found.keep(self.folder), coverage=seen, pictures=pictures,
-                              diagnostics=describing.diagnostics(reconstruction),
-                              marks=describing.marks(self.entry.method, self.plan.prior.name, reconstruction),
-                              timing=self._timing(fit_seconds, seconds))  # fmt: skip
-        path = write_record(record, self.folder)
         shutil.rmtree(self.folder / "work", ignore_errors=True)
         return read_record(path)
 

@@ -130,7 +130,7 @@ def test_losing_every_gaussian_is_said(case: Case) -> None:
 
 def test_what_tables_say_of_them() -> None:
     said = {method.info.title: method.info for method in (D3dgs(), D3dgsStar(), Gart(), GartStar())}
-    assert [title for title, info in said.items() if info.sees_test_frames] == ["GART* (20 bones)"]
+    assert [title for title, info in said.items() if info.mark] == ["GART* (20 bones)"]
     assert [title for title, info in said.items() if not info.uses_prior] == ["D-3DGS"]
 
 
@@ -139,7 +139,7 @@ def test_an_unreadable_reconstruction_is_named(tmp_path: Path) -> None:
         Gart().load(tmp_path, CPU)
     (tmp_path / "state.pt").write_bytes(b"no state")
     (tmp_path / "config.json").write_text("{}")
-    with pytest.raises(UserError, match="expected a reconstruction by 'd3dgs-star', but it cannot be read"):
+    with pytest.raises(UserError, match="expected a saved reconstruction, but it is cut off or another file"):
         D3dgsStar().load(tmp_path, CPU)
 
 

@@ -188,7 +188,7 @@ def test_edited_sources_of_a_plugged_in_method_are_another_run(
 def test_a_prior_from_the_truth_is_a_mark_of_those_that_use_it() -> None:
     reconstruction: Any = object()
     assert marks("ours", "coarse:0.5", reconstruction) == marks("prior-only", "coarse", reconstruction) == [FROM_TRUTH]
-    assert marks("gart-star", "coarse:0", reconstruction) == ["has seen the test frames", FROM_TRUTH]
+    assert marks("gart-star", "coarse:0", reconstruction) == ["poses fitted once more to each input image", FROM_TRUTH]
     assert marks("empty", "coarse:0", reconstruction) == marks("ours", "template", reconstruction) == []
     assert marks("ours", "priors/coarse.npz", reconstruction) == []
 

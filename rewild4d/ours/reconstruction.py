@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from rewild4d.errors import UserError
-from rewild4d.files import atomic
+from rewild4d.files import atomic, load_tensors, save_tensors
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.config import Config
 from rewild4d.ours.geometry_losses import relative_turn
@@ -111,8 +111,7 @@ class OursReconstruction:
             "object_to_world": self.object_to_world,
             "cameras": [_camera_state(camera) for camera in self.cameras],
         }
-        with atomic(folder / STATE) as path:
-            torch.save(state, path)
+        save_tensors(state, folder / STATE)
         with atomic(folder / CONFIG) as path:
             path.write_bytes(msgspec.json.format(msgspec.json.encode(self.config), indent=2))
 
@@ -146,9 +145,9 @@ def load_reconstruction(folder: Path, device: torch.device) -> OursReconstructio
             raise UserError(f"{folder}: expected a reconstruction by 'ours', but it has no {name}.")
     try:
         config = msgspec.json.decode((folder / CONFIG).read_bytes(), type=Config)
-        state = torch.load(folder / STATE, map_location="cpu", weights_only=True)
-    except (msgspec.MsgspecError, RuntimeError, EOFError, ValueError) as error:
+    except (msgspec.MsgspecError, ValueError) as error:
         raise UserError(f"{folder}: expected a reconstruction by 'ours', but it cannot be read ({error}).") from error
+    state = load_tensors(folder / STATE)
     saved = state["model"]
     gaussians = Gaussians({name: saved[f"gaussians.{name}"] for name in NAMES}, config.canonical.max_scale)
     logits, origin, pitch, mirror = (saved[f"field.{name}"] for name in ("logits", "origin", "pitch", "mirror"))
