@@ -23,7 +23,7 @@ from rewild4d import describing
 from rewild4d.contracts import DatasetReader, Reconstruction
 from rewild4d.coverage import coverage
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.files import held, write_text
+from rewild4d.files import held, remove_leftovers, write_text
 from rewild4d.leaderboard.records import FILE, SCHEMA, RunRecord, Timing, make_run_id, read_record, write_record
 from rewild4d.machine import code_of, machine, peak_memory_mib
 from rewild4d.original_view import original_frames
@@ -225,7 +225,10 @@ class Job:
     def run(self, case: Case, seen: dict[str, float]) -> RunRecord:
         """What is there, if it is finished; else fit, evaluate, draw, record. One process at a time."""
         with held(self.folder, f"{self.title}: waiting for another process that makes {self.folder.name}"):
-            return self.record() if self.finished() else self._run(case, seen)
+            if self.finished():
+                return self.record()
+            remove_leftovers(self.folder)
+            return self._run(case, seen)
 
     def _run(self, case: Case, seen: dict[str, float]) -> RunRecord:
         try:

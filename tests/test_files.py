@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from rewild4d.errors import UserError
-from rewild4d.files import held, save_tensors
+from rewild4d.files import atomic, held, remove_leftovers, save_tensors
 
 
 @contextmanager
@@ -57,3 +57,15 @@ def test_a_held_folder_makes_others_wait(tmp_path: Path, capsys: pytest.CaptureF
         held(tmp_path / "file/run", ""),
     ):
         pass
+
+
+def test_what_a_killed_process_had_begun_is_removed(tmp_path: Path) -> None:
+    kept = [tmp_path / "film.mp4", tmp_path / ".hidden", tmp_path / ".a.folder__.mp4"]
+    kept[0].write_text("a")
+    kept[1].write_text("b")
+    kept[2].mkdir()
+    block = atomic(tmp_path / "film.mp4")
+    begun = block.__enter__()  # and no end
+    assert begun.is_file() and begun.parent == tmp_path
+    remove_leftovers(tmp_path)
+    assert sorted(tmp_path.iterdir()) == sorted(kept)
