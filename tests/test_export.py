@@ -195,7 +195,7 @@ def test_the_command(
         saved = tmp_path / method / "reconstruction"
         saved.mkdir(parents=True)
         reconstruction.save(saved)
-        found = record(method=method, dataset="online", case="clip", protocol={"name": "online-256-v2"},
+        found = record(method=method, dataset="online", case="clip", protocol=PROTOCOL | {"name": "online-256-v2"},
                        data={"root": str(tmp_path / "clip"), **settings})  # fmt: skip
         write_record(found, tmp_path / method)
     with pytest.raises(SystemExit) as stop:
