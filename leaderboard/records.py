@@ -174,8 +174,3 @@ def find_records(folder: Path) -> list[tuple[Path, RunRecord]]:
     if not folder.is_dir():
         raise UserError(f"{folder}: expected a folder of runs, but there is no such folder.")
     return [(path.parent, read_record(path)) for path in sorted(folder.rglob(FILE))]
-
-
-def read_records(folder: Path) -> list[RunRecord]:
-    """All records below a folder, sorted by path; see `find_records`."""
-    return [record for _, record in find_records(folder)]

@@ -17,11 +17,15 @@ from rewild4d.leaderboard import collect as module
 from rewild4d.leaderboard.collect import MARKER, collect, per_moment, rounded, title_of
 from rewild4d.leaderboard.curves import moments
 from rewild4d.leaderboard.privacy import last_part, without_paths
-from rewild4d.leaderboard.records import FILE, RunRecord, Score, find_records, read_records, write_record
+from rewild4d.leaderboard.records import FILE, RunRecord, Score, find_records, write_record
 
 OPEN = {"licence": "CC0 1.0 (made by rewild4d)", "root": "/home/jane doe/animals/zoo"}
 LIMIT = 15_000_000
 ITEMS = [f"view {view} at {time:.4f} s" for time in (0.0, 0.5) for view in (1, 2)]
+
+
+def kept_records(folder: Path) -> list[RunRecord]:
+    return [record for _, record in find_records(folder / "kept")]
 
 
 def call(*words: str) -> int:
@@ -64,7 +68,7 @@ def test_only_what_a_page_needs_is_kept(tmp_path: Path) -> None:
     }  # fmt: skip
     assert (made.runs, made.pictured, made.remarks) == (2, 1, [])
     assert made.size == sum(path.stat().st_size for path in (tmp_path / "kept").rglob("*") if path.is_file())
-    first, second = read_records(tmp_path / "kept")
+    first, second = kept_records(tmp_path)
     assert (first.pictures, second.pictures) == (["comparison.webp", "orbit.mp4"], [])
     picture = imageio.imread(next((tmp_path / "kept").rglob("comparison.webp")))
     assert picture.shape == (round(640 * 960 / 2048), 960, 3)
@@ -90,7 +94,7 @@ def test_means_stay_and_items_are_shortened(tmp_path: Path) -> None:
     for seed in (1, 2):
         keep(tmp_path / "runs" / str(seed), seed, drawn=False)
     collect(find_records(tmp_path / "runs"), tmp_path / "kept", title="", limit=LIMIT)
-    first, second = (made.scores["psnr"] for made in read_records(tmp_path / "kept"))
+    first, second = (made.scores["psnr"] for made in kept_records(tmp_path))
     assert (first.value, first.count, first.per_item) == (20.123456789, 4, [10.12, 20.0, None, 30.0])
     assert (second.value, second.count, second.per_item) == (20.123456789, 4, [round((10.12345 + 20) / 2, 2), 30.0])
 
@@ -212,7 +216,7 @@ def test_the_latest_of_equal_runs_is_kept_and_a_failure_too(tmp_path: Path) -> N
     write_record(msgspec.structs.replace(old, timing=older), tmp_path / "runs" / "old")
     keep(tmp_path / "runs" / "bad", 2, False, status="failed", error="/home/jane/a.ply: cut", scores={}, pictures=[])
     collect(find_records(tmp_path / "runs"), tmp_path / "kept", title="", limit=LIMIT)
-    kept = read_records(tmp_path / "kept")
+    kept = kept_records(tmp_path)
     assert [(made.seed, made.run_id, made.error) for made in kept] == [
         (1, f"{1:016d}", ""),
         (2, f"{2:016d}", "a.ply: cut"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from imageio.v2 import get_reader
-from test_records import record
+from records_for_tests import PROTOCOL, record
 
 from rewild4d import cli
 from rewild4d.baselines.empty import EmptyReconstruction
