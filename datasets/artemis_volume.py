@@ -1,6 +1,5 @@
 """The true geometry of an Artemis animal: rest-pose voxels with skinning weights, moved by the bones."""
 
-import pickle
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,6 +9,7 @@ import torch
 
 from rewild4d.datasets.artemis_files import read_matrices, read_parents
 from rewild4d.errors import UserError
+from rewild4d.files import load_tensors
 
 SURFACE_POINTS = 10_000
 """Voxels of `Truth.surface` at most; `Truth.sample` draws as many points as it is asked for."""
@@ -206,12 +206,7 @@ class MovingSurface:
 
 
 def _tensor(path: Path) -> np.ndarray:
-    try:
-        value = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise UserError(f"{path}: expected a file that can be read, but: {error.strerror}.") from error
-    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError) as error:
-        raise UserError(f"{path}: expected a saved torch tensor, but it cannot be read as one.") from error
+    value = load_tensors(path, "saved torch tensor")
     if not isinstance(value, torch.Tensor):
         raise UserError(f"{path}: expected a saved torch tensor, got {type(value).__name__}.")
     return value.numpy()

@@ -1,4 +1,4 @@
-"""Atomic writes and content digests."""
+"""Files and folders: whole or not at all, one writer at a time, known by their content, in the order people count."""
 
 import contextlib
 import hashlib
@@ -170,8 +170,12 @@ def natural(path: Path) -> list[str | int]:
     return [int(part) if index % 2 else part for index, part in enumerate(re.split(r"([0-9]+)", path.name))]
 
 
-def load_tensors(path: Path) -> Any:
+def load_tensors(path: Path, kind: str = "saved reconstruction") -> Any:
     """What torch saved, on the CPU.
+
+    Args:
+        path: the file.
+        kind: what the file should be, for the error.
 
     Raises:
         UserError: it is missing, damaged, or holds more than tensors and numbers.
@@ -179,9 +183,9 @@ def load_tensors(path: Path) -> Any:
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
-        raise UserError(f"{path}: expected a saved reconstruction, but there is no such file.") from error
+        raise UserError(f"{path}: expected a {kind}, but there is no such file.") from error
     except Exception as error:  # an unpickler that meets other bytes fails in any way
-        raise UserError(f"{path}: expected a saved reconstruction, but it is cut off or another file.") from error
+        raise UserError(f"{path}: expected a {kind}, but it is cut off or another file.") from error
 
 
 def cache_folder() -> Path:

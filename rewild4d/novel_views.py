@@ -30,7 +30,7 @@ from rewild4d.metrics.video import (
     unfit,
     video_features,
 )
-from rewild4d.orbit import orbit_cameras
+from rewild4d.orbit import first_across, orbit_cameras
 from rewild4d.types import Camera, Clip, Frame, Splats
 
 TITLES = {title: name for scores in KINDS.values() for name, title in scores.items()}
@@ -273,16 +273,8 @@ def _cameras(known: Sequence[Camera], middle: Tensor, up: Tensor) -> list[Camera
     first = known[0]
     return orbit_cameras(
         middle, float(radii.median()), elevation, intrinsics=first.intrinsics, width=first.width, height=first.height,
-        up=up, ahead=_ahead(offsets, up), views=VIEWS,
+        up=up, ahead=first_across(offsets, up), views=VIEWS,
     )  # fmt: skip
-
-
-def _ahead(offsets: Tensor, up: Tensor) -> Tensor:
-    """The way to the first camera that does not stand straight above; any level one where all do, [3]."""
-    for offset in offsets:
-        if float(torch.linalg.cross(offset, up).norm()) > 1e-6 * float(offset.norm()):
-            return offset
-    return torch.linalg.cross(up, torch.eye(3).double()[int(up.abs().argmin())])
 
 
 def _windows(frames: int, settings: NovelViews) -> list[list[int]]:

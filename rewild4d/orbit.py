@@ -51,3 +51,16 @@ def orbit_cameras(
         eye = center.double() + axis_angle_to_matrix(up * (2 * math.pi * view / views)) @ start
         cameras.append(Camera(look_at(eye, center.double(), up), intrinsics.double(), width, height))
     return cameras
+
+
+def first_across(offsets: Tensor, up: Tensor) -> Tensor:
+    """The first of some directions that is not along ``up``; where all are, any across it: an azimuth 0, [3].
+
+    Args:
+        offsets: not of unit length, float64, [n, 3].
+        up: of unit length, float64, [3].
+    """
+    for offset in offsets:
+        if float(torch.linalg.cross(offset, up).norm()) > 1e-6 * float(offset.norm()):
+            return offset
+    return torch.linalg.cross(up, torch.eye(3).double()[int(up.abs().argmin())])

@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 
 from rewild4d.contracts import Articulated, Reconstruction
 from rewild4d.novel_views import input_camera, world_up
-from rewild4d.orbit import orbit_cameras
+from rewild4d.orbit import first_across, orbit_cameras
 from rewild4d.pictures import PANEL, header, over
 from rewild4d.types import Camera, Clip, Splats
 
@@ -147,11 +147,8 @@ def _axes(
     if all(frame.crop is not None for frame in clip.frames):  # footage: the prior's object frame is the world
         return torch.eye(3).double().expand(count, 3, 3), True
     up = world_up(clip, cameras, up)
-    toward = cameras[0].center - middles[0]
-    level = toward - (toward @ up) * up
-    if float(level.norm()) < 1e-6 * float(toward.norm()):
-        level = torch.linalg.cross(up, torch.eye(3).double()[int(up.abs().argmin())])
-    ahead = normalize(level, dim=0)
+    toward = first_across((cameras[0].center - middles[0])[None], up)
+    ahead = normalize(toward - (toward @ up) * up, dim=0)
     return torch.stack((torch.linalg.cross(up, ahead), up, ahead)).expand(count, 3, 3), False
 
 

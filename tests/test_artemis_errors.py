@@ -228,11 +228,11 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "a torn tensor": (
         lambda a: cut(a / "volumes/coords_init.pth"),
-        r"coords_init\.pth: expected a saved torch tensor, but it cannot be read as one\.",
+        r"coords_init\.pth: expected a saved torch tensor, but it is cut off or another file\.",
     ),
     "half a volume": (
         lambda a: (a / "volumes/volume_indices.pth").unlink(),
-        r"volume_indices\.pth: expected a file .* No such file",
+        r"volume_indices\.pth: expected a saved torch tensor, but there is no such file",
     ),
 }
 

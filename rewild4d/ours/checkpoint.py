@@ -6,8 +6,7 @@ from typing import Any
 import msgspec
 import torch
 
-from rewild4d.errors import UserError
-from rewild4d.files import digest, save_tensors
+from rewild4d.files import digest, load_tensors, save_tensors
 from rewild4d.types import Clip, Prior
 
 NAME = "checkpoint.pt"
@@ -33,12 +32,7 @@ def load_checkpoint(folder: Path, identity: str) -> tuple[dict[str, Any] | None,
     path = folder / NAME
     if not path.exists():
         return None, None
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, ValueError) as error:
-        raise UserError(
-            f"{path}: expected a checkpoint, but it cannot be read ({error}); remove it to start anew."
-        ) from error
+    content = load_tensors(path, "checkpoint (remove it to start anew)")
     if content.get("digest") != identity:
         return None, f"{path}: is of another configuration, clip, prior or seed; starting anew."
     return content["state"], None
