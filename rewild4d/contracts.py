@@ -31,7 +31,7 @@ class Reconstruction(Protocol):
 
         Where the data set has no cameras (`Frame.camera` is None) the evaluation renders held-out frames of the input
         view with it. It must then answer between the clip's frames too, for the image that the clip would hold at that
-        time: crops of held-out moments lie on the straight line between those of the neighbouring frames.
+        time: its crop lies on the straight line between those of the neighbouring frames (`recropping` does the rest).
         """
         ...
 

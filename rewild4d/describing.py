@@ -28,6 +28,19 @@ def prior_of(prior: Prior | None) -> dict[str, Any]:
     return said | ({"notes": list(prior.notes)} if prior.notes else {})
 
 
+def left_out(clip: Clip, shown: Clip | None) -> dict[str, list[int]]:
+    """Rows of the frames that the method was not shown, because the prior does not know their cameras, if any."""
+    times = set(clip.times if shown is None else shown.times)
+    rows = [row for row, time in enumerate(clip.times) if time not in times]
+    return {"left_out": rows} if rows else {}
+
+
+def shown_of(clip: Clip, prior: dict[str, Any]) -> Clip:
+    """What a record's method was shown of its clip; ``prior`` as the record has it."""
+    missing = set(prior.get("left_out", ()))
+    return clip.only([row for row in range(len(clip.frames)) if row not in missing]) if missing else clip
+
+
 def keypoints(choice: PriorChoice, clip: Clip) -> dict[str, str]:
     """Which annotated keypoints the fit of the prior saw, where the clip has any."""
     if choice.mapping is None or all(frame.keypoints is None for frame in clip.frames):

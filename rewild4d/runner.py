@@ -31,6 +31,7 @@ from rewild4d.priors.choose import PriorChoice, make_prior
 from rewild4d.priors.placing import known_frames, with_cameras
 from rewild4d.protocol import Protocol, evaluate, may_be_scored_now
 from rewild4d.rasterizer import pick_rasterizer, set_default
+from rewild4d.recropping import seen_by
 from rewild4d.registry import load_method
 from rewild4d.types import Case, Clip, Prior, Truth
 from rewild4d.view import save_pictures
@@ -235,12 +236,13 @@ class Job:
             reconstruction, fit_seconds = self._fit(case)
             begin = time.perf_counter()
             progress = Progress(f"{self.title}: evaluate")
-            clip = with_cameras(self.clip, case.prior)  # also the frames that the fit was not shown
-            found = evaluate(reconstruction, clip, case.truth, self.plan.protocol, progress, self.plan.device)
+            whole = with_cameras(self.clip, case.prior)  # also the frames that the fit was not shown
+            clip, truth = seen_by(reconstruction, whole, case.truth, case.clip)
+            found = evaluate(reconstruction, clip, truth, self.plan.protocol, progress, self.plan.device)
             progress.close()
             seconds = time.perf_counter() - begin
             pictures = save_pictures(
-                reconstruction, clip, case.truth, self.folder,
+                reconstruction, clip, truth, self.folder,
                 original_frames(self.plan.reader, clip, self.plan.protocol.selection),
             )  # fmt: skip
             record = self._record(
@@ -305,7 +307,8 @@ class Job:
                      "truth": self.truth.digest, **describing.reading(plan.reader, self.clip)},
             "prior": {"choice": plan.prior.name, "config": msgspec.to_builtins(plan.prior.settings(self.clip)),
                       **describing.keypoints(plan.prior, self.clip),
-                      **describing.prior_of(case.prior if case else None)},
+                      **describing.prior_of(case.prior if case else None),
+                      **describing.left_out(self.clip, case.clip if case else None)},
             "protocol": {"digest": plan.protocol.digest, **msgspec.to_builtins(plan.protocol)},
             "code": code_of(self.entry.method), "machine": machine(plan.device, plan.rasterizer),
         }  # fmt: skip

@@ -93,6 +93,14 @@ class Crop:
         placed = torch.tensor(((scale, 0, self.left), (0, scale, self.top), (0, 0, 1)), dtype=camera.intrinsics.dtype)
         return replace(camera, intrinsics=placed @ camera.intrinsics, width=self.width, height=self.height)
 
+    def cropped_camera(self, camera: Camera, size: int) -> Camera:
+        """The camera of the image (``size`` wide and high), from the camera of the whole original frame."""
+        moved = camera.intrinsics.clone()
+        moved[0, 2] -= self.left
+        moved[1, 2] -= self.top
+        moved[:2] *= size / self.side
+        return replace(camera, intrinsics=moved, width=size, height=size)
+
 
 @dataclass(frozen=True)
 class Keypoints:
@@ -166,6 +174,13 @@ class Clip:
     @property
     def times(self) -> tuple[float, ...]:
         return tuple(frame.time for frame in self.frames)
+
+    def only(self, rows: Sequence[int]) -> "Clip":
+        """The clip without its other frames; the digest stays that of the whole."""
+        travel = self.travel
+        if travel is not None:
+            travel = torch.cat((travel.new_zeros(1, 2), travel.cumsum(0)))[list(rows)].diff(dim=0)
+        return replace(self, frames=tuple(self.frames[row] for row in rows), travel=travel)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from rewild4d.machine import code_of, machine, peak_memory_mib, pick_device
 from rewild4d.original_view import original_frames
 from rewild4d.protocol import evaluate, find_protocol
 from rewild4d.rasterizer import pick_rasterizer, set_default
+from rewild4d.recropping import seen_by
 from rewild4d.registry import load_dataset, load_method
 from rewild4d.runner import STAMP, Progress, fit_seconds
 from rewild4d.view import save_pictures
@@ -77,6 +78,7 @@ def score_again(folder: Path, options: Options) -> RunRecord:
     reconstruction = load_method(record.method).load(saved, device)
     set_default(rasterizer)
     begin = time.perf_counter()
+    clip, truth = seen_by(reconstruction, clip, truth, describing.shown_of(clip, record.prior))
     progress = Progress(f"{record.case}: evaluate")
     found = evaluate(reconstruction, clip, truth, protocol, progress, device)
     progress.close()

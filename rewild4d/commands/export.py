@@ -7,6 +7,7 @@ from pathlib import Path
 
 import tyro
 
+from rewild4d import describing
 from rewild4d.commands.shared import require_writable
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError
@@ -15,8 +16,9 @@ from rewild4d.leaderboard.records import FILE, RunRecord, read_record
 from rewild4d.machine import pick_device
 from rewild4d.protocol import find_protocol
 from rewild4d.rasterizer import pick_rasterizer, set_default
+from rewild4d.recropping import seen_by
 from rewild4d.registry import load_dataset, load_method
-from rewild4d.types import Clip
+from rewild4d.types import Clip, Truth
 
 DESCRIPTION = """Write a run's reconstruction as files for other programs: Gaussians of every frame (ply), an animated
 skinned mesh (glb), cameras (OpenCV axes, JSON) and films (mp4)."""
@@ -54,6 +56,7 @@ def main(arguments: list[str]) -> int:
         raise UserError(f"{saved}: expected a saved reconstruction, but there is no such folder.")
     clip = load_clip(record, options.data)
     reconstruction = load_method(record.method).load(saved, device)
+    clip, _ = seen_by(reconstruction, clip, Truth((), None, ""), describing.shown_of(clip, record.prior))
     reasons = {kind: why_not(reconstruction, kind, clip) for kind in kinds}
     if all(reasons.values()):
         raise UserError(f"{options.run}: nothing can be written: {'; '.join(f'{k}: {r}' for k, r in reasons.items())}.")

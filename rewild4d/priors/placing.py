@@ -9,6 +9,7 @@ from torch import Tensor
 from rewild4d.errors import UserError
 from rewild4d.priors.io import seal
 from rewild4d.priors.motion import camera_at, pose_at, world_camera
+from rewild4d.recropping import recropped
 from rewild4d.transforms import camera_in_object
 from rewild4d.types import Camera, Clip, Prior
 
@@ -153,27 +154,21 @@ def in_crops(prior: Prior, clip: Clip) -> Prior:
                 f"{clip.name}: expected crops of {plain.width}x{plain.height} frames as prior '{prior.name}' knows, "
                 f"got {held}."
             )
-        cameras.append(_cropped(plain, crop.left, crop.top, crop.side, size))
+        cameras.append(crop.cropped_camera(plain, size))
         # in the flipped frame the crop starts as far from the left as it ends from the right
-        flipped.append(_cropped(prior.cameras_flip[row], crop.width - crop.left - crop.side, crop.top, crop.side, size))
+        mirrored = replace(crop, left=crop.width - crop.left - crop.side)
+        flipped.append(mirrored.cropped_camera(prior.cameras_flip[row], size))
     return seal(replace(prior, cameras=tuple(cameras), cameras_flip=tuple(flipped)))
-
-
-def _cropped(camera: Camera, left: float, top: float, side: float, size: int) -> Camera:
-    moved: Tensor = camera.intrinsics.clone()
-    moved[0, 2] -= left
-    moved[1, 2] -= top
-    moved[:2] *= size / side
-    return replace(camera, intrinsics=moved, width=size, height=size)
 
 
 def with_cameras(clip: Clip, prior: Prior) -> Clip:
     """The clip with the prior's cameras, in the prior's world, where its own are unknown; frames match by time."""
     if all(frame.camera is not None for frame in clip.frames):
         return clip
-    frames = []
+    shown, frames = known_frames(clip, prior), []
     for frame in clip.frames:
-        frames.append(frame if frame.camera is not None else replace(frame, camera=world_camera(prior, frame.time)))
+        camera = frame.camera or recropped(world_camera(prior, frame.time), shown, frame)
+        frames.append(replace(frame, camera=camera))
     return replace(clip, frames=tuple(frames))
 
 
@@ -185,7 +180,4 @@ def known_frames(clip: Clip, prior: Prior) -> Clip:
     rows = torch.nonzero(distance * clip.fps <= SAME)[:, 0].tolist()
     if len(rows) == len(clip.frames) or not rows:
         return clip
-    travel = clip.travel
-    if travel is not None:
-        travel = torch.cat((travel.new_zeros(1, 2), travel.cumsum(0)))[rows].diff(dim=0)
-    return replace(clip, frames=tuple(clip.frames[row] for row in rows), travel=travel)
+    return clip.only(rows)

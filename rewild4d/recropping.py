@@ -1,0 +1,88 @@
+"""Cameras at moments that a method was not shown, for images that squares cut from a video as they follow the animal.
+
+A method knows the cameras of the images that it was shown and answers between them for an image in between
+(`contracts.Reconstruction.camera`). Where the prior's filter has left frames out, the image that is really there was
+cut by another square.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, replace
+from typing import overload
+
+from rewild4d.contracts import Reconstruction
+from rewild4d.types import Camera, Clip, Crop, Frame, Truth
+
+
+def crop_between(shown: Clip, time: float) -> Crop | None:
+    """The square on the straight line between those of a clip's frames; None where the clip has none.
+
+    Args:
+        shown: frames in order.
+        time: seconds; before the first frame it is that one's, behind the last one that one's.
+    """
+    later = next((row for row, each in enumerate(shown.times) if each > time), len(shown.frames))
+    first, second = shown.frames[max(later - 1, 0)], shown.frames[min(later, len(shown.frames) - 1)]
+    if first.crop is None or second.crop is None:
+        return None
+    part = (time - first.time) / (second.time - first.time) if first.time < time < second.time else 0.0
+    a, b = first.crop, second.crop
+    left, top, side = (low + part * (high - low) for low, high in ((a.left, b.left), (a.top, b.top), (a.side, b.side)))
+    return Crop(left, top, side, a.width, a.height)
+
+
+def recropped(camera: Camera, shown: Clip, frame: Frame) -> Camera:
+    """A camera for the image that a frame is, from one for the image that `shown` would hold at its time.
+
+    Args:
+        camera: of a square image.
+        shown: the frames that gave the camera.
+        frame: at any time.
+    """
+    expected = crop_between(shown, frame.time)
+    if frame.crop is None or expected is None or camera.width != camera.height:
+        return camera
+    edges = zip(astuple(expected), astuple(frame.crop), strict=True)
+    if all(math.isclose(a, b, rel_tol=0.0, abs_tol=1e-6) for a, b in edges):
+        return camera
+    return frame.crop.cropped_camera(expected.original_camera(camera), camera.width)
+
+
+def seen_by(reconstruction: Reconstruction, clip: Clip, truth: Truth, shown: Clip) -> tuple[Clip, Truth]:
+    """A clip and its truth with the reconstruction's cameras wherever the data set has none and the method knows one.
+
+    Args:
+        reconstruction: of ``shown``.
+        clip: all frames of the video.
+        truth: its held-out frames are decoded when they are asked for.
+        shown: the frames of the clip that the method saw.
+    """
+    placed = Placed(reconstruction, shown, clip.frames)
+    return replace(clip, frames=tuple(placed)), replace(truth, held_out=Placed(reconstruction, shown, truth.held_out))
+
+
+@dataclass(frozen=True)
+class Placed(Sequence[Frame]):
+    """Frames, and a camera of the reconstruction for each that has none of its own."""
+
+    reconstruction: Reconstruction
+    shown: Clip
+    frames: Sequence[Frame]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+    @overload
+    def __getitem__(self, index: slice) -> "Placed": ...
+    def __getitem__(self, index: int | slice) -> "Frame | Placed":
+        if isinstance(index, slice):
+            return replace(self, frames=self.frames[index])
+        frame = self.frames[index]
+        camera = frame.camera or self.reconstruction.camera(frame.time)
+        return (
+            frame
+            if camera is frame.camera or camera is None
+            else replace(frame, camera=recropped(camera, self.shown, frame))
+        )
