@@ -127,7 +127,7 @@ class D3dgsStarConfig(D3dgsConfig, frozen=True, forbid_unknown_fields=True, kw_o
     """`d3dgs-star`; the defaults are `d3dgs`'s with the silhouette loss of `ours` and its start."""
 
     mirrored: Share = 0.5
-    """Share of the steps that see a mirror image, at negative times. .125 for .5, as preset `standard` of `ours` has it:
+    """Share of the steps that see a mirror image, at negative times. .125 for .5, as presets of `ours` have it:
     19.80 for 19.30 dB on the built-in tiger (quick, mean of three seeds that differ by .40 and .26, held-out PSNR)."""
     canonical: StarCanonical = StarCanonical()
     loss: StarLoss = StarLoss()

@@ -90,7 +90,8 @@ class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     time_noise_until: Weight = 0.5
     """Fraction at which the jitter ends."""
     tied: bool = False
-    """Pose of a flipped image = mirror image of that of the image, not its own: twice the evidence for each pose."""
+    """Pose of a flipped image = mirror image of that of the image, not its own. More evidence for each pose, yet worse than
+    poses of their own in preset `standard` (baselines/presets/ours.toml)."""
 
     def __post_init__(self) -> None:
         _require_heads(self.width, self.heads)
@@ -280,7 +281,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """At least so many steps for every frame of the clip; 0 leaves it at `iterations`."""
     mirrored: Share = 0.5
     """Share of the steps that see a mirror image (paper: half). Mirror images teach the side that no camera saw; what
-    cameras did see they pull towards its mirror image. .125 for .5 (preset standard, one seed each, sweep camera, held-
+    cameras did see they pull towards its mirror image. .125 for .5 (standard, poses tied, one seed each, sweep, held-
     out PSNR): pinto horse 25.6 for 24.4, tiger 22.6 for 22.2; symmetric coats: cow 27.4 for 27.3, fox 20.5 for 20.7."""
     checkpoint_every: Count = 500
     """Steps between checkpoints, where a work folder is given."""
