@@ -90,8 +90,8 @@ class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     time_noise_until: Weight = 0.5
     """Fraction at which the jitter ends."""
     tied: bool = False
-    """Pose of a flipped image = mirror image of that of the image, not its own. More evidence for each pose, yet worse than
-    poses of their own in preset `standard` (baselines/presets/ours.toml)."""
+    """Pose of a flipped image = mirror image of that of the image, not its own. More evidence for each pose, yet worse
+    than poses of their own in preset `standard` (baselines/presets/ours.toml)."""
 
     def __post_init__(self) -> None:
         _require_heads(self.width, self.heads)
