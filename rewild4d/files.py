@@ -184,6 +184,8 @@ def load_tensors(path: Path, kind: str = "saved reconstruction") -> Any:
         return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise UserError(f"{path}: expected a {kind}, but there is no such file.") from error
+    except OSError as error:
+        raise UserError(f"{path}: expected a {kind}, but: {error.strerror or error}.") from error
     except Exception as error:  # an unpickler that meets other bytes fails in any way
         raise UserError(f"{path}: expected a {kind}, but it is cut off or another file.") from error
 

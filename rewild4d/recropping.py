@@ -5,10 +5,11 @@ A method knows the cameras of the images that it was shown and answers between t
 cut by another square.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
 from typing import overload
+
+import numpy as np
 
 from rewild4d.contracts import Reconstruction
 from rewild4d.types import Camera, Clip, Crop, Frame, Truth
@@ -21,14 +22,14 @@ def crop_between(shown: Clip, time: float) -> Crop | None:
         shown: frames in order.
         time: seconds; before the first frame it is that one's, behind the last one that one's.
     """
-    later = next((row for row, each in enumerate(shown.times) if each > time), len(shown.frames))
-    first, second = shown.frames[max(later - 1, 0)], shown.frames[min(later, len(shown.frames) - 1)]
-    if first.crop is None or second.crop is None:
+    crops = [frame.crop for frame in shown.frames if frame.crop is not None]
+    if len(crops) < len(shown.frames):
         return None
-    part = (time - first.time) / (second.time - first.time) if first.time < time < second.time else 0.0
-    a, b = first.crop, second.crop
-    left, top, side = (low + part * (high - low) for low, high in ((a.left, b.left), (a.top, b.top), (a.side, b.side)))
-    return Crop(left, top, side, a.width, a.height)
+    left, top, side = (
+        float(np.interp(time, shown.times, values))
+        for values in zip(*(astuple(crop)[:3] for crop in crops), strict=True)
+    )
+    return Crop(left, top, side, crops[0].width, crops[0].height)
 
 
 def recropped(camera: Camera, shown: Clip, frame: Frame) -> Camera:
@@ -42,8 +43,7 @@ def recropped(camera: Camera, shown: Clip, frame: Frame) -> Camera:
     expected = crop_between(shown, frame.time)
     if frame.crop is None or expected is None or camera.width != camera.height:
         return camera
-    edges = zip(astuple(expected), astuple(frame.crop), strict=True)
-    if all(math.isclose(a, b, rel_tol=0.0, abs_tol=1e-6) for a, b in edges):
+    if np.allclose(astuple(expected), astuple(frame.crop), rtol=0.0, atol=1e-6):
         return camera
     return frame.crop.cropped_camera(expected.original_camera(camera), camera.width)
 
@@ -80,9 +80,5 @@ class Placed(Sequence[Frame]):
         if isinstance(index, slice):
             return replace(self, frames=self.frames[index])
         frame = self.frames[index]
-        camera = frame.camera or self.reconstruction.camera(frame.time)
-        return (
-            frame
-            if camera is frame.camera or camera is None
-            else replace(frame, camera=recropped(camera, self.shown, frame))
-        )
+        camera = None if frame.camera else self.reconstruction.camera(frame.time)
+        return replace(frame, camera=recropped(camera, self.shown, frame)) if camera else frame

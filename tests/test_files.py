@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from rewild4d.errors import UserError
-from rewild4d.files import atomic, held, remove_leftovers, save_tensors
+from rewild4d.files import atomic, held, load_tensors, remove_leftovers, save_tensors
 
 
 @contextmanager
@@ -69,3 +69,9 @@ def test_what_a_killed_process_had_begun_is_removed(tmp_path: Path) -> None:
     assert begun.is_file() and begun.parent == tmp_path
     remove_leftovers(tmp_path)
     assert sorted(tmp_path.iterdir()) == sorted(kept)
+
+
+def test_a_file_that_cannot_be_read_is_not_called_damaged(tmp_path: Path) -> None:
+    (tmp_path / "state.pt").mkdir()
+    with pytest.raises(UserError, match=r"state\.pt: expected a checkpoint, but: Is a directory\."):
+        load_tensors(tmp_path / "state.pt", "checkpoint")
