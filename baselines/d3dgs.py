@@ -127,8 +127,9 @@ class D3dgsStarConfig(D3dgsConfig, frozen=True, forbid_unknown_fields=True, kw_o
     """`d3dgs-star`; the defaults are `d3dgs`'s with the silhouette loss of `ours` and its start."""
 
     mirrored: Share = 0.5
-    """Share of the steps that see a mirror image, at negative times. .125 for .5, as presets of `ours` have it:
-    19.80 for 19.30 dB on the built-in tiger (quick, mean of three seeds that differ by .40 and .26, held-out PSNR)."""
+    """Share of the steps that see a mirror image, at negative times (the paper's is open; `ours`: half). An eighth, as
+    presets of `ours` have it, gains nothing sure: tiger, held out, mean of three seeds 19.8 for 19.3 (quick), 20.5 for
+    20.3 (standard, seeds differ by .8); giraffe 25.9 (standard, one seed) for 26.2."""
     canonical: StarCanonical = StarCanonical()
     loss: StarLoss = StarLoss()
 

@@ -20,6 +20,7 @@ from rewild4d.baselines.volume import SCENE_HALF, common_volume, random_points, 
 from rewild4d.config import load_preset, preset_names
 from rewild4d.conformance import check_method, tiny_case
 from rewild4d.errors import UserError
+from rewild4d.kernels.halves import AVAILABLE
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.config import Canonical
 from rewild4d.registry import load_method
@@ -210,7 +211,7 @@ def test_the_octave_code() -> None:
 
 def test_the_network_is_the_originals() -> None:
     """Against the layers written out one by one, with the input joined to the fifth layer's output."""
-    shape = NetworkShape(width=12, time_width=7, time_features=5, place_octaves=2, time_octaves=3)
+    shape = NetworkShape(width=12, time_width=7, time_features=5, place_octaves=2, time_octaves=3, half=False)
     network = DeformationNetwork(shape, torch.Generator().manual_seed(0))
     torch.nn.init.normal_(network.heads.weight, generator=torch.Generator().manual_seed(1))
     points, time = torch.randn(6, 3, generator=torch.Generator().manual_seed(2)), torch.tensor(-0.4)
@@ -229,6 +230,23 @@ def test_the_network_is_the_originals() -> None:
     torch.testing.assert_close(torch.cat(network(points, time), dim=1), expected, atol=1e-5, rtol=1e-5)
     sizes = [tuple(layer.weight.shape) for layer in DeformationNetwork(NetworkShape(), torch.Generator()).layers]
     assert sizes == [(256, 256)] * 7
+
+
+@pytest.mark.skipif(not AVAILABLE, reason="this CPU does not multiply bfloat16 pairs")
+def test_the_network_in_bfloat16_is_that_of_single_precision() -> None:
+    """But for what eight bits of a number lose: a percent of the outputs; gradients point the same way."""
+    points, time = torch.rand(200, 3, generator=torch.Generator().manual_seed(2)) * 2 - 1, torch.tensor(-0.4)
+    results = []
+    for half in (True, False):
+        network = DeformationNetwork(NetworkShape(width=64, half=half), torch.Generator().manual_seed(0))
+        torch.nn.init.normal_(network.heads.weight, generator=torch.Generator().manual_seed(1))
+        made = torch.cat(network(points, time), dim=1)
+        assert made.dtype == torch.float32
+        made.square().mean().backward()
+        results.append([made.detach(), *(each.grad for each in network.parameters())])
+    errors = [float((rounded - exact).norm() / exact.norm()) for rounded, exact in zip(*results, strict=True)]
+    assert 1e-4 < errors[0] < 0.01
+    assert max(errors[1:]) < 0.15
 
 
 def test_flips_are_seen_at_negative_times(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ from rewild4d.contracts import Log, MethodInfo
 from rewild4d.ours.config import Config as OursConfig
 from rewild4d.ours.fit import train
 from rewild4d.ours.reconstruction import OursReconstruction, from_fit, load_reconstruction
-from rewild4d.ours.schedule import for_clip
+from rewild4d.ours.schedule import for_clip_of_ours
 from rewild4d.ours.symmetry import match_times
 from rewild4d.types import Clip, Prior
 
@@ -36,7 +36,7 @@ class Ours:
         workdir: Path | None,
     ) -> OursReconstruction:
         """Reconstruct from the clip and the prior; see contracts.Method."""
-        config = for_clip(config, len(clip.frames))
+        config = for_clip_of_ours(config, len(clip.frames))
         rows = match_times(clip, prior)
         model = train(clip, prior, config, seed, device, log, workdir)
         return from_fit(model, config, clip, prior, rows)

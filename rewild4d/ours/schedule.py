@@ -1,8 +1,11 @@
 """How long a fit is, and schedules as pure functions of its progress in [0, 1]."""
 
+import math
 from typing import Any, TypeVar
 
 import msgspec
+
+from rewild4d.ours.config import Config
 
 C = TypeVar("C", bound=msgspec.Struct)
 
@@ -16,6 +19,23 @@ def for_clip(config: C, frames: int) -> C:
     """
     own: Any = config
     return msgspec.structs.replace(config, iterations=max(own.iterations, own.steps_per_frame * frames))
+
+
+def for_clip_of_ours(config: Config, frames: int) -> Config:
+    """`for_clip`, but that short clips may take fewer steps, and that long ones have a finer time code.
+
+    Args:
+        config: as chosen.
+        frames: of the clip.
+
+    Returns:
+        Settings that are plain numbers: they give the same for a clip of any length.
+    """
+    pose = config.pose
+    doublings = math.log2(frames / pose.octave_frames) if pose.octave_frames else 0.0
+    pose = msgspec.structs.replace(pose, frequencies=pose.frequencies + max(0, round(doublings)), octave_frames=0)
+    steps = min(config.iterations, config.short_iterations) if frames <= config.short_frames else config.iterations
+    return for_clip(msgspec.structs.replace(config, iterations=steps, short_frames=0, pose=pose), frames)
 
 
 def exponential(first: float, last: float, progress: float) -> float:
