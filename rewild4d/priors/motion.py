@@ -66,12 +66,8 @@ def pose_at(prior: Prior, time: float) -> tuple[Tensor, Tensor]:
     Returns:
         object_to_world, float64, [4, 4]; rest -> posed transforms, float32, [J, 4, 4].
     """
-    times = prior.times
-    after = min(int(torch.searchsorted(times, torch.tensor(time, dtype=times.dtype) - 1e-9)), len(times) - 1)
-    before = after if time >= float(times[after]) - 1e-9 or after == 0 else after - 1
-    span = float(times[after] - times[before])
-    part = (time - float(times[before])) / span if span > 0 else 0.0
-    if before == after or part <= 1e-9:
+    before, after, part = _neighbours(prior.times, time)
+    if before == after:
         return prior.object_to_world[before], prior.transforms[before]
     return (
         blend_similarities(prior.object_to_world[before], prior.object_to_world[after], part),
@@ -81,12 +77,10 @@ def pose_at(prior: Prior, time: float) -> tuple[Tensor, Tensor]:
 
 def camera_at(prior: Prior, time: float) -> Camera:
     """The prior's camera at any time in the object frame: exact at its frames, between them on the straight way."""
-    times = prior.times
-    after = min(int(torch.searchsorted(times, torch.tensor(time, dtype=times.dtype) - 1e-9)), len(times) - 1)
-    before = max(after - 1, 0)
-    span = float(times[after] - times[before])
-    part = min(max((time - float(times[before])) / span, 0.0), 1.0) if span > 0 else 0.0
+    before, after, part = _neighbours(prior.times, time)
     first, second = prior.cameras[before], prior.cameras[after]
+    if before == after:
+        return first
     moved = blend_similarities(first.world_to_camera, second.world_to_camera, part)
     intrinsics = (1 - part) * first.intrinsics + part * second.intrinsics
     return replace(second, world_to_camera=moved, intrinsics=intrinsics)
@@ -95,6 +89,15 @@ def camera_at(prior: Prior, time: float) -> Camera:
 def world_camera(prior: Prior, time: float) -> Camera:
     """`camera_at` in the world where the prior's animal stands."""
     return camera_in_object(camera_at(prior, time), torch.linalg.inv(pose_at(prior, time)[0]))
+
+
+def _neighbours(times: Tensor, time: float) -> tuple[int, int, float]:
+    """The frames before and after a time, and its part of the way; one frame twice at it and beyond the ends."""
+    after = min(int(torch.searchsorted(times, torch.tensor(time, dtype=times.dtype) - 1e-9)), len(times) - 1)
+    if after == 0 or time >= float(times[after]) - 1e-9:
+        return after, after, 0.0
+    low, high = float(times[after - 1]), float(times[after])
+    return after - 1, after, (time - low) / (high - low)
 
 
 def blend_similarities(a: Tensor, b: Tensor, part: float) -> Tensor:
