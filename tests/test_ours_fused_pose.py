@@ -129,9 +129,9 @@ def batch_of_poses(dtype: torch.dtype, batch: int) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize(("batch", "rows"), [(1, [0]), (3, [1]), (6, [0, 4]), (2, [])])
-@pytest.mark.parametrize("only", ["limit", "attach", "temporal", None, ""])
+@pytest.mark.parametrize("only", ["limit", "attach", "temporal", "still", None, ""])
 def test_stance(batch: int, rows: list[int], only: str | None) -> None:
-    weights = {"limit": 3.0, "attach": 20.0, "temporal": 10.0}
+    weights = {"limit": 3.0, "attach": 20.0, "temporal": 10.0, "still": 2.0}
     if only is not None:
         weights = {name: value * (name == only) for name, value in weights.items()}
     config = Geometry(**weights)
@@ -152,7 +152,7 @@ def test_the_sum_alone_is_that_of_the_stance() -> None:
 
 def test_only_neighbouring_frames_have_a_bend() -> None:
     own, pose = model(), Pose(**batch_of_poses(torch.float32, 3))
-    config = Geometry(limit=0.0, attach=0.0, temporal=10.0)
+    config = Geometry(limit=0.0, attach=0.0, temporal=10.0, still=1.0)
     assert float(skeleton_losses(own, pose, own.transforms(pose), config, False).detach()) == 0
     assert float(stance(own, pose, [0, 1, 2], config)[2].detach()) == 0  # three views of a clip of two frames
     assert float(stance(own, pose, [1], config)[2].detach()) > 0
@@ -176,6 +176,23 @@ def test_attachment_of_a_shifted_joint() -> None:
     bones = sum(parent >= 0 for parent in PARENTS)
     expected = 2.0 * (0.5 / OBJECT_DIAGONAL) ** 2 / bones
     assert float(stance(own, pose, [0], config)[2]) == pytest.approx(expected, rel=1e-5)
+
+
+def test_steps_cost_their_length() -> None:
+    own, shifts, quats = model(), torch.zeros(3, 20, 3), torch.tensor((1.0, 0, 0, 0)).repeat(3, 20, 1)
+    config = Geometry(limit=0.0, attach=0.0, temporal=0.0, still=2.0)
+
+    def cost() -> float:
+        return float(stance(own, Pose(quats, shifts, torch.zeros(3, 20, 4)), [1], config)[2])
+
+    assert cost() == 0
+    quats[1] = -quats[1]  # the same rotation
+    assert cost() == 0
+    shifts[1:, 7, 1] = 0.5
+    once = 2.0 * 0.5 / OBJECT_DIAGONAL / (2 * 20)  # one of two steps of one of twenty joints
+    assert cost() == pytest.approx(once, rel=1e-2)
+    shifts[1, 7, 1] = 0.2  # the same way in two steps
+    assert cost() == pytest.approx(once, rel=1e-2)
 
 
 def test_a_bone_beyond_its_limit() -> None:

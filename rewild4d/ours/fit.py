@@ -95,7 +95,7 @@ class Training:
         """
         config, model = self.config, self.model
         progress = index / config.iterations
-        keys, own = neighbour_keys([key], self.supervision.frames, config.geometry.temporal > 0)
+        keys, own = neighbour_keys([key], self.supervision.frames, config.geometry)
         poses = model.pose(self._times(keys, progress), keys)
         network_pose = poses
         if config.prior.blend:

@@ -12,6 +12,7 @@ from rewild4d.kernels.arrays import fits
 from rewild4d.ours.deform import Posed
 from rewild4d.ours.fused.compactness import compactness
 from rewild4d.ours.fused.normals import disagreement, smallest_axes
+from rewild4d.ours.fused.skeleton import STILL
 from rewild4d.ours.pose import Pose, aligned
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import look_at, quat_multiply, quat_to_matrix
@@ -149,6 +150,17 @@ def temporal_loss(pose: Pose) -> Tensor:
     bend = aligned(quats[:, 0], middle) + aligned(quats[:, 2], middle) - 2 * middle
     swerve = (shifts[:, 0] + shifts[:, 2] - 2 * shifts[:, 1]) / OBJECT_DIAGONAL
     return bend.square().sum(-1).mean() + swerve.square().sum(-1).mean()
+
+
+def still_loss(pose: Pose) -> Tensor:
+    """Mean length, rounded at zero, of the steps of rotations and shifts within triples of frames, B = 3 k.
+
+    Not squared: many small steps cost as much as few large ones, so what need not move stands still.
+    """
+    quats, shifts = pose.quats.unflatten(0, (-1, 3)), pose.shifts.unflatten(0, (-1, 3))
+    turned = quats[:, 1:] - aligned(quats[:, :-1], quats[:, 1:])
+    moved = (shifts[:, 1:] - shifts[:, :-1]) / OBJECT_DIAGONAL
+    return sum(((step.square().sum(-1) + STILL**2).sqrt() - STILL).mean() for step in (turned, moved))
 
 
 def neighbours(points: Tensor, count: int) -> Tensor:

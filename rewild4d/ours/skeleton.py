@@ -7,24 +7,24 @@ from torch import Tensor
 from rewild4d.kernels.arrays import fits
 from rewild4d.ours.config import Geometry
 from rewild4d.ours.fused.skeleton import Weights, stand
-from rewild4d.ours.geometry_losses import attach_loss, limit_loss, temporal_loss
+from rewild4d.ours.geometry_losses import attach_loss, limit_loss, still_loss, temporal_loss
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import Pose
 from rewild4d.ours.symmetry import Key
 from rewild4d.types import OBJECT_DIAGONAL
 
 
-def neighbour_keys(keys: list[Key], frames: int, needed: bool) -> tuple[list[Key], list[int]]:
+def neighbour_keys(keys: list[Key], frames: int, config: Geometry) -> tuple[list[Key], list[int]]:
     """Each view with the frames before and after it, in triples, and the rows of the views themselves.
 
-    At an end of the clip the triple is moved inwards. Clips of two frames, or ``needed`` false, get no neighbours.
+    At an end of the clip the triple is moved inwards. Clips of two frames get no neighbours, nor does who needs none.
 
     Args:
         keys: the views of a step.
         frames: number of frames.
-        needed: whether a temporal term wants triples.
+        config: the weights of the temporal terms.
     """
-    if not needed or frames < 3:
+    if (not config.temporal and not config.still) or frames < 3:
         return keys, list(range(len(keys)))
     triples, own = [], []
     for row, key in enumerate(keys):
@@ -41,7 +41,7 @@ def stance(model: Model, poses: Pose, rows: list[int], config: Geometry) -> tupl
         model: gives the skeleton.
         poses: [B, J, ...]; where B = 3 k, triples of neighbouring frames as `neighbour_keys` makes them.
         rows: which are chosen, k of them.
-        config: the weights of joint limits, attachment and (over triples) temporal smoothness.
+        config: the weights of joint limits, attachment and (over triples) temporal smoothness and stillness.
 
     Returns:
         Poses [k, J, ...], transforms [k, J, 4, 4] and the weighted sum, scalar.
@@ -56,14 +56,14 @@ def stance(model: Model, poses: Pose, rows: list[int], config: Geometry) -> tupl
 
 
 def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geometry, triples: bool) -> Tensor:
-    """Weighted sum of joint limits, attachment and (over triples) temporal smoothness, scalar.
+    """Weighted sum of joint limits, attachment and (over triples) temporal smoothness and stillness, scalar.
 
     Args:
         model: gives the skeleton.
         pose: [B, J, ...].
         transforms: of the same poses, [B, J, 4, 4].
         config: the weights.
-        triples: whether the poses are those of triples of neighbouring frames; of others no bend is known.
+        triples: whether the poses are those of triples of neighbouring frames; of others no step is known.
     """
     if fits(pose.quats):
         return stand(*pose, [], model.pivots, model.parents, _weights(config, triples))[-1]
@@ -74,9 +74,12 @@ def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geomet
         total = total + config.attach * attach_loss(transforms, model.pivots, model.parents)
     if config.temporal and triples:
         total = total + config.temporal * temporal_loss(pose)
+    if config.still and triples:
+        total = total + config.still * still_loss(pose)
     return total
 
 
 def _weights(config: Geometry, triples: bool) -> Weights:
     cosine = math.cos(math.radians(config.limit_degrees) / 2)
-    return Weights(config.limit, cosine, config.attach, config.temporal if triples else 0.0, OBJECT_DIAGONAL)
+    temporal, still = (config.temporal, config.still) if triples else (0.0, 0.0)
+    return Weights(config.limit, cosine, config.attach, temporal, still, OBJECT_DIAGONAL)

@@ -51,7 +51,9 @@ class WarmUp:
         self._set_rate(index)
         copied = index < stage.regress
         keys = [self.supervision.draw(self.generator) for _ in range(stage.copies if copied else stage.views)]
-        keys, own = neighbour_keys(keys, self.supervision.frames, self.config.geometry.temporal > 0 and not copied)
+        own = list(range(len(keys)))
+        if not copied:
+            keys, own = neighbour_keys(keys, self.supervision.frames, self.config.geometry)
         times = torch.tensor([(key.frame + 1) / self.supervision.frames for key in keys])
         pose = self.model.pose(times, keys)
         distance = pose_distance(pose, *self.supervision.prior_pose(keys))
