@@ -178,21 +178,25 @@ def test_attachment_of_a_shifted_joint() -> None:
     assert float(stance(own, pose, [0], config)[2]) == pytest.approx(expected, rel=1e-5)
 
 
-def test_steps_cost_their_length() -> None:
+def test_what_drifts_costs_and_what_moves_is_left_alone() -> None:
     own, shifts, quats = model(), torch.zeros(3, 20, 3), torch.tensor((1.0, 0, 0, 0)).repeat(3, 20, 1)
-    config = Geometry(limit=0.0, attach=0.0, temporal=0.0, still=2.0)
+    step = 2e-3
+    config = Geometry(limit=0.0, attach=0.0, temporal=0.0, still=2.0, still_step=step)
 
-    def cost() -> float:
-        return float(stance(own, Pose(quats, shifts, torch.zeros(3, 20, 4)), [1], config)[2])
+    def cost(way: float) -> tuple[float, float]:
+        """Of one joint that takes the first of its two steps, with the slope by its way in diagonals."""
+        moved = shifts.clone()
+        moved[1:, 7, 1] = way * OBJECT_DIAGONAL
+        moved.requires_grad_(True)
+        total = stance(own, Pose(quats, moved, torch.zeros(3, 20, 4)), [1], config)[2]
+        total.backward()
+        return float(total.detach()), -float(moved.grad[0, 7, 1]) * OBJECT_DIAGONAL
 
-    assert cost() == 0
+    share = 2.0 / (2 * 20)  # one of two steps of one of twenty joints
     quats[1] = -quats[1]  # the same rotation
-    assert cost() == 0
-    shifts[1:, 7, 1] = 0.5
-    once = 2.0 * 0.5 / OBJECT_DIAGONAL / (2 * 20)  # one of two steps of one of twenty joints
-    assert cost() == pytest.approx(once, rel=1e-2)
-    shifts[1, 7, 1] = 0.2  # the same way in two steps
-    assert cost() == pytest.approx(once, rel=1e-2)
+    assert cost(0.0) == (0, 0)
+    assert cost(step) == pytest.approx((share * step / 2, share / 2), rel=1e-4)
+    assert cost(3 * step) == pytest.approx((share * step * 9 / 10, share * 6 / 100), rel=1e-4)
 
 
 def test_a_bone_beyond_its_limit() -> None:

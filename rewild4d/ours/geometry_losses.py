@@ -12,7 +12,6 @@ from rewild4d.kernels.arrays import fits
 from rewild4d.ours.deform import Posed
 from rewild4d.ours.fused.compactness import compactness
 from rewild4d.ours.fused.normals import disagreement, smallest_axes
-from rewild4d.ours.fused.skeleton import STILL
 from rewild4d.ours.pose import Pose, aligned
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import look_at, quat_multiply, quat_to_matrix
@@ -152,15 +151,17 @@ def temporal_loss(pose: Pose) -> Tensor:
     return bend.square().sum(-1).mean() + swerve.square().sum(-1).mean()
 
 
-def still_loss(pose: Pose) -> Tensor:
-    """Mean length, rounded at zero, of the steps of rotations and shifts within triples of frames, B = 3 k.
+def still_loss(pose: Pose, step: float) -> Tensor:
+    """Mean of s v^2 / (v^2 + s^2) over the steps v of rotations and shifts within triples of frames, B = 3 k.
 
-    Not squared: many small steps cost as much as few large ones, so what need not move stands still.
+    Steps much longer than s cost s and feel nothing: what moves is left alone, what drifts slowly is held still
+    (Geman and McClure's function).
     """
     quats, shifts = pose.quats.unflatten(0, (-1, 3)), pose.shifts.unflatten(0, (-1, 3))
     turned = quats[:, 1:] - aligned(quats[:, :-1], quats[:, 1:])
     moved = (shifts[:, 1:] - shifts[:, :-1]) / OBJECT_DIAGONAL
-    return sum(((step.square().sum(-1) + STILL**2).sqrt() - STILL).mean() for step in (turned, moved))
+    squares = torch.stack([way.square().sum(-1) for way in (turned, moved)])
+    return 2 * step * (squares / (squares + step**2)).mean()
 
 
 def neighbours(points: Tensor, count: int) -> Tensor:

@@ -75,11 +75,11 @@ def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geomet
     if config.temporal and triples:
         total = total + config.temporal * temporal_loss(pose)
     if config.still and triples:
-        total = total + config.still * still_loss(pose)
+        total = total + config.still * still_loss(pose, config.still_step)
     return total
 
 
 def _weights(config: Geometry, triples: bool) -> Weights:
     cosine = math.cos(math.radians(config.limit_degrees) / 2)
     temporal, still = (config.temporal, config.still) if triples else (0.0, 0.0)
-    return Weights(config.limit, cosine, config.attach, temporal, still, OBJECT_DIAGONAL)
+    return Weights(config.limit, cosine, config.attach, temporal, still, config.still_step, OBJECT_DIAGONAL)

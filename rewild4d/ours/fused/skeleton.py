@@ -4,7 +4,6 @@ The twins in plain torch are in ours/skeleton.py and ours/pose.py. A loss is fou
 backward pass scales it.
 """
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,9 +15,6 @@ from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.ours.fused.quaternions import dot, rotation, rotation_slope, side, unit, unit_slope
 
-STILL = 1e-4
-"""Steps well below this cost their square: a hundredth of a degree, or a ten-thousandth of the diagonal."""
-
 
 class Weights(NamedTuple):
     """Of the regularisers.
@@ -29,6 +25,7 @@ class Weights(NamedTuple):
         attach: of the gaps between a joint and its parent.
         temporal: of second differences over triples; 0 where the poses are none.
         still: of the steps between neighbours in triples; 0 where the poses are none.
+        step: length beyond which a step is taken for motion.
         unit: length that distances are divided by.
     """
 
@@ -37,6 +34,7 @@ class Weights(NamedTuple):
     attach: float
     temporal: float
     still: float
+    step: float
     unit: float
 
 
@@ -138,31 +136,32 @@ def _second_differences(
 
 @kernel
 def _steps(
-    quats: np.ndarray, shifts: np.ndarray, weight: float, unit: float, on_quats: np.ndarray, on_shifts: np.ndarray
-) -> float:
-    """Mean length, rounded at zero, of the steps of rotations and of shifts within triples, and its gradient."""
-    joints, total = quats.shape[1], 0.0
-    share = 3 * weight / (2 * len(quats) * joints)
-    by_length = share / (unit * unit)
+    quats: np.ndarray, shifts: np.ndarray, weight: float, step: float, unit: float, on_quats: np.ndarray,
+    on_shifts: np.ndarray,
+) -> float:  # fmt: skip
+    """Mean of s v^2 / (v^2 + s^2) over the steps v of rotations and of shifts within triples, and its gradient."""
+    joints, square, total = quats.shape[1], step * step, 0.0
+    share = 3 * weight * step / (2 * len(quats) * joints)
     for item in range(len(quats)):
         if item % 3 == 2:
             continue
         for joint in range(joints):
             one, other = _quat(quats, item, joint), _quat(quats, item + 1, joint)
             same = side(one, other)
-            turned, moved = STILL * STILL, STILL * STILL
+            turned, moved = 0.0, 0.0
             for i in range(4):
                 turned += (other[i] - same * one[i]) ** 2
             for i in range(3):
                 moved += ((np.float64(shifts[item + 1, joint, i]) - shifts[item, joint, i]) / unit) ** 2
-            turned, moved = math.sqrt(turned), math.sqrt(moved)
-            total += share * (turned + moved - 2 * STILL)
+            total += share * (turned / (turned + square) + moved / (moved + square))
+            by_turn = 2 * share * square / (turned + square) ** 2
+            by_move = 2 * share * square / ((moved + square) * unit) ** 2
             for i in range(4):
-                slope = share * (other[i] - same * one[i]) / turned
+                slope = by_turn * (other[i] - same * one[i])
                 on_quats[item + 1, joint, i] += slope
                 on_quats[item, joint, i] -= same * slope
             for i in range(3):
-                slope = by_length / moved * (np.float64(shifts[item + 1, joint, i]) - shifts[item, joint, i])
+                slope = by_move * (np.float64(shifts[item + 1, joint, i]) - shifts[item, joint, i])
                 on_shifts[item + 1, joint, i] += slope
                 on_shifts[item, joint, i] -= slope
     return total
@@ -183,7 +182,7 @@ def _regularise(
     if weights.temporal:
         total += _second_differences(quats, shifts, weights.temporal, weights.unit, on_quats, on_shifts)
     if weights.still:
-        total += _steps(quats, shifts, weights.still, weights.unit, on_quats, on_shifts)
+        total += _steps(quats, shifts, weights.still, weights.step, weights.unit, on_quats, on_shifts)
     return total
 
 
