@@ -16,7 +16,8 @@ something only there, and the root is part of the prior that the star stands for
 
 What differs from the original: the time is (frame + 1) / T, so that t and -t are never the same; the heads start at
 zero; a Gaussian's harmonics turn with it; densification looks at the animal's box, its number of Gaussians is capped,
-and every Gaussian has at least half an input pixel of blur, as in `ours`; the schedule is given in fractions.
+and every Gaussian has at least half an input pixel of blur, as in `ours`; the schedule is given in fractions; the
+network works in bfloat16 where the CPU multiplies such pairs.
 """
 
 import math
@@ -129,7 +130,8 @@ class D3dgsStarConfig(D3dgsConfig, frozen=True, forbid_unknown_fields=True, kw_o
     mirrored: Share = 0.5
     """Share of the steps that see a mirror image, at negative times (the paper's is open; `ours`: half). An eighth, as
     presets of `ours` have it, gains nothing sure: tiger, held out, mean of three seeds 19.8 for 19.3 (quick), 20.5 for
-    20.3 (standard, seeds differ by .8); giraffe 25.9 (standard, one seed) for 26.2."""
+    20.3 (standard, seeds differ by .8); giraffe 25.9 (standard, one seed) for 26.2
+    (three, network in single precision)."""
     canonical: StarCanonical = StarCanonical()
     loss: StarLoss = StarLoss()
 

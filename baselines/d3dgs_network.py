@@ -38,8 +38,8 @@ class NetworkShape(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """What it makes of the time."""
     half: bool = True
     """On a CPU that multiplies bfloat16 pairs the layers work in bfloat16, as the deformation of `ours` does: forward
-    and backward 18 ms for 50 (6,000 Gaussians, width 128, one thread); the built-in tiger held out, standard, mean of
-    three seeds that differ by .8: 20.3 dB for 20.0."""
+    and backward about 20 ms for 50 (timed by hand; 6,000 Gaussians, width 128, one thread); the built-in tiger held
+    out, standard, mean of three seeds that differ by .8: 20.3 dB for 20.0 (single precision, on another machine)."""
 
 
 class DeformationNetwork(nn.Module):

@@ -221,7 +221,8 @@ class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     still: Weight = 0.0
     """Pose: steps between neighbouring frames, as Geman and McClure weigh them: what drifts slowly, where the one
     camera cannot see it, is held still; what moves is left alone. 3: rigged cow 27.6 for 27.0 dB, horse 25.2 for 25.3
-    (held out, standard, one seed; their plain lengths, weight 1: 28.8 and 24.1). Not in a preset yet."""
+    (held out, standard, one seed, by a prototype in plain torch; the steps' plain lengths, weight 1, not in the code:
+    28.8 and 24.1). Not in a preset yet."""
     still_step: Positive = 1e-3
     """Step of a rotation (half radians) or of a joint (diagonals) that divides drift from motion."""
     rigid: Weight = 1.0

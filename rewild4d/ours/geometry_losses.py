@@ -152,7 +152,7 @@ def temporal_loss(pose: Pose) -> Tensor:
 
 
 def still_loss(pose: Pose, step: float) -> Tensor:
-    """Mean of s v^2 / (v^2 + s^2) over the steps v of rotations and shifts within triples of frames, B = 3 k.
+    """Mean of s v^2 / (v^2 + s^2) over the steps v of rotations within triples of frames, B = 3 k, plus that of shifts.
 
     Steps much longer than s cost s and feel nothing: what moves is left alone, what drifts slowly is held still
     (Geman and McClure's function).

@@ -1,4 +1,4 @@
-"""How long a fit is, and schedules as pure functions of its progress in [0, 1]."""
+"""What the length of a clip decides, and schedules as pure functions of a fit's progress in [0, 1]."""
 
 import math
 from typing import Any, TypeVar

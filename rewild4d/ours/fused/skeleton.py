@@ -139,7 +139,7 @@ def _steps(
     quats: np.ndarray, shifts: np.ndarray, weight: float, step: float, unit: float, on_quats: np.ndarray,
     on_shifts: np.ndarray,
 ) -> float:  # fmt: skip
-    """Mean of s v^2 / (v^2 + s^2) over the steps v of rotations and of shifts within triples, and its gradient."""
+    """Mean of s v^2 / (v^2 + s^2) over the steps v of rotations in triples, plus that of shifts; and its gradient."""
     joints, square, total = quats.shape[1], step * step, 0.0
     share = 3 * weight * step / (2 * len(quats) * joints)
     for item in range(len(quats)):
