@@ -11,7 +11,7 @@ from torch import nn
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.doubles import floor, load_columns, log2, root, spread, store_columns, where_gt
 from rewild4d.kernels.halves import AVAILABLE, add_pair_product, pair_matrix, pair_rows, pair_vectors
-from rewild4d.kernels.matrix import add_product, transpose_tile
+from rewild4d.kernels.matrix import add_product, matrix_tile, multiply_add, transpose_tile
 from rewild4d.kernels.memory import keep_freed_memory
 from rewild4d.kernels.rows import add_scaled, sum_rows
 from rewild4d.kernels.threads import run, spans, thread_count, torch_on_one
@@ -33,6 +33,31 @@ def test_products_are_added(rows: int, depth: int, columns: int, transposed: boo
     stored, strides = (np.ascontiguousarray(a.T), (1, rows)) if transposed else (a, (depth, 1))
     add_product(stored.ravel(), 0, *strides, b.ravel(), 0, columns, depth, c.ravel(), 0, columns, rows, columns)
     np.testing.assert_allclose(c, before + a.astype(np.float64) @ b, atol=1e-4)
+
+
+_wide, _narrow = matrix_tile(8, 3, multiply_add), matrix_tile(4, 1, multiply_add)
+
+
+@kernel
+def _by_wide_tile(a: np.ndarray, b: np.ndarray, c: np.ndarray, depth: int) -> None:
+    _wide(a, 0, depth, 1, b, 0, 48, depth, c, 0, 48)
+
+
+@kernel
+def _by_narrow_tiles(a: np.ndarray, b: np.ndarray, c: np.ndarray, depth: int) -> None:
+    for row in range(0, 8, 4):
+        for column in range(0, 48, 16):
+            _narrow(a, row * depth, depth, 1, b, column, 48, depth, c, row * 48 + column, 48)
+
+
+@pytest.mark.parametrize("depth", [0, 1, 37])
+def test_tiles_for_avx512_and_for_avx2_give_the_same_bits(depth: int) -> None:
+    a, b = numbers(8, depth, seed=1), numbers(depth, 48, seed=2)
+    wide, narrow = numbers(2, 8, 48, seed=3)[:1].repeat(2, axis=0)
+    _by_wide_tile(a.ravel(), b.ravel(), wide.ravel(), depth)
+    _by_narrow_tiles(a.ravel(), b.ravel(), narrow.ravel(), depth)
+    np.testing.assert_array_equal(wide, narrow)
+    np.testing.assert_allclose(wide, numbers(2, 8, 48, seed=3)[0] + a.astype(np.float64) @ b, atol=1e-4)
 
 
 @kernel

@@ -38,7 +38,7 @@ def _multiply_add(builder: Any, left: Any, right: Any, total: Any) -> Any:
     return builder.call(function, [total, *pairs])
 
 
-_tile1, _tile2, _tile3 = (matrix_tile(vectors, _multiply_add) for vectors in (1, 2, 3))
+_tile1, _tile2, _tile3 = (matrix_tile(ROWS, vectors, _multiply_add) for vectors in (1, 2, 3))
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""Small dense products inside kernels: tiles of 8 rows by up to 48 columns whose sums never leave the registers.
+"""Small dense products inside kernels, in tiles whose sums never leave the registers.
 
 A matrix is a 1D float32 array, the index of its first element and the distances between rows and columns, so one
 routine serves a matrix and its transpose. Rows of the result and of the right factor are multiples of sixteen floats.
@@ -8,17 +8,20 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
+from llvmlite import binding, ir
 from numba.core import types
 from numba.core.typing import signature
 
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.simd import INTEGERS, LANES, VECTOR, intrinsic, llvm_call
 
-ROWS = 8
-"""Rows of a tile; the left factor and the result have a multiple of it."""
-VECTORS = 3
-"""Vectors in a row of a tile: 24 sums, 3 loads and 8 broadcasts a step leave the multiplier as the limit."""
+ROWS, VECTORS = (8, 3) if binding.get_host_cpu_features().get("avx512f", False) else (4, 1)
+"""Rows of a tile and vectors in one of them; rows of the left factor and of the result are a multiple of 8.
+
+AVX-512 has 32 registers: 24 sums, 3 loads and 8 broadcasts a step leave the multiplier as the limit. AVX2 has 16 of
+half the length, and 4 x 1 needs eight for its sums; the sums of an 8 x 3 tile would go to memory and back at every step
+(three times slower). Every sum runs over the depth in order, so the result does not depend on the tile.
+"""
 
 _FLOAT, _WORD = ir.FloatType(), ir.IntType(64)
 
@@ -36,10 +39,11 @@ def _broadcast(builder: Any, number: Any) -> Any:
     return builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
 
 
-def matrix_tile(vectors: int, multiply_add: Callable[[Any, Any, Any, Any], Any]) -> Any:
-    """An intrinsic that adds A B to a tile of C of 8 rows and ``vectors`` vectors.
+def matrix_tile(rows: int, vectors: int, multiply_add: Callable[[Any, Any, Any, Any], Any]) -> Any:
+    """An intrinsic that adds A B to a tile of C.
 
     Args:
+        rows: of the tile.
         vectors: in a row of the tile.
         multiply_add: generates total + left * right from (builder, left, right, total).
     """
@@ -52,14 +56,14 @@ def matrix_tile(vectors: int, multiply_add: Callable[[Any, Any, Any, Any], Any])
         def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
             left, right, out = (_data(context, builder, sig.args[i], args[i]) for i in (0, 4, 8))
             a_first, a_row, a_step, b_first, b_row, depth, c_first, c_row = (args[i] for i in (1, 2, 3, 5, 6, 7, 9, 10))
-            row_starts = [builder.add(a_first, builder.mul(a_row, ir.Constant(_WORD, r))) for r in range(ROWS)]
+            row_starts = [builder.add(a_first, builder.mul(a_row, ir.Constant(_WORD, r))) for r in range(rows)]
             places = [
                 _vector_at(
                     builder,
                     out,
                     builder.add(c_first, builder.add(builder.mul(c_row, _word(r)), _word(v * LANES))),
                 )
-                for r in range(ROWS)
+                for r in range(rows)
                 for v in range(vectors)
             ]
             start = [builder.load(place, align=4) for place in places]
@@ -79,7 +83,7 @@ def matrix_tile(vectors: int, multiply_add: Callable[[Any, Any, Any, Any], Any])
             ]
             along = builder.mul(step, a_step)
             new = []
-            for r in range(ROWS):
+            for r in range(rows):
                 factor = _broadcast(builder, builder.load(builder.gep(left, [builder.add(row_starts[r], along)])))
                 new += [multiply_add(builder, factor, columns[v], sums[r * vectors + v]) for v in range(vectors)]
             following = builder.add(step, _word(1))
@@ -108,17 +112,18 @@ def _word(value: int) -> Any:
     return ir.Constant(_WORD, value)
 
 
-def _multiply_add(builder: Any, left: Any, right: Any, total: Any) -> Any:
+def multiply_add(builder: Any, left: Any, right: Any, total: Any) -> Any:
+    """Total + left * right, rounded once, while code is generated."""
     return llvm_call(builder, "llvm.fma.v16f32", [left, right, total])
 
 
-_tile1, _tile2, _tile3 = (matrix_tile(vectors, _multiply_add) for vectors in (1, 2, 3))
+_tile1, _tile2, _tile3 = (matrix_tile(ROWS, vectors, multiply_add) for vectors in (1, 2, 3))
 
 
 @kernel
 def tile_width(left: int) -> int:
     """Vectors of the next tile's rows where so many are left; two and two for four: eight sums wait for each other."""
-    return min(left, VECTORS) if left != VECTORS + 1 else 2
+    return 2 if left == VECTORS + 1 == 4 else min(left, VECTORS)
 
 
 @kernel
