@@ -192,6 +192,9 @@ def recipe_digest() -> str:
 def ensure(progress: Progress | None = None) -> Path:
     """The folder of all built-in animals in Artemis format, rendered on first use and kept in the cache.
 
+    Its name begins with their version: records of one version stand in one table, whichever processor rendered them
+    (leaderboard/variants.py). An edit that changes the pictures by more than rounding raises it.
+
     Args:
         progress: called as ``progress(done, total)`` with counts of images.
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import statistics
 from collections import Counter, defaultdict
 from collections.abc import Sequence
@@ -10,6 +11,9 @@ from pathlib import PurePath
 from typing import Any
 
 from rewild4d.leaderboard.records import RunRecord
+
+_BUILT_IN = re.compile(r"(builtin-v\d+)-[0-9a-f]{12}")
+"""A folder of the built-in animals: their version, then a digest of the sources that made them."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +37,12 @@ def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
     """The records that may stand in one table, and sentences on those left out.
 
     Of equal runs by several versions of the code the latest one counts. Of a case whose data has changed, and of a
-    protocol that has, only the runs on the latest one count.
+    protocol that has, only the runs on the latest one count. The built-in animals of one version are the same data on
+    every processor, although the last digits of a sine, and with them some pixels, differ.
     """
     remarks = []
     kept: list[RunRecord] = []
+    rounded: dict[str, list[str]] = defaultdict(list)
     cases: dict[tuple[str, str, str], list[RunRecord]] = defaultdict(list)
     for record in records:
         cases[record.dataset, record.protocol["name"], record.case].append(record)
@@ -45,10 +51,16 @@ def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
         same = [run for run in runs if _ground(run) == _ground(newest)]
         if len(same) < len(runs):
             remarks.append(f"{protocol}, {case}: {len(runs) - len(same)} older records of other data left out.")
+        if len({_digests(run) for run in same}) > 1:
+            rounded[protocol].append(case)
         once: dict[tuple[str, int], RunRecord] = {}
         for run in sorted(same, key=_age):
             once[_identity(run), run.seed] = run
         kept += [run for run in same if once[_identity(run), run.seed] is run]
+    remarks += [
+        f"{protocol}: {', '.join(found)} rendered on several kinds of processor, equal up to rounding."
+        for protocol, found in rounded.items()
+    ]
     versions = {record.code.get("sources", "") for record in kept if record.code}
     if len(versions) > 1:
         remarks.append(f"Runs of {len(versions)} versions of the code.")
@@ -94,7 +106,13 @@ def _age(record: RunRecord) -> tuple[str, str]:
 
 def _ground(record: RunRecord) -> tuple[Any, ...]:
     """What two runs of a case must share to be compared."""
-    return record.data.get("clip"), record.data.get("truth"), record.protocol.get("digest")
+    built_in = _BUILT_IN.fullmatch(PurePath(record.data.get("root", "")).name)
+    return built_in[1] if built_in else _digests(record), record.protocol.get("digest")
+
+
+def _digests(record: RunRecord) -> tuple[Any, Any]:
+    """Of every pixel, camera and time that the method saw, and of the truth."""
+    return record.data.get("clip"), record.data.get("truth")
 
 
 def _settings(record: RunRecord) -> dict[str, Any]:

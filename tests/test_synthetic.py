@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from rewild4d.datasets import synthetic
 from rewild4d.datasets.anatomy import assemble
@@ -155,6 +156,28 @@ def test_building_twice_gives_the_same_bytes() -> None:
     assert everything() == everything()
 
 
+@pytest.mark.parametrize(
+    ("name", "place", "spread", "color", "joints"),
+    [
+        ("horse", (0.0007, 1.0963, 0.0457), (0.1674, 0.4724, 0.6700), (0.5477, 0.3832, 0.2785), (0.7072, 0.7200)),
+        ("tiger", (0.0000, 0.6411, 0.0136), (0.1322, 0.2920, 0.6650), (0.6655, 0.4716, 0.2674), (1.3265,)),
+        ("giraffe", (0.0000, 2.1225, 0.2286), (0.2387, 1.1070, 0.8060), (0.7482, 0.5942, 0.4024), (2.0927,)),
+    ],
+)
+def test_what_builtin_v1_looks_like(
+    name: str, place: tuple[float, ...], spread: tuple[float, ...], color: tuple[float, ...], joints: tuple[float, ...]
+) -> None:
+    """Tables hold all records of one version side by side: who changes an animal on purpose raises the version in
+    `synthetic.ensure`, then these numbers (means and standard deviations, metres) and those of the rendering below."""
+    surface = synthetic.rest_surface(name)
+    assert surface.vertices.mean(axis=0) == pytest.approx(place, abs=3e-4)
+    assert surface.vertices.std(axis=0) == pytest.approx(spread, abs=3e-4)
+    assert surface.colors.mean(axis=0) == pytest.approx(color, abs=3e-4)
+    assert [np.abs(animal.bones[..., :3, 3]).mean() for animal in synthetic.build(name)] == pytest.approx(
+        joints, abs=3e-4
+    )
+
+
 def test_unknown_animal_gets_a_suggestion() -> None:
     with pytest.raises(UserError, match="unknown built-in animal 'hors'. Did you mean 'horse'"):
         synthetic.build("hors")
@@ -167,7 +190,9 @@ def test_render_makes_what_is_missing_once(tmp_path: Path) -> None:
     assert [path.name for path in root.iterdir()] == ["tiger"]
     assert [path.name for path in root.parent.iterdir()] == ["set"]
     pictures = sorted(path for path in root.rglob("*") if path.suffix in (".png", ".jpg"))
-    assert len(pictures) >= 2 * 2 * synthetic.FRAMES
+    assert len(pictures) == 2 * 2 * synthetic.FRAMES
+    colors = [np.asarray(Image.open(path).convert("RGB"), float).mean(axis=(0, 1)) for path in pictures]
+    assert np.mean(colors, axis=0) == pytest.approx((48.10, 38.96, 29.53), abs=0.05)  # of builtin-v1, see above
     again: list[tuple[int, int]] = []
     synthetic.render(root, ["tiger"], views=2, width=48, height=32, progress=lambda *pair: again.append(pair))
     assert again == []

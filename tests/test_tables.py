@@ -317,6 +317,20 @@ def test_runs_on_data_that_has_changed_are_left_out_and_told() -> None:
     assert made.remarks == ("p-v1, wolf/Run: 1 older records of other data left out.",)
 
 
+def test_the_built_in_animals_are_the_same_data_wherever_they_were_rendered() -> None:
+    def on(folder: str, pixels: str, method: str) -> RunRecord:
+        return record(method=method, data={"root": folder, "clip": pixels, "truth": pixels})
+
+    mine, theirs = on("/home/me/builtin-v1-0123456789ab", "1", "ours"), on("builtin-v1-ba9876543210", "2", "gart")
+    (made,) = protocol_tables([mine, theirs])
+    assert [row.stubs[1] for row in made.rows] == ["ours", "gart"]
+    assert made.remarks == ("p-v1: wolf/Run rendered on several kinds of processor, equal up to rounding.",)
+    assert not protocol_tables([mine, on("builtin-v1-ba9876543210", "1", "gart")])[0].remarks
+    for other in ("builtin-v2-ba9876543210", "builtin-v1", "rigs"):
+        (made,) = protocol_tables([mine, on(other, "2", "gart")])
+        assert made.remarks == ("p-v1, wolf/Run: 1 older records of other data left out.",), other
+
+
 def test_a_line_stands_before_every_condition() -> None:
     frame = replace(FRAME, conditions=("fixed", "sweep"), scores=("psnr", "iou"))
     made = html(named_table(frame, [Entrant("ours", (runs({"a": [10.0]}), runs({"a": [20.0]})))]))
