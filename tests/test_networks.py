@@ -94,8 +94,9 @@ RAMP = (0.19550593197345734, 18.039949417114258, (0.8856359124183655, 0.03009587
 
 def assert_features(found: Tensor, mean: float, length: float, first: tuple[float, ...]) -> None:
     assert found.shape == (1, 2048)
-    assert [float(found.double().mean()), float(found.double().norm())] == pytest.approx([mean, length], rel=1e-6)
-    assert found[0, :3].tolist() == pytest.approx(first, abs=1e-6)  # the last float32 digit depends on the threads
+    # Ninety layers in single precision: between threads the last digit differs, between AVX2 and AVX-512 1.5e-6.
+    assert [float(found.double().mean()), float(found.double().norm())] == pytest.approx([mean, length], rel=1e-5)
+    assert found[0, :3].tolist() == pytest.approx(first, abs=1e-5)
 
 
 @pytest.mark.parametrize("how", ["clean", "tf1", "bilinear-antialias"])
