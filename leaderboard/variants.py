@@ -38,7 +38,7 @@ def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
 
     Of equal runs by several versions of the code the latest one counts. Of a case whose data has changed, and of a
     protocol that has, only the runs on the latest one count. The built-in animals of one version are the same data on
-    every processor, although the last digits of a sine, and with them some pixels, differ.
+    every processor, although the last digits of its arithmetic, and with them some pixels, differ.
     """
     remarks = []
     kept: list[RunRecord] = []
