@@ -28,6 +28,7 @@ from rewild4d.datasets.artemis_files import (
 from rewild4d.datasets.artemis_volume import SURFACE_POINTS, MovingSurface, Surface, read_pose, read_surface
 from rewild4d.datasets.artemis_writer import ArtemisWriter
 from rewild4d.datasets.images import Decoded, decode
+from rewild4d.datasets.recipe import read_recipe
 from rewild4d.datasets.selection import held_out, kept_frames, placed_view, selected_views, up_direction
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import digest
@@ -86,6 +87,10 @@ class Artemis:
     def check(self) -> list[Finding]:
         """Verify layout and contents of every animal, each file decoded; all faults, not only the first."""
         return [finding for folder in self._animals.values() for finding in check_animal(folder)]
+
+    def recipe(self, case: str) -> str:
+        """By which a rendered case is known on every processor; "" for one that was filmed, or edited since."""
+        return read_recipe(self._animals[case.partition("/")[0]])
 
     def _table(self, selection: Selection) -> dict[str, tuple[str, str, str]]:
         """Case name -> animal, motion, placement ("" for none)."""

@@ -21,6 +21,8 @@ from rewild4d.datasets.artemis_files import (
 )
 from rewild4d.datasets.artemis_volume import read_pose, read_skeleton, read_surface
 from rewild4d.datasets.images import read_pair, read_rgb
+from rewild4d.datasets.recipe import FILE as RECIPE
+from rewild4d.datasets.recipe import read_recipe
 from rewild4d.errors import UserError
 
 _Arguments = ParamSpec("_Arguments")
@@ -110,6 +112,9 @@ class _Check:
             self._add("warning", self.animal / "sequences", "no list of motions: the folders under img/ are taken")
         if read_licence(self.animal) == NO_LICENCE:
             self._add("warning", self.animal, NO_LICENCE)
+        recipe = self.animal / RECIPE
+        if recipe.is_file() and not read_recipe(self.animal):
+            self._add("warning", recipe, "the files are no longer those that were rendered: the data counts as new")
 
     def _attempt(
         self,

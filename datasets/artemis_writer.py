@@ -6,13 +6,14 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
 import torch
 
 from rewild4d.datasets.artemis_files import write_intrinsics, write_matrices
+from rewild4d.datasets.recipe import write_recipe
 from rewild4d.errors import UserError
 from rewild4d.files import save_tensors
 from rewild4d.types import Camera
@@ -31,6 +32,7 @@ class ArtemisWriter:
         voxel_weights: their skinning weights, [V, K].
         radius: half extent of the volume's box per axis, [3].
         licence: first line of the licence file; "" writes none.
+        recipe: what decides the contents, except the processor (see `recipe`); None writes none.
 
     Raises:
         UserError: the folder is not empty or cannot be written.
@@ -48,6 +50,7 @@ class ArtemisWriter:
         voxel_weights: np.ndarray,
         radius: np.ndarray,
         licence: str = "",
+        recipe: dict[str, Any] | None = None,
     ) -> None:
         self.folder = Path(folder).absolute()
         self._cameras = tuple(cameras)
@@ -58,6 +61,7 @@ class ArtemisWriter:
         self._weights = np.asarray(voxel_weights, dtype=np.float32)
         self._radius = np.asarray(radius, dtype=np.float64)
         self._licence = licence
+        self._recipe = recipe
         self._frames: dict[str, int] = {}
         self._written: set[tuple[str, int, int]] = set()
 
@@ -135,5 +139,7 @@ class ArtemisWriter:
         (build / "sequences").write_text("".join(f"{name} {count}\n" for name, count in self._frames.items()))
         if self._licence:
             (build / "licence.txt").write_text(self._licence + "\n", encoding="utf-8")
+        if self._recipe is not None:
+            write_recipe(build, self._recipe)
         os.chmod(build, 0o755)
         os.replace(build, self.folder)

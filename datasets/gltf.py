@@ -87,6 +87,12 @@ class Document:
             self._buffers[index] = (self.tree.binary_blob() or b"") if uri is None else self._fetch(uri)
         return self._buffers[index]
 
+    def beside(self) -> Iterator[bytes]:
+        """Bytes of the buffers and images that lie in files of their own, in the order in which they are named."""
+        for entry in (*self.tree.buffers, *self.tree.images):
+            if entry.uri is not None and not entry.uri.startswith("data:"):
+                yield self._fetch(entry.uri)
+
     def _fetch(self, uri: str) -> bytes:
         if uri.startswith("data:"):
             try:

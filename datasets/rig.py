@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rewild4d.datasets.animal import AnimatedAnimal, Surface
 from rewild4d.datasets.gltf import Document, Floats, consistent
 from rewild4d.errors import UserError, unknown_name
+from rewild4d.files import digest
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
 MIRRORED, CLAMPED = 33648, 33071
@@ -28,6 +29,16 @@ def clips(path: Path) -> list[str]:
     """
     with consistent(path):
         return _clip_names(Document(path))
+
+
+def content(path: Path) -> str:
+    """Digest of a rig file and of the files beside it that it names: the same for every copy of the rig.
+
+    Raises:
+        UserError: the file is missing or is no glTF, or a file beside it is missing.
+    """
+    with consistent(path):
+        return digest(path.read_bytes(), *Document(path).beside())[:16]
 
 
 def load_rig(path: Path, clip: str, frames: int = 24, shares: Floats | None = None) -> AnimatedAnimal:

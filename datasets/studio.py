@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from rewild4d.datasets.animal import AnimatedAnimal
 from rewild4d.datasets.artemis_writer import ArtemisWriter
-from rewild4d.datasets.rig import load_rig
+from rewild4d.datasets.rig import content, load_rig
 from rewild4d.datasets.shading import SUN_ALONG, SUN_UP, Picture
 from rewild4d.datasets.voxels import raycaster, voxelise
 from rewild4d.errors import UserError
@@ -63,9 +64,10 @@ def make_artemis(
         if value < least:
             raise UserError(f"{out}: expected {name} of at least {least}, got {value}.")
     _expect_empty(out)
-    return render_artemis(
-        [load_rig(rig, clip, frames)], out, views=views, width=width, height=height, progress=progress
-    )
+    animal = load_rig(rig, clip, frames)
+    size = {"views": views, "frames": frames, "width": width, "height": height}
+    recipe = {"rig": content(rig), "clip": clip, **size}
+    return render_artemis([animal], out, views=views, width=width, height=height, recipe=recipe, progress=progress)
 
 
 def render_artemis(
@@ -75,6 +77,7 @@ def render_artemis(
     views: int,
     width: int,
     height: int,
+    recipe: dict[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Render the motions of one animal as an Artemis folder; nothing stays behind when it fails.
@@ -85,6 +88,7 @@ def render_artemis(
         views: number of cameras, the same for all motions.
         width: of the images in pixels.
         height: of the images in pixels.
+        recipe: what the animals were made of, by which the folder is known on every processor (see `recipe`).
         progress: called after every image.
 
     Returns:
@@ -110,6 +114,7 @@ def render_artemis(
             volume.weights,
             volume.radius,
             first.licence,
+            recipe,
         ) as writer,
         ThreadPoolExecutor(1) as encoder,
     ):

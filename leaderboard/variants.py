@@ -37,8 +37,9 @@ def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
     """The records that may stand in one table, and sentences on those left out.
 
     Of equal runs by several versions of the code the latest one counts. Of a case whose data has changed, and of a
-    protocol that has, only the runs on the latest one count. The built-in animals of one version are the same data on
-    every processor, although the last digits of its arithmetic, and with them some pixels, differ.
+    protocol that has, only the runs on the latest one count. The built-in animals of one version, and folders that were
+    rendered by one recipe, are the same data on every processor, although the last digits of its arithmetic, and with
+    them some pixels, differ.
     """
     remarks = []
     kept: list[RunRecord] = []
@@ -48,7 +49,7 @@ def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
         cases[record.dataset, record.protocol["name"], record.case].append(record)
     for (_, protocol, case), runs in cases.items():
         newest = max(runs, key=_age)
-        same = [run for run in runs if _ground(run) == _ground(newest)]
+        same = [run for run in runs if _comparable(run, newest)]
         if len(same) < len(runs):
             remarks.append(f"{protocol}, {case}: {len(runs) - len(same)} older records of other data left out.")
         if len({_digests(run) for run in same}) > 1:
@@ -104,10 +105,17 @@ def _age(record: RunRecord) -> tuple[str, str]:
     return record.timing.started, record.run_id
 
 
-def _ground(record: RunRecord) -> tuple[Any, ...]:
-    """What two runs of a case must share to be compared."""
+def _comparable(run: RunRecord, other: RunRecord) -> bool:
+    """Whether two runs of a case are of one protocol and of one data set."""
+    recipe = _recipe(run)
+    same = _digests(run) == _digests(other) or (recipe is not None and recipe == _recipe(other))
+    return same and run.protocol.get("digest") == other.protocol.get("digest")
+
+
+def _recipe(record: RunRecord) -> str | None:
+    """What the data was rendered from, if it was."""
     built_in = _BUILT_IN.fullmatch(PurePath(record.data.get("root", "")).name)
-    return built_in[1] if built_in else _digests(record), record.protocol.get("digest")
+    return built_in[1] if built_in else record.data.get("recipe") or None
 
 
 def _digests(record: RunRecord) -> tuple[Any, Any]:

@@ -14,9 +14,13 @@ FROM_TRUTH = "upper bound: its prior was made from the truth"
 
 
 def reading(reader: DatasetReader, clip: Clip) -> dict[str, str]:
-    """How the data was read: the reader's settings and what it left out; nothing where nothing was."""
-    settings = getattr(reader, "settings", {})
-    found = {"settings": json.dumps(settings) if settings else "", "notes": "; ".join(clip.notes)}
+    """How the data was read: the reader's settings, what it left out, what it was rendered from, if anything."""
+    settings, recipe = getattr(reader, "settings", {}), getattr(reader, "recipe", None)
+    found = {
+        "settings": json.dumps(settings) if settings else "",
+        "notes": "; ".join(clip.notes),
+        "recipe": recipe(clip.name) if recipe else "",
+    }
     return {name: text for name, text in found.items() if text}
 
 

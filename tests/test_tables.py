@@ -331,6 +331,20 @@ def test_the_built_in_animals_are_the_same_data_wherever_they_were_rendered() ->
         assert made.remarks == ("p-v1, wolf/Run: 1 older records of other data left out.",), other
 
 
+def test_a_folder_of_one_recipe_is_the_same_data_wherever_it_was_rendered() -> None:
+    def on(recipe: dict[str, str], pixels: str, method: str) -> RunRecord:
+        return record(method=method, data={"root": "rigs", "clip": pixels, "truth": pixels, **recipe})
+
+    mine = on({"recipe": "r1"}, "1", "ours")
+    (made,) = protocol_tables([mine, on({"recipe": "r1"}, "2", "gart")])
+    assert [row.stubs[1] for row in made.rows] == ["ours", "gart"]
+    assert made.remarks == ("p-v1: wolf/Run rendered on several kinds of processor, equal up to rounding.",)
+    assert not protocol_tables([mine, on({}, "1", "gart")])[0].remarks, "the same pixels, of a time without recipes"
+    for left, right in (({"recipe": "r1"}, {"recipe": "r2"}), ({"recipe": "r1"}, {}), ({}, {})):
+        (made,) = protocol_tables([on(left, "1", "ours"), on(right, "2", "gart")])
+        assert made.remarks == ("p-v1, wolf/Run: 1 older records of other data left out.",), (left, right)
+
+
 def test_a_line_stands_before_every_condition() -> None:
     frame = replace(FRAME, conditions=("fixed", "sweep"), scores=("psnr", "iou"))
     made = html(named_table(frame, [Entrant("ours", (runs({"a": [10.0]}), runs({"a": [20.0]})))]))

@@ -1,0 +1,39 @@
+"""What a rendered folder was made of: it is known by that on every processor, although the last digits of arithmetic,
+and with them some pixels, differ from one to the next."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rewild4d.files import digest
+
+FILE = "recipe.json"
+RENDERER = "render-v1"
+"""Raised, like the version of the built-in animals, by an edit that changes pictures or truth by more than rounding."""
+
+
+def write_recipe(folder: Path, ingredients: dict[str, Any]) -> None:
+    """Write the recipe of a finished folder, with a digest of the files that it gave.
+
+    Args:
+        folder: holds all files, but no recipe yet.
+        ingredients: everything that decides what is rendered, except the processor.
+    """
+    text = {"ingredients": {"renderer": RENDERER, **ingredients}, "files": _files(folder)}
+    (folder / FILE).write_text(json.dumps(text, indent=1) + "\n", encoding="utf-8")
+
+
+def read_recipe(folder: Path) -> str:
+    """Digest of the recipe; "" where the folder has none, or where its files are no longer those that were rendered."""
+    try:
+        recipe = json.loads((folder / FILE).read_text(encoding="utf-8"))
+        ingredients, files = recipe["ingredients"], recipe["files"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
+    return digest(json.dumps(ingredients, sort_keys=True))[:16] if files == _files(folder) else ""
+
+
+def _files(folder: Path) -> str:
+    """Digest of the names and the bytes of all files but the recipe."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / FILE)
+    return digest(*(part for path in paths for part in (path.relative_to(folder).as_posix(), path.read_bytes())))
