@@ -348,3 +348,28 @@ def test_settings_follow_the_length_of_the_clip() -> None:
     # A saved fit holds plain numbers: it is the same again whatever the clip that it is read beside.
     made = for_clip_of_ours(paper, 12)
     assert for_clip_of_ours(made, 300) == made
+
+
+def test_settings_follow_whether_the_cameras_are_known() -> None:
+    quick, standard, paper = (load_preset("ours", Config, name) for name in ("quick", "standard", "paper"))
+    made = for_clip_of_ours(standard, 24, filmed=True)
+    assert (made.geometry.temporal, made.geometry.rigid) == (5.0, 0.2)
+    assert (made.rates.pose, made.rates.deform, made.prior.pull_until) == ((7e-4, 1e-5), (2e-3, 1e-5), 0.35)
+    assert made.iterations == 24 * 200
+    assert made.geometry.still == standard.geometry.still
+    assert for_clip_of_ours(made, 24, filmed=True) == made
+    for preset in (quick, paper):
+        assert for_clip_of_ours(preset, 24, filmed=True) == for_clip_of_ours(preset, 24)
+
+
+def test_a_film_is_a_clip_without_cameras(toy: tuple[Clip, Prior]) -> None:
+    clip, prior = toy
+    config = msgspec.structs.replace(TINY, iterations=2)
+
+    def fitted(clip: Clip) -> Config:
+        made = Ours().fit(clip, prior, config=config, seed=0, device=CPU, log=lambda *_: None, workdir=None)
+        return made.config
+
+    film = replace(clip, frames=tuple(replace(frame, camera=None) for frame in clip.frames))
+    assert fitted(clip).geometry == config.geometry
+    assert fitted(film).geometry.temporal == config.footage.temporal

@@ -21,21 +21,36 @@ def for_clip(config: C, frames: int) -> C:
     return msgspec.structs.replace(config, iterations=max(own.iterations, own.steps_per_frame * frames))
 
 
-def for_clip_of_ours(config: Config, frames: int) -> Config:
-    """`for_clip`, but that short clips may take fewer steps, and that long ones have a finer time code.
+def for_clip_of_ours(config: Config, frames: int, *, filmed: bool = False) -> Config:
+    """`for_clip`, but that short clips may take fewer steps, that long ones have a finer time code, and that a film of
+    unknown cameras has some values of its own.
 
     Args:
         config: as chosen.
         frames: of the clip.
+        filmed: its cameras are not known.
 
     Returns:
         Settings that are plain numbers: they give the same for a clip of any length.
     """
+    config = _for_footage(config) if filmed and config.footage.use else config
     pose = config.pose
     doublings = math.log2(frames / pose.octave_frames) if pose.octave_frames else 0.0
     pose = msgspec.structs.replace(pose, frequencies=pose.frequencies + max(0, round(doublings)), octave_frames=0)
     steps = min(config.iterations, config.short_iterations) if frames <= config.short_frames else config.iterations
     return for_clip(msgspec.structs.replace(config, iterations=steps, short_frames=0, pose=pose), frames)
+
+
+def _for_footage(config: Config) -> Config:
+    own, replace = config.footage, msgspec.structs.replace
+    return replace(
+        config,
+        steps_per_frame=own.steps_per_frame,
+        geometry=replace(config.geometry, temporal=own.temporal, rigid=own.rigid),
+        prior=replace(config.prior, pull_until=own.pull_until),
+        rates=replace(config.rates, pose=own.pose, deform=own.deform),
+        footage=replace(own, use=False),
+    )
 
 
 def exponential(first: float, last: float, progress: float) -> float:
