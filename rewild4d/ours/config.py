@@ -257,7 +257,7 @@ class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """Fraction over which the networks' rates rise from zero: Adam's first steps would undo the warm-up."""
     deform: Rate = (8e-4, 1.6e-6)
     """Deformation network. (2e-3, 2e-5) for it (standard, seed 0): rigged horse and cow 25.2 and 27.6 for 25.2 and 27.5
-    dB, giraffe 30.1 for 30.2, DAVIS cows 23.52 for 23.45, and with `geometry.rigid` .2 for 1 besides 23.65."""
+    dB, giraffe 30.1 for 30.2; of films see `Footage`."""
     clip: Positive = 1.0
     """Bound on the gradient norm of the networks."""
 
