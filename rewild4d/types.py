@@ -159,6 +159,7 @@ class Clip:
         start: seconds from the start of the video to the moment that the clip calls 0.
         travel: motion of the animal over the background from each frame to the next, in pixels of the latter's image
             (x to the right, y down), measured in these whole frames alone; None where it is not known, [T - 1, 2].
+        guessed_cameras: whether the data set has no cameras, and those of the frames are a prior's.
     """
 
     name: str
@@ -170,6 +171,7 @@ class Clip:
     notes: tuple[str, ...] = ()
     start: float = 0.0
     travel: Tensor | None = None
+    guessed_cameras: bool = False
 
     @property
     def times(self) -> tuple[float, ...]:

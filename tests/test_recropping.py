@@ -88,6 +88,7 @@ def test_cameras_of_all_frames_agree_where_the_priors_filter_left_one_out() -> N
         transforms=prior.transforms[rows], transforms_flip=prior.transforms_flip[rows],
     )  # fmt: skip
     shown = with_cameras(known_frames(clip, prior), prior)
+    assert shown.guessed_cameras and not clip.guessed_cameras
     assert len(shown.frames) == 9 and shown.travel is not None and shown.travel[3].tolist() == [2, 2]
 
     def error(frame: Frame, camera: Camera | None) -> float:

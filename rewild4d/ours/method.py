@@ -36,8 +36,7 @@ class Ours:
         workdir: Path | None,
     ) -> OursReconstruction:
         """Reconstruct from the clip and the prior; see contracts.Method."""
-        filmed = any(frame.camera is None for frame in clip.frames)
-        config = for_clip_of_ours(config, len(clip.frames), filmed=filmed)
+        config = for_clip_of_ours(config, len(clip.frames), filmed=clip.guessed_cameras)
         rows = match_times(clip, prior)
         model = train(clip, prior, config, seed, device, log, workdir)
         return from_fit(model, config, clip, prior, rows)

@@ -169,7 +169,7 @@ def with_cameras(clip: Clip, prior: Prior) -> Clip:
     for frame in clip.frames:
         camera = frame.camera or recropped(world_camera(prior, frame.time), shown, frame)
         frames.append(replace(frame, camera=camera))
-    return replace(clip, frames=tuple(frames))
+    return replace(clip, frames=tuple(frames), guessed_cameras=True)
 
 
 def known_frames(clip: Clip, prior: Prior) -> Clip:
