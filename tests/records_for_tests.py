@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from rewild4d.leaderboard.layout import Table
 from rewild4d.leaderboard.records import RunRecord, Score, Timing
 
 PROTOCOL = {"name": "p-v1", "title": "P", "scores": ["psnr"], "floors": ["empty"], "digest": "d"}
@@ -27,3 +28,17 @@ def psnr(value: float | None, note: str = "") -> dict[str, Score]:
 def lower(value: float) -> dict[str, Score]:
     """One score of which less is better."""
     return {"psnr": Score(value, "1", "lower", 1, [value])}
+
+
+def runs(values: dict[str, list[float]], **changes: object) -> tuple[RunRecord, ...]:
+    """Runs by case, a seed a value."""
+    return tuple(
+        record(case=case, seed=seed, scores=psnr(value), **changes)
+        for case, found in values.items()
+        for seed, value in enumerate(found)
+    )
+
+
+def texts(made: Table) -> dict[str, tuple[str, str, str]]:
+    """Row -> text, spread and mark of its first cell."""
+    return {row.stubs[0]: (row.cells[0].text, row.cells[0].spread, row.cells[0].mark) for row in made.rows}

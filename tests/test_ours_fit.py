@@ -9,7 +9,6 @@ import msgspec
 import pytest
 import torch
 
-from rewild4d.config import load_preset
 from rewild4d.errors import UserError
 from rewild4d.harmonics import seen_colors
 from rewild4d.ours.config import Canonical, Config, Deform, Density, Geometry, PriorUse, Skinning, WarmUp
@@ -17,7 +16,7 @@ from rewild4d.ours.fit import Training, train
 from rewild4d.ours.method import Ours
 from rewild4d.ours.model import build_model
 from rewild4d.ours.reconstruction import OursReconstruction
-from rewild4d.ours.schedule import for_clip, for_clip_of_ours
+from rewild4d.ours.schedule import for_clip
 from rewild4d.ours.symmetry import SIGNS, Key, Supervision
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.motion import quats_from_normals, sample_surface
@@ -332,34 +331,6 @@ def test_a_long_clip_gets_more_steps(toy: tuple[Clip, Prior]) -> None:
     assert totals == {config.warmup.regress + config.warmup.iterations + 1 * FRAMES}
     assert made.config.iterations == FRAMES
     assert for_clip(msgspec.structs.replace(config, iterations=50), FRAMES).iterations == 50
-
-
-def test_settings_follow_the_length_of_the_clip() -> None:
-    standard, paper = (load_preset("ours", Config, name) for name in ("standard", "paper"))
-
-    def octaves(frames: int) -> int:
-        return for_clip_of_ours(standard, frames).pose.frequencies
-
-    assert [octaves(frames) for frames in (2, 24, 48, 2 * 48, 72)] == [4, 4, 4 + 1, 4 + 2, 4 + 2]
-    fixed = msgspec.structs.replace(standard, pose=msgspec.structs.replace(standard.pose, octave_frames=0))
-    assert for_clip_of_ours(fixed, 96).pose.frequencies == 4
-    assert for_clip_of_ours(standard, 12).iterations == standard.iterations
-    assert [for_clip_of_ours(paper, frames).iterations for frames in (12, 15, 16)] == [10_000, 10_000, 20_000]
-    # A saved fit holds plain numbers: it is the same again whatever the clip that it is read beside.
-    made = for_clip_of_ours(paper, 12)
-    assert for_clip_of_ours(made, 300) == made
-
-
-def test_settings_follow_whether_the_cameras_are_known() -> None:
-    quick, standard, paper = (load_preset("ours", Config, name) for name in ("quick", "standard", "paper"))
-    made = for_clip_of_ours(standard, 24, filmed=True)
-    assert (made.geometry.temporal, made.geometry.rigid) == (5.0, 0.2)
-    assert (made.rates.pose, made.rates.deform, made.prior.pull_until) == ((7e-4, 1e-5), (2e-3, 1e-5), 0.35)
-    assert made.iterations == 24 * 200
-    assert made.geometry.still == standard.geometry.still
-    assert for_clip_of_ours(made, 24, filmed=True) == made
-    for preset in (quick, paper):
-        assert for_clip_of_ours(preset, 24, filmed=True) == for_clip_of_ours(preset, 24)
 
 
 def test_a_film_is_a_clip_whose_cameras_are_guessed(toy: tuple[Clip, Prior]) -> None:

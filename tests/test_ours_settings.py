@@ -1,0 +1,35 @@
+"""The settings that a preset gives: by the length of the clip, and by whether its cameras are known."""
+
+import msgspec
+
+from rewild4d.config import load_preset
+from rewild4d.ours.config import Config
+from rewild4d.ours.schedule import for_clip_of_ours
+
+
+def test_settings_follow_the_length_of_the_clip() -> None:
+    standard, paper = (load_preset("ours", Config, name) for name in ("standard", "paper"))
+
+    def octaves(frames: int) -> int:
+        return for_clip_of_ours(standard, frames).pose.frequencies
+
+    assert [octaves(frames) for frames in (2, 24, 48, 2 * 48, 72)] == [4, 4, 4 + 1, 4 + 2, 4 + 2]
+    fixed = msgspec.structs.replace(standard, pose=msgspec.structs.replace(standard.pose, octave_frames=0))
+    assert for_clip_of_ours(fixed, 96).pose.frequencies == 4
+    assert for_clip_of_ours(standard, 12).iterations == standard.iterations
+    assert [for_clip_of_ours(paper, frames).iterations for frames in (12, 15, 16)] == [10_000, 10_000, 20_000]
+    # A saved fit holds plain numbers: it is the same again whatever the clip that it is read beside.
+    made = for_clip_of_ours(paper, 12)
+    assert for_clip_of_ours(made, 300) == made
+
+
+def test_settings_follow_whether_the_cameras_are_known() -> None:
+    quick, standard, paper = (load_preset("ours", Config, name) for name in ("quick", "standard", "paper"))
+    made = for_clip_of_ours(standard, 24, filmed=True)
+    assert (made.geometry.temporal, made.geometry.rigid) == (5.0, 0.2)
+    assert (made.rates.pose, made.rates.deform, made.prior.pull_until) == ((7e-4, 1e-5), (2e-3, 1e-5), 0.35)
+    assert made.iterations == 24 * 200
+    assert made.geometry.still == standard.geometry.still
+    assert for_clip_of_ours(made, 24, filmed=True) == made
+    for preset in (quick, paper):
+        assert for_clip_of_ours(preset, 24, filmed=True) == for_clip_of_ours(preset, 24)
