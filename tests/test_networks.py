@@ -207,6 +207,18 @@ def test_i3d_says_which_clips_it_cannot_read() -> None:
     assert extractor(torch.zeros(1, 9, 3, 20, 16)).shape == (1, 400)
 
 
+def test_the_pool_by_axes_is_that_of_torch() -> None:
+    x = torch.rand(2, 3, 5, 9, 8, generator=torch.Generator().manual_seed(0))
+    for window, stride in [
+        ((3, 3, 3), (1, 1, 1)),
+        ((1, 3, 3), (1, 2, 2)),
+        ((2, 2, 2), (2, 2, 2)),
+        ((3, 2, 1), (2, 1, 3)),
+    ]:
+        expected = torch.nn.functional.max_pool3d(i3d_network._pad(x, window, stride), window, stride)
+        assert torch.equal(i3d_network._pool(x, window, stride), expected), (window, stride)
+
+
 def test_same_padding_puts_the_odd_zero_behind() -> None:
     x = torch.ones(1, 1, 4, 5, 6)
     padded = i3d_network._pad(x, (3, 3, 3), (2, 2, 1))

@@ -83,8 +83,17 @@ def _fold_normalisation(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _pool(x: Tensor, window: tuple[int, ...], stride: tuple[int, ...]) -> Tensor:
-    """Maximum; zeros may pad because everything pooled here is behind a ReLU."""
-    return F.max_pool3d(_pad(x, window, stride), window, stride)
+    """Maximum, one axis after the other; zeros may pad because everything pooled here is behind a ReLU.
+
+    `max_pool3d` gives the same bits, and on a CPU takes 6 to 90 times as long: a quarter of the whole network.
+    """
+    x = _pad(x, window, stride)
+    for axis, (length, step) in enumerate(zip(window, stride, strict=True), 2):
+        windows = x.unfold(axis, length, step)
+        x = windows.select(-1, 0)
+        for place in range(1, length):
+            x = torch.maximum(x, windows.select(-1, place))
+    return x
 
 
 def _pad(x: Tensor, window: tuple[int, ...], stride: tuple[int, ...]) -> Tensor:
