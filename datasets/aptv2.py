@@ -18,6 +18,7 @@ from rewild4d.datasets.frame_files import image_size, read_images, read_masks
 from rewild4d.datasets.mask_check import check_videos
 from rewild4d.datasets.mask_makers import Unmasked
 from rewild4d.datasets.masks import open_masks
+from rewild4d.datasets.parts import with_parts
 from rewild4d.datasets.wild import LEAST_FRAMES, Moment, Video, files_identity, original_images, split_video
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.types import Clip, Truth
@@ -37,16 +38,17 @@ class AptV2:
     Args:
         root: the folder that holds the annotations.
         masks: of the animals; root/masks where it is left out.
+        parts: of them (`parts.Parts`).
 
     Raises:
         UserError: no such folder.
     """
 
-    options = ("masks",)
+    options = ("masks", "parts")
     keypoint_mapping, keypoint_use = "aptv2", "all"
 
-    def __init__(self, root: Path, masks: Path | None = None) -> None:
-        self.root = root
+    def __init__(self, root: Path, masks: Path | None = None, parts: str = "all") -> None:
+        self.root, self.parts = root, parts
         self.masks = Path(masks) if masks else root / "masks"
         for folder in (root, *([self.masks] if masks else [])):
             if not folder.is_dir():
@@ -59,7 +61,8 @@ class AptV2:
     @property
     def settings(self) -> dict[str, str]:
         """The options that differ from their defaults, for the record."""
-        return {} if self.masks == self.root / "masks" else {"masks": str(self.masks.resolve())}
+        masks = {} if self.masks == self.root / "masks" else {"masks": str(self.masks.resolve())}
+        return masks | ({"parts": self.parts} if self.parts != "all" else {})
 
     def cases(self, selection: Selection) -> list[str]:
         """Every animal that is annotated in enough frames of a clip.
@@ -121,7 +124,7 @@ class AptV2:
             f"{subject.outside} keypoints outside their image taken as not visible" if subject.outside else "",
             f"a {subject.species} is no quadruped: no four-legged template fits" if subject.species in PRIMATES else "",
         )
-        return Video(
+        video = Video(
             title=str(files[0].parent), name=case, species=subject.species, fps=FPS, licence=LICENCE,
             identity=files_identity(*files, *masks.files) + points, size=size,
             moments=tuple(
@@ -132,6 +135,7 @@ class AptV2:
             masks=partial(read_masks, masks, track, range(len(files)), size),
             notes=tuple(note for note in notes if note),
         )  # fmt: skip
+        return with_parts(video, self.parts)
 
     def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
         """Verify the annotations and some animals that have masks; contact sheets go to ``sheets``."""

@@ -23,6 +23,7 @@ from rewild4d.datasets.keypoint_files import read_keypoints, told_outside
 from rewild4d.datasets.keypoints import read_badja
 from rewild4d.datasets.mask_check import check_videos
 from rewild4d.datasets.masks import MaskFiles, list_images, match_masks, open_masks
+from rewild4d.datasets.parts import with_parts
 from rewild4d.datasets.wild import Moment, Video, files_identity, original_images, split_video
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.types import Clip, Keypoints, Truth
@@ -48,17 +49,21 @@ class Davis:
         masks: other masks for the frames that methods see, <sequence>/00000.png; held-out frames are judged by DAVIS's
             own where they are there.
         keypoints: a file of them (`keypoint_files`) in place of BADJA's.
+        parts: of the masks that methods see (`parts.Parts`); held-out frames are judged by all of DAVIS's.
 
     Raises:
         UserError: no such folder, or no frames in it.
     """
 
-    options = ("masks", "keypoints")
+    options = ("masks", "keypoints", "parts")
     keypoint_mapping, keypoint_use = "badja", "none"
 
-    def __init__(self, root: Path, masks: Path | None = None, keypoints: Path | None = None) -> None:
+    def __init__(
+        self, root: Path, masks: Path | None = None, keypoints: Path | None = None, parts: str = "all"
+    ) -> None:
         self.root = root / "DAVIS" if (root / "DAVIS" / "JPEGImages").is_dir() else root
         self.masks, self.keypoints = (Path(path) if path else None for path in (masks, keypoints))
+        self.parts = parts
         images = self.root / "JPEGImages"
         self.resolution = next((name for name in RESOLUTIONS if (images / name).is_dir()), None)
         if self.resolution is None:
@@ -74,7 +79,8 @@ class Davis:
     def settings(self) -> dict[str, str]:
         """The options that differ from their defaults, for the record."""
         given = {"masks": self.masks, "keypoints": self.keypoints}
-        return {name: str(path.resolve()) for name, path in given.items() if path is not None}
+        paths = {name: str(path.resolve()) for name, path in given.items() if path is not None}
+        return paths | ({"parts": self.parts} if self.parts != "all" else {})
 
     def cases(self, selection: Selection) -> list[str]:
         """Every sequence with masks; where it has several objects, "<sequence>@<id>" for each of them too."""
@@ -123,15 +129,16 @@ class Davis:
         joints, outside = self._joints(sequence, files, size)
         facts = known_sequences().get(sequence, {})
         notes = (note, outside, str(facts.get("note", "")), _odd_animal(facts))
-        return Video(
+        video = Video(
             title=str(files[0].parent), name=case, species=str(facts.get("species", sequence)), fps=FPS,
             licence=LICENCE, identity=files_identity(*files, *own.files, *used.files) + f" {object_id}", size=size,
             moments=tuple(Moment(file.name, i / FPS, joints.get(file.stem)) for i, file in enumerate(files)),
             images=partial(read_images, files, size),
             masks=partial(read_masks, used, object_id if object_id in used.ids else None, every, size),
-            true_masks=partial(read_masks, own, object_id, every, size) if given else None,
+            true_masks=partial(read_masks, own, object_id, every, size) if given or self.parts != "all" else None,
             notes=tuple(text for text in notes if text),
         )  # fmt: skip
+        return with_parts(video, self.parts)
 
     def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
         """Verify some sequences, each file decoded; contact sheets go to ``sheets``."""

@@ -84,6 +84,9 @@ def check_video(video: Video, sheets: Path | None) -> list[Finding]:
         if indices:
             told = f"{what} in {len(indices)} of {count} frames: {_names(video, indices)}"
             findings.append(Finding("warning", video.name, told))
+    if troubles[_SECOND] or troubles[_TWO]:
+        told = "where other parts are not the animal, --parts main keeps to its own (see the contact sheet)"
+        findings.append(Finding("warning", video.name, told))
     try:
         layout = lay_out(video, facts, SPLIT)
         findings += [Finding("warning", video.name, note) for note in layout.notes]
@@ -136,11 +139,12 @@ def _jumps(facts: Sequence[MaskFacts | None]) -> list[int]:
     return found
 
 
+_SECOND, _TWO = "a second part beside the animal", "two parts of like size (two animals?)"
 _TESTS: dict[str, Callable[[Sequence[MaskFacts | None]], list[int]]] = {
     "no mask or an empty one": _empty,
     f"holes (or gaps between legs) above {HOLES:.0%} of the animal": _holed,
-    "a second part beside the animal": _split,
-    "two parts of like size (two animals?)": _twins,
+    _SECOND: _split,
+    _TWO: _twins,
     "a jump from the frame before": _jumps,
 }
 

@@ -18,6 +18,7 @@ from rewild4d.datasets.keypoint_files import read_keypoints, told_outside
 from rewild4d.datasets.mask_check import check_videos
 from rewild4d.datasets.mask_makers import Unmasked
 from rewild4d.datasets.masks import MaskFiles, fit_size, list_images, match_masks, open_masks, read_transparency
+from rewild4d.datasets.parts import with_parts
 from rewild4d.datasets.video_file import ASSUMED_FPS, SUFFIXES, read_video, video_facts
 from rewild4d.datasets.wild import Masks, Moment, Video, files_identity, original_images, split_video
 from rewild4d.errors import UserError, unknown_name
@@ -61,13 +62,14 @@ class Online:
         start: seconds from where on frames are used.
         end: seconds up to which frames are used.
         fps: frames per second that are kept; of a folder also the rate at which it was taken.
+        parts: of the masks (`parts.Parts`).
         keypoints: a file of them (`keypoint_files`), which names the frames or counts those of the video from 0.
 
     Raises:
         UserError: no such file, or numbers that make no sense.
     """
 
-    options = ("masks", "start", "end", "fps", "keypoints")
+    options = ("masks", "start", "end", "fps", "keypoints", "parts")
     licence = LICENCE
 
     def __init__(
@@ -78,8 +80,9 @@ class Online:
         end: float | str | None = None,
         fps: float | str | None = None,
         keypoints: Path | str | None = None,
+        parts: str = "all",
     ) -> None:
-        self.root = root
+        self.root, self.parts = root, parts
         self.masks, self.keypoints = (Path(path) if path else None for path in (masks, keypoints))
         self.start, self.end, self.fps = (None if value is None else float(value) for value in (start, end, fps))
         for path in (self.root, *([self.masks] if self.masks else [])):
@@ -97,6 +100,7 @@ class Online:
         given = {
             "masks": self.masks and self.masks.resolve(), "start": self.start, "end": self.end, "fps": self.fps,
             "keypoints": self.keypoints and self.keypoints.resolve(),
+            "parts": None if self.parts == "all" else self.parts,
         }  # fmt: skip
         return {name: str(value) for name, value in given.items() if value is not None}
 
@@ -139,7 +143,7 @@ class Online:
         points, outside = self._keypoints
         settings = f"{indices} {self._table[case]} {self.fps}"
         sources = self._mask_sources
-        return Video(
+        video = Video(
             title=str(self.root), name=case, species="animal", fps=(len(times) - 1) / span if span else FOLDER_FPS,
             licence=LICENCE, identity=files_identity(*(material.files or (self.root,)), *sources) + settings,
             size=material.size,
@@ -147,6 +151,7 @@ class Online:
             images=self._images, masks=masks,
             notes=(*material.notes, *(text for text in (thinned, note, outside) if text)),
         )  # fmt: skip
+        return with_parts(video, self.parts)
 
     def unmasked(self, case: str) -> Unmasked:
         """The chosen frames without their masks, for programs that make some; masks are named by frame number.

@@ -168,7 +168,9 @@ def usable(
         cut_note = "where the image's border cuts the animal left out"
     notes.append(_told(video, is_cut, cut_note))
     twins = [i for i in used if (fact := facts[i]) is not None and fact.second > TWIN]
-    notes.append(_told(video, twins, "with two parts of like size (two animals?) taken as one animal"))
+    notes.append(
+        _told(video, twins, "with two parts of like size (two animals?) taken as one animal (--parts main takes one)")
+    )
     if len(used) < least:
         reasons = [f"{len(missing)} have no mask" if missing else "", f"{len(empty)} an empty one" if empty else ""]
         said = " and ".join(reason for reason in reasons if reason)

@@ -180,8 +180,8 @@ def test_two_animals_in_one_mask_are_taken_as_one_and_told(walk: Path) -> None:
         moving.save(walk / "masks" / f"{i:05d}.png", moving.mask(i, left=20) | moving.mask(i, left=60))
     clip, truth = load(walk)
     assert len(whole(clip, truth)) == 12
-    told = "2 of 12 frames with two parts of like size (two animals?) taken as one animal: 00003.png to 00004.png"
-    assert told in clip.notes
+    told = "with two parts of like size (two animals?) taken as one animal (--parts main takes one)"
+    assert f"2 of 12 frames {told}: 00003.png to 00004.png" in clip.notes
 
 
 def test_time_stamps_out_of_order_are_replaced_and_told(

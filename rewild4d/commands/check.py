@@ -9,6 +9,7 @@ from rewild4d.config import parse_flags
 from rewild4d.conformance import check_method
 from rewild4d.contracts import Finding
 from rewild4d.datasets.mask_check import SPLIT
+from rewild4d.datasets.parts import Parts
 from rewild4d.errors import UserError
 from rewild4d.runner import choose_cases
 
@@ -26,6 +27,7 @@ class Options:
         data: the folder; the built-in data where it is left out.
         video: the same as --data, for a video file or a folder of frames (--dataset online).
         masks: as for `run`.
+        parts: as for `run`.
         start: as for `run`.
         end: as for `run`.
         fps: as for `run`.
@@ -39,6 +41,7 @@ class Options:
     data: Path | None = None
     video: Path | None = None
     masks: Path | None = None
+    parts: Parts | None = None
     start: float | None = None
     end: float | None = None
     fps: float | None = None

@@ -8,6 +8,7 @@ from rewild4d.commands.shared import require_writable
 from rewild4d.config import parse_flags
 from rewild4d.contracts import Selection
 from rewild4d.datasets.online import Online
+from rewild4d.datasets.parts import Parts
 from rewild4d.datasets.whole_frames import whole_clip
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.priors.choose import Use, split_marks
@@ -39,6 +40,7 @@ class FitOptions:
     Attributes:
         frames: folder of images in order of their names, or a video file.
         masks: folder of masks with the frames' names, or a video of them; the frames' alpha where it is left out.
+        parts: as for `run`.
         out: the npz to write.
         keypoints: BADJA or COCO-like .json, DeepLabCut or SLEAP .csv.
         mapping: which keypoint is which point of the template: aptv2, badja, superanimal-quadruped or a .toml file.
@@ -50,6 +52,7 @@ class FitOptions:
     frames: Path
     out: Path
     masks: Path | None = None
+    parts: Parts = "all"
     keypoints: Path | None = None
     mapping: str | None = None
     use: Use = "all"
@@ -100,7 +103,9 @@ def _fit(options: FitOptions) -> None:
     if (options.keypoints is None) != (options.mapping is None):
         raise UserError("--keypoints and --mapping: expected both or neither.")
     mapping = load_mapping(options.mapping) if options.mapping else {}
-    reader = Online(options.frames, masks=options.masks, fps=options.fps, keypoints=options.keypoints)
+    reader = Online(
+        options.frames, masks=options.masks, fps=options.fps, keypoints=options.keypoints, parts=options.parts
+    )
     video = reader.video(reader.cases(WHOLE)[0])
     clip = whole_clip(video)
     for note in clip.notes:

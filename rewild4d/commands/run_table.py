@@ -13,6 +13,7 @@ from rewild4d.commands.choice import cases_of, chosen
 from rewild4d.commands.shared import check_numbers, choose_prior, floor_entry, open_dataset, require_writable
 from rewild4d.config import parse_flags
 from rewild4d.contracts import DatasetReader
+from rewild4d.datasets.parts import Parts
 from rewild4d.errors import UserError
 from rewild4d.leaderboard.formats import markdown
 from rewild4d.leaderboard.layout import Table
@@ -38,6 +39,8 @@ class Options:
         data: one animal's folder or a folder of animals; the built-in animals where it is left out.
         video: the same as --data, for a video file or a folder of frames (a protocol of online).
         masks: of the animal: a folder or, for online, a video; in place of the data set's own where it has some.
+        parts: of masks in several parts: all, or main, the one that goes on from the frame before (a second animal was
+            taken in); all where it is left out.
         start: seconds from where on frames of the video are used.
         end: seconds up to which they are used.
         fps: how many of them a second; of a folder of frames the rate at which it was taken.
@@ -58,6 +61,7 @@ class Options:
     data: Path | None = None
     video: Path | None = None
     masks: Path | None = None
+    parts: Parts | None = None
     start: float | None = None
     end: float | None = None
     fps: float | None = None

@@ -12,7 +12,7 @@ from rewild4d.priors.landmarks import load_mapping
 from rewild4d.registry import load_builtin, load_dataset, load_method
 from rewild4d.runner import Entry, Progress
 
-SOURCE_FLAGS = ("masks", "start", "end", "fps", "keypoints")
+SOURCE_FLAGS = ("masks", "parts", "start", "end", "fps", "keypoints")
 """Flags that a reader takes if its `options` name them."""
 
 
