@@ -48,8 +48,7 @@ def main_parts(masks: Masks) -> Iterator[np.ndarray | None]:
     """
     before: np.ndarray | None = None
     for mask in masks():
-        solid = mask > 127 if mask is not None else np.zeros(0, dtype=bool)
-        if mask is None or not solid.any():
+        if mask is None or not (solid := mask > 127).any():
             yield mask
             continue
         part = _main(solid, before)
