@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
+from operator import itemgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -55,7 +56,7 @@ class Entry:
 class Plan:
     """Everything that decides what is run; the same plan gives the same run ids.
 
-    `jobs` fits run at a time, each in a process with `threads` threads: the tensors of one fit are small, so two fits
+    `jobs` rows run at a time, each in a process with `threads` threads: the tensors of one fit are small, so two fits
     side by side finish sooner than one with two threads. `rasterizer` is one of rewild4d.rasterizer.BACKENDS.
     """
 
@@ -123,8 +124,10 @@ def execute(plan: Plan) -> list[RunRecord]:
         for note in plan.reader.load(name, plan.protocol.selection)[0].notes:
             print(f"{name}: {note}", file=sys.stderr)
     parts = [(name, entry, seed) for name in plan.cases for entry in plan.entries for seed in entry.seeds]
-    fits = sum(entry.method not in plan.protocol.floors for _, entry, _ in parts)
-    jobs = min(plan.jobs, max(len(plan.cases), fits))
+    floors = [entry.method in plan.protocol.floors for _, entry, _ in parts]
+    # A floor is done at once, unless sets of novel views are scored: those take minutes of every row.
+    long = len(parts) if plan.protocol.novel else floors.count(False)
+    jobs = min(plan.jobs, max(len(plan.cases), long))
     if jobs <= 1:
         torch.set_num_threads(plan.threads)
         set_default(plan.rasterizer)
@@ -136,7 +139,10 @@ def execute(plan: Plan) -> list[RunRecord]:
     with Workers(jobs, plan.threads, plan.rasterizer) as workers:
         # Every fit of a case starts from its prior, so the priors come first.
         workers.map(_prepare, [(plan, name) for name in plan.cases], lambda *_: None)
-        return workers.map(_run_part, [(plan, *part) for part in parts], _lost_part)
+        # Fits first: the floors fill the time that they leave.
+        order = sorted(range(len(parts)), key=floors.__getitem__)
+        made = workers.map(_run_part, [(plan, *parts[i]) for i in order], _lost_part)
+        return [record for _, record in sorted(zip(order, made, strict=True), key=itemgetter(0))]
 
 
 def pieces(plan: Plan) -> list["Job"]:

@@ -21,6 +21,7 @@ from rewild4d.contracts import Selection
 from rewild4d.coverage import coverage, visible
 from rewild4d.errors import UserError
 from rewild4d.leaderboard.records import FILE, RunRecord, Timing
+from rewild4d.novel_views import NovelViews
 from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import STANDARD
 from rewild4d.priors.io import save_prior
@@ -102,6 +103,23 @@ def test_finished_runs_are_skipped(plan: runner.Plan, monkeypatch: pytest.Monkey
     once = runner.execute(plan)
     monkeypatch.setattr(PriorOnly, "fit", lambda *_, **__: pytest.fail("fitted a finished run again"))
     assert runner.execute(plan) == once
+
+
+def test_where_sets_are_scored_floors_run_beside_the_one_fit(
+    plan: runner.Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Scoring sets of novel views takes minutes of every row; without them one fit needs no second process."""
+
+    def start(jobs: int, *_: object) -> None:
+        raise RuntimeError(f"{jobs} processes")
+
+    monkeypatch.setattr(runner, "Workers", start)
+    plain = msgspec.structs.replace(plan.protocol, floors=("empty",))
+    entries = (plan.entries[0], replace(plan.entries[1], seeds=(0,)))
+    assert len(runner.execute(replace(plan, protocol=plain, entries=entries, jobs=4))) == 2
+    sets = msgspec.structs.replace(plain, novel=NovelViews(frames=2, clip=2, stride=1))
+    with pytest.raises(RuntimeError, match="2 processes"):
+        runner.execute(replace(plan, protocol=sets, entries=entries, jobs=4))
 
 
 def test_a_run_killed_while_scoring_is_not_fitted_again(plan: runner.Plan, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,7 +54,7 @@ class Options:
             scored). Where it is left out: all of aptv2's and of a file's, none of BADJA's beside davis.
         device: auto, cpu or cuda.
         rasterizer: what renders: auto, numba (CPU), triton or gsplat (CUDA), or reference (small scenes only).
-        jobs: cases at a time; 0 is one for each processor core (one in all on a GPU).
+        jobs: runs at a time (a case, a method and a seed each); 0 is one for each processor core (one in all on a GPU).
         threads: of each case; other numbers than 1 may change the last digits.
         out: folder for runs.
         json: print the records as a JSON array, and nothing else, to standard output.
