@@ -31,12 +31,12 @@ from rewild4d.original_view import original_frames
 from rewild4d.priors.choose import PriorChoice, make_prior
 from rewild4d.priors.placing import known_frames, with_cameras
 from rewild4d.protocol import Protocol, evaluate, may_be_scored_now
-from rewild4d.rasterizer import pick_rasterizer, set_default
+from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.recropping import seen_by
 from rewild4d.registry import load_method
 from rewild4d.types import Case, Clip, Prior, Truth
 from rewild4d.view import save_pictures
-from rewild4d.workers import Workers
+from rewild4d.workers import Workers, share_cores, this_process
 
 STAMP = "fit.json"
 """Beside a saved reconstruction: how long the fit took, written last."""
@@ -56,8 +56,8 @@ class Entry:
 class Plan:
     """Everything that decides what is run; the same plan gives the same run ids.
 
-    `jobs` rows run at a time, each in a process with `threads` threads: the tensors of one fit are small, so two fits
-    side by side finish sooner than one with two threads. `rasterizer` is one of rewild4d.rasterizer.BACKENDS.
+    `jobs` rows run at a time, each in a process where torch has `threads` threads; our kernels take the cores that no
+    fit needs. Two fits side by side finish sooner than one on two cores. `rasterizer` is one of rewild4d.rasterizer's.
     """
 
     dataset: str
@@ -128,15 +128,15 @@ def execute(plan: Plan) -> list[RunRecord]:
     # A floor is done at once, unless sets of novel views are scored: those take minutes of every row.
     long = len(parts) if plan.protocol.novel else floors.count(False)
     jobs = min(plan.jobs, max(len(plan.cases), long))
+    threads = share_cores(plan.threads, min(jobs, floors.count(False)), plan.device)
     if jobs <= 1:
-        torch.set_num_threads(plan.threads)
-        set_default(plan.rasterizer)
         records = []
-        for name in plan.cases:
-            _prepare(plan, name)
-            records += _run_case(plan, name)
+        with this_process(threads, plan.rasterizer):
+            for name in plan.cases:
+                _prepare(plan, name)
+                records += _run_case(plan, name)
         return records
-    with Workers(jobs, plan.threads, plan.rasterizer) as workers:
+    with Workers(jobs, threads, plan.rasterizer) as workers:
         # Every fit of a case starts from its prior, so the priors come first.
         workers.map(_prepare, [(plan, name) for name in plan.cases], lambda *_: None)
         # Fits first: the floors fill the time that they leave.

@@ -3,18 +3,47 @@
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from queue import SimpleQueue
 from threading import Thread
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 
+from rewild4d.kernels.threads import set_kernel_threads
 from rewild4d.rasterizer import set_default
 
 T = TypeVar("T")
+MOST_THREADS = 4
+"""That the kernels of one fit take unasked: what they gain from more has not been measured."""
+
+
+class Threads(NamedTuple):
+    """Of one process: torch's, on whose number last digits depend, and our kernels', on whose number nothing does."""
+
+    torch: int
+    kernels: int
+
+
+def share_cores(threads: int, fits: int, device: torch.device) -> Threads:
+    """Threads of each process where so many fits run at a time: the kernels take the cores that no fit needs."""
+    idle = len(os.sched_getaffinity(0)) // max(fits, 1) if device.type == "cpu" else 1
+    return Threads(threads, max(threads, min(idle, MOST_THREADS)))
+
+
+@contextmanager
+def this_process(threads: Threads, rasterizer: str) -> Iterator[None]:
+    """Work here, as a worker would."""
+    torch.set_num_threads(threads.torch)
+    set_default(rasterizer)
+    before = set_kernel_threads(threads.kernels)
+    try:
+        yield
+    finally:
+        set_kernel_threads(before)
 
 
 class Workers:
@@ -23,7 +52,7 @@ class Workers:
     Each is a pool of one: a pool of several is lost as a whole, with all that is under way, when one of them dies.
     """
 
-    def __init__(self, jobs: int, threads: int, rasterizer: str) -> None:
+    def __init__(self, jobs: int, threads: Threads, rasterizer: str) -> None:
         self._jobs, self._setup = jobs, (threads, rasterizer, os.getpid())
         self._free: SimpleQueue[ProcessPoolExecutor] = SimpleQueue()
         for _ in range(jobs):
@@ -64,9 +93,10 @@ class Workers:
         return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), start_worker, self._setup)
 
 
-def start_worker(threads: int, rasterizer: str, parent: int) -> None:
+def start_worker(threads: Threads, rasterizer: str, parent: int) -> None:
     """Threads of its own, and an end with its parent: an orphan would write into the folder of the next start."""
-    torch.set_num_threads(threads)
+    torch.set_num_threads(threads.torch)
+    set_kernel_threads(threads.kernels)
     set_default(rasterizer)
 
     def watch() -> None:

@@ -14,7 +14,7 @@ from rewild4d.kernels.halves import AVAILABLE, add_pair_product, pair_matrix, pa
 from rewild4d.kernels.matrix import add_product, matrix_tile, multiply_add, transpose_tile
 from rewild4d.kernels.memory import keep_freed_memory
 from rewild4d.kernels.rows import add_scaled, sum_rows
-from rewild4d.kernels.threads import run, spans, thread_count, torch_on_one
+from rewild4d.kernels.threads import run, set_kernel_threads, spans, thread_count, torch_on_one
 from rewild4d.ours.gradients import clip_gradients
 
 
@@ -151,6 +151,19 @@ def test_the_kernels_keep_their_threads_while_torch_has_one() -> None:
         assert torch.get_num_threads() == 3 and thread_count() == 3
     finally:
         torch.set_num_threads(before)
+
+
+def test_the_kernels_may_have_threads_of_their_own() -> None:
+    """A run gives them cores that torch may not use: its last digits depend on how many it has."""
+    torch_has = torch.get_num_threads()
+    before = set_kernel_threads(torch_has + 2)
+    try:
+        assert (torch.get_num_threads(), thread_count()) == (torch_has, torch_has + 2)
+        with torch_on_one():
+            assert thread_count() == torch_has + 2
+        assert set_kernel_threads(None) == torch_has + 2 and thread_count() == torch_has
+    finally:
+        set_kernel_threads(before)
 
 
 def test_an_error_in_a_thread_reaches_the_caller() -> None:

@@ -11,6 +11,7 @@ import torch
 
 from rewild4d.errors import UserError
 from rewild4d.harmonics import seen_colors
+from rewild4d.kernels.threads import set_kernel_threads
 from rewild4d.ours.config import Canonical, Config, Deform, Density, Geometry, PriorUse, Skinning, WarmUp
 from rewild4d.ours.fit import Training, train
 from rewild4d.ours.method import Ours
@@ -197,7 +198,9 @@ def test_a_change_of_scale_by_the_deformation_costs_its_square(toy: tuple[Clip, 
     assert "steady" not in start(toy, off).losses(key, target, last)[0]
 
 
-def test_a_killed_fit_resumes_to_the_same_bits(toy: tuple[Clip, Prior], tmp_path: Path) -> None:
+def test_a_killed_fit_resumes_to_the_same_bits_on_more_threads(
+    toy: tuple[Clip, Prior], tmp_path: Path
+) -> None:
     whole = train(*toy, TINY, 0, CPU, quiet, None)
 
     class Killed(Exception):
@@ -211,7 +214,9 @@ def test_a_killed_fit_resumes_to_the_same_bits(toy: tuple[Clip, Prior], tmp_path
     with pytest.raises(Killed):
         train(*toy, TINY, 0, CPU, kill_late, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
+    before = set_kernel_threads(3)
     resumed = train(*toy, TINY, 0, CPU, quiet, tmp_path)
+    set_kernel_threads(before)
     other = train(*toy, TINY, 1, CPU, quiet, tmp_path)
     assert len(whole.gaussians) > TINY.canonical.samples
     for (name, a), b in zip(whole.state_dict().items(), resumed.state_dict().values(), strict=True):

@@ -29,7 +29,7 @@ from rewild4d.protocol import find_protocol
 from rewild4d.rasterizer.backends import resolve
 from rewild4d.registry import load_method
 from rewild4d.types import Camera, Case, Clip, Truth
-from rewild4d.workers import start_worker
+from rewild4d.workers import Threads, share_cores, start_worker
 
 SETTINGS = PriorOnlyConfig(gaussians=2000)
 
@@ -157,9 +157,21 @@ def test_the_rasterizer_is_named_and_another_one_is_another_run(plan: runner.Pla
     assert made[2].status == "ok"
 
 
+@pytest.mark.parametrize(
+    ("cores", "threads", "fits", "device", "kernels"),
+    [(2, 1, 1, "cpu", 2), (2, 1, 2, "cpu", 1), (8, 1, 3, "cpu", 8 // 3), (64, 1, 1, "cpu", 4), (2, 1, 0, "cpu", 2),
+     (2, 3, 2, "cpu", 3), (8, 1, 1, "cuda", 1)],
+)  # fmt: skip
+def test_kernels_take_the_cores_that_no_fit_needs(
+    cores: int, threads: int, fits: int, device: str, kernels: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    assert share_cores(threads, fits, torch.device(device)) == Threads(threads, kernels)
+
+
 def test_worker_processes_render_with_the_rasterizer_of_the_plan() -> None:
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, context, start_worker, (1, "reference", os.getpid())) as pool:
+    with ProcessPoolExecutor(1, context, start_worker, (Threads(1, 1), "reference", os.getpid())) as pool:
         assert pool.submit(resolve, "auto", torch.device("cpu"), torch.float32).result() == "reference"
 
 

@@ -26,7 +26,7 @@ from rewild4d.priors.io import save_prior
 from rewild4d.protocol import find_protocol
 from rewild4d.registry import load_method
 from rewild4d.types import Case
-from rewild4d.workers import Workers
+from rewild4d.workers import Threads, Workers
 
 SETTINGS = PriorOnlyConfig(gaussians=500)
 
@@ -87,7 +87,7 @@ def test_what_another_process_has_finished_meanwhile_is_not_fitted_again(
 
 
 def test_a_killed_process_takes_only_its_own_piece_with_it() -> None:
-    with Workers(2, 1, "numba") as workers:
+    with Workers(2, Threads(1, 1), "numba") as workers:
         found = workers.map(dying.square, [(number, 2) for number in range(5)], lambda number, _: -number)
     assert found == [0, 1, -2, 9, 16]
 

@@ -65,8 +65,22 @@ _own_count: int | None = None
 
 
 def thread_count() -> int:
-    """How many threads to use: torch's own number, so that one setting governs everything, but see `torch_on_one`."""
+    """How many threads to use: torch's own number, unless `set_kernel_threads` was given another."""
     return _own_count or torch.get_num_threads()
+
+
+def set_kernel_threads(count: int | None) -> int | None:
+    """Give the kernels a number of threads apart from torch's: their results are the same bits on any, torch's are not.
+
+    Args:
+        count: of this process from now on; None: torch's own number.
+
+    Returns:
+        What it was.
+    """
+    global _own_count
+    before, _own_count = _own_count, count
+    return before
 
 
 @contextmanager
@@ -76,14 +90,13 @@ def torch_on_one() -> Iterator[None]:
     After a parallel operation torch's OpenMP threads spin for some milliseconds, and a kernel that starts then has to
     share its cores with them: on two cores it gained nothing from the second.
     """
-    global _own_count
-    before, threads = _own_count, torch.get_num_threads()
-    _own_count = thread_count()
+    threads = torch.get_num_threads()
+    before = set_kernel_threads(thread_count())
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        _own_count = before
+        set_kernel_threads(before)
         torch.set_num_threads(threads)
 
 
