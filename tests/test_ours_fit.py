@@ -198,9 +198,7 @@ def test_a_change_of_scale_by_the_deformation_costs_its_square(toy: tuple[Clip, 
     assert "steady" not in start(toy, off).losses(key, target, last)[0]
 
 
-def test_a_killed_fit_resumes_to_the_same_bits_on_more_threads(
-    toy: tuple[Clip, Prior], tmp_path: Path
-) -> None:
+def test_a_killed_fit_resumes_to_the_same_bits_on_more_threads(toy: tuple[Clip, Prior], tmp_path: Path) -> None:
     whole = train(*toy, TINY, 0, CPU, quiet, None)
 
     class Killed(Exception):
