@@ -55,7 +55,8 @@ class Options:
         device: auto, cpu or cuda.
         rasterizer: what renders: auto, numba (CPU), triton or gsplat (CUDA), or reference (small scenes only).
         jobs: runs at a time (a case, a method and a seed each); 0 is one for each processor core (one in all on a GPU).
-        threads: of each case; other numbers than 1 may change the last digits.
+        threads: of torch in each run; other numbers than 1 may change the last digits. Our own kernels take idle cores
+            unasked, which changes nothing but the time.
         out: folder for runs.
         json: print the records as a JSON array, and nothing else, to standard output.
     """
