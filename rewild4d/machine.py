@@ -13,6 +13,7 @@ import torch
 from rewild4d import __version__
 from rewild4d.errors import UserError
 from rewild4d.files import digest
+from rewild4d.kernels.threads import thread_count
 from rewild4d.registry import load_method
 
 PACKAGES = (
@@ -77,6 +78,7 @@ def machine(device: torch.device, rasterizer: str) -> dict[str, str]:
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "threads": str(torch.get_num_threads()),
+        "kernel_threads": str(thread_count()),
         **versions,
     }
 
