@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
+import torch
 import tyro
 
 from rewild4d import describing
@@ -17,11 +18,12 @@ from rewild4d.leaderboard.tables import markdown
 from rewild4d.machine import code_of, machine, peak_memory_mib, pick_device
 from rewild4d.original_view import original_frames
 from rewild4d.protocol import evaluate, find_protocol
-from rewild4d.rasterizer import pick_rasterizer, set_default
+from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.recropping import seen_by
 from rewild4d.registry import load_dataset, load_method
 from rewild4d.runner import STAMP, Progress, fit_seconds
 from rewild4d.view import save_pictures
+from rewild4d.workers import share_cores, this_process
 
 DESCRIPTION = """Score saved reconstructions again, with the protocol that they were fitted for (another one could hold
 out what the method has seen), draw their pictures again and write their records anew."""
@@ -63,12 +65,17 @@ def score_again(folder: Path, options: Options) -> RunRecord:
     """
     device = pick_device(options.device)
     rasterizer = pick_rasterizer(options.rasterizer, device)
+    with this_process(share_cores(1, 1, device), rasterizer):  # as a run scores: torch's threads decide last digits
+        return _scored(folder, options.data, device, rasterizer)
+
+
+def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: str) -> RunRecord:
     record = read_record(folder / FILE)
     saved = folder / "reconstruction"
     if not saved.is_dir():
         raise UserError(f"{saved}: expected a saved reconstruction, but there is no such folder.")
     protocol = find_protocol(record.dataset, record.protocol["name"])
-    root = options.data or Path(record.data["root"])
+    root = data or Path(record.data["root"])
     settings = json.loads(record.data.get("settings", "{}"))
     reader = load_dataset(record.dataset)(root, **settings)
     clip, truth = reader.load(record.case, protocol.selection)
@@ -76,7 +83,6 @@ def score_again(folder: Path, options: Options) -> RunRecord:
         if now != record.data[name]:
             raise UserError(f"{root}: the {name} of {record.case} is not the one that {folder} was fitted to.")
     reconstruction = load_method(record.method).load(saved, device)
-    set_default(rasterizer)
     begin = time.perf_counter()
     clip, truth = seen_by(reconstruction, clip, truth, describing.shown_of(clip, record.prior))
     progress = Progress(f"{record.case}: evaluate")
