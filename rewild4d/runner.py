@@ -57,7 +57,7 @@ class Plan:
     """Everything that decides what is run; the same plan gives the same run ids.
 
     `jobs` rows run at a time, each in a process where torch has `threads` threads; our kernels take the cores that no
-    fit needs. Two fits side by side finish sooner than one on two cores. `rasterizer` is one of rewild4d.rasterizer's.
+    fit needs. Two fits side by side finish sooner than one on two cores. `rasterizer`: rewild4d.rasterizer.BACKENDS.
     """
 
     dataset: str

@@ -28,22 +28,31 @@ class Threads(NamedTuple):
     kernels: int
 
 
+def usable_cores(device: torch.device) -> int:
+    """Processes that a device can keep busy: one for each core that this process may use, one in all on a GPU."""
+    return 1 if device.type == "cuda" else len(os.sched_getaffinity(0))
+
+
 def share_cores(threads: int, fits: int, device: torch.device) -> Threads:
     """Threads of each process where so many fits run at a time: the kernels take the cores that no fit needs."""
-    idle = len(os.sched_getaffinity(0)) // max(fits, 1) if device.type == "cpu" else 1
-    return Threads(threads, max(threads, min(idle, MOST_THREADS)))
+    return Threads(threads, max(threads, min(usable_cores(device) // max(fits, 1), MOST_THREADS)))
 
 
 @contextmanager
 def this_process(threads: Threads, rasterizer: str) -> Iterator[None]:
     """Work here, as a worker would."""
-    torch.set_num_threads(threads.torch)
-    set_default(rasterizer)
-    before = set_kernel_threads(threads.kernels)
+    before = _settle(threads, rasterizer)
     try:
         yield
     finally:
         set_kernel_threads(before)
+
+
+def _settle(threads: Threads, rasterizer: str) -> int | None:
+    """Set up this process; gives how many threads its kernels had."""
+    torch.set_num_threads(threads.torch)
+    set_default(rasterizer)
+    return set_kernel_threads(threads.kernels)
 
 
 class Workers:
@@ -95,9 +104,7 @@ class Workers:
 
 def start_worker(threads: Threads, rasterizer: str, parent: int) -> None:
     """Threads of its own, and an end with its parent: an orphan would write into the folder of the next start."""
-    torch.set_num_threads(threads.torch)
-    set_kernel_threads(threads.kernels)
-    set_default(rasterizer)
+    _settle(threads, rasterizer)
 
     def watch() -> None:
         while os.getppid() == parent:

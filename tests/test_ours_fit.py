@@ -74,6 +74,7 @@ def one_thread() -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
+    set_kernel_threads(None)
     torch.set_num_threads(before)
 
 
@@ -212,9 +213,8 @@ def test_a_killed_fit_resumes_to_the_same_bits_on_more_threads(toy: tuple[Clip, 
     with pytest.raises(Killed):
         train(*toy, TINY, 0, CPU, kill_late, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
-    before = set_kernel_threads(3)
+    set_kernel_threads(3)
     resumed = train(*toy, TINY, 0, CPU, quiet, tmp_path)
-    set_kernel_threads(before)
     other = train(*toy, TINY, 1, CPU, quiet, tmp_path)
     assert len(whole.gaussians) > TINY.canonical.samples
     for (name, a), b in zip(whole.state_dict().items(), resumed.state_dict().values(), strict=True):

@@ -1,6 +1,5 @@
 """`run`: fit a method on a data set and score it on views it never saw."""
 
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from rewild4d.protocol import find_protocol
 from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_dataset, load_method
 from rewild4d.runner import Entry, Plan, choose_cases, execute
+from rewild4d.workers import usable_cores
 
 DESCRIPTION = """Fit a method on every case of a data set and score it on the views that it never saw.
 Finished runs are skipped and a killed one resumes. Without --data the built-in animals are made on first use.
@@ -127,7 +127,6 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
     floors = [floor_entry(name) for name in protocol.floors if name != options.method]
     entry = Entry(options.method, options.preset, config, tuple(dict.fromkeys(options.seeds)))
     prior = choose_prior(options.prior, options.preset, reader, options)
-    cores = 1 if device.type == "cuda" else len(os.sched_getaffinity(0))
     return Plan(
         dataset=options.dataset,
         reader=reader,
@@ -138,7 +137,7 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
         prior=prior,
         device=device,
         out=options.out.absolute(),
-        jobs=options.jobs or cores,
+        jobs=options.jobs or usable_cores(device),
         threads=options.threads,
         rasterizer=rasterizer,
     )

@@ -1,6 +1,5 @@
 """`run --table NAME`: plan what a table needs, run what is missing, print it."""
 
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +24,7 @@ from rewild4d.protocol import Protocol
 from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_dataset
 from rewild4d.runner import Entry, Plan, choose_cases, execute, pieces
+from rewild4d.workers import usable_cores
 
 DESCRIPTION = """Fit what a table of leaderboard/tables (see `list`) needs and has no record for yet, on every case, and
 print it. Finished runs are skipped and a killed one resumes."""
@@ -118,7 +118,6 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
     entries = planning.entries(options.table, spec, tuple(dict.fromkeys(options.seeds or spec.seeds)))
     require_writable(options.out)
     root, reader = open_dataset(spec.dataset, options.data, options)
-    cores = 1 if device.type == "cuda" else len(os.sched_getaffinity(0))
     plans = []
     for (name, prior), patterns in planning.grounds(spec).items():
         protocol = protocols[name]
@@ -129,7 +128,8 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
             Plan(
                 dataset=spec.dataset, reader=reader, root=root, cases=cases, protocol=protocol,
                 entries=(*floors, *entries), prior=choose_prior(prior, spec.preset, reader), device=device,
-                out=options.out.absolute(), jobs=options.jobs or cores, threads=options.threads, rasterizer=rasterizer,
+                out=options.out.absolute(), jobs=options.jobs or usable_cores(device), threads=options.threads,
+                rasterizer=rasterizer,
             )
         )  # fmt: skip
     return plans
