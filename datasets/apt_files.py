@@ -6,9 +6,23 @@ Every split file of APTv2 lists all images, so clips are found through annotatio
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from rewild4d.datasets.entries import (
+    Entry,
+    LeftOut,
+    Unusable,
+    box_of,
+    by_id,
+    image_of,
+    listed,
+    look_up,
+    numbers,
+    shown,
+    triples_of,
+)
 from rewild4d.datasets.keypoints import APT, coco_keypoints, read_json
 from rewild4d.errors import UserError
 from rewild4d.types import Keypoints
@@ -49,10 +63,17 @@ class Subject:
 
 @dataclass(frozen=True)
 class Annotations:
-    """All subjects of a data set, and what did not fit, a sentence each."""
+    """All subjects of a data set, and what did not fit, a sentence each.
+
+    Attributes:
+        subjects: by name.
+        faults: of all files.
+        clip_faults: of each clip, by its folder; under "" those of which nobody knows the clip.
+    """
 
     subjects: dict[str, Subject]
     faults: tuple[str, ...]
+    clip_faults: dict[str, list[str]]
 
 
 def read_annotations(root: Path) -> Annotations:
@@ -64,66 +85,110 @@ def read_annotations(root: Path) -> Annotations:
     files = sorted({*root.glob("annotations*/*.json"), *root.glob("*.json")})
     subjects: dict[str, Subject] = {}
     faults: list[str] = []
-    seen: set[tuple[str, str]] = set()
+    clip_faults: dict[str, list[str]] = {}
+    seen: set[tuple[str, int]] = set()
     read = 0
     for path in files:
         table = read_json(path)
         if not isinstance(table, dict) or "annotations" not in table:
             continue
         read += 1
-        faults += _add(path, table, subjects, seen)
+        left = _add(path, table, subjects, seen)
+        faults += [f"{path.name}: {sentence}" for sentence in left.told()]
+        for clip in left.groups:
+            clip_faults.setdefault(clip, []).extend(f"{path.name}: {sentence}" for sentence in left.told(clip))
     if not read:
         raise UserError(f"{root / 'annotations'}: expected annotation files of APTv2 or APT-36K (.json), got none.")
     if not subjects:
         raise UserError(f"{root}: expected annotations of animals in images, got none: {'; '.join(faults) or 'empty'}.")
     for subject in subjects.values():
         subject.sightings.sort(key=lambda sighting: (sighting.number, str(sighting.file)))
-    return Annotations(dict(sorted(subjects.items())), tuple(faults))
+    return Annotations(dict(sorted(subjects.items())), tuple(faults), clip_faults)
 
 
-def _add(path: Path, table: dict[str, Any], subjects: dict[str, Subject], seen: set[tuple[str, str]]) -> list[str]:
-    """Add one file's annotations; gives what did not fit."""
+def _add(path: Path, table: dict[str, Any], subjects: dict[str, Subject], seen: set[tuple[str, int]]) -> LeftOut:
+    """Add one file's annotations; gives those that did not fit.
+
+    Args:
+        path: of the file.
+        table: what it holds.
+        subjects: by name, which gain sightings.
+        seen: file and track of every sighting so far: splits overlap.
+    """
     try:
-        images = {image["id"]: image for image in table["images"]}
-        kinds = {kind["id"]: str(kind["name"]) for kind in table.get("categories", [])}
-        for key in ("video_id", "track_id"):
-            if table["annotations"] and not any(key in entry for entry in table["annotations"]):
-                raise UserError(f"{path}: expected annotations with video_id and track_id, got none with {key}.")
-        counts = {"name an image that is not listed": 0, "have no box inside their image": 0}
-        for entry in table["annotations"]:
-            image = images.get(entry["image_id"])
-            if image is None:
-                counts["name an image that is not listed"] += 1
-                continue
-            pair = (str(image["file_name"]), str(entry.get("track_id", 0)))
-            if pair in seen:
-                continue
-            seen.add(pair)
-            if not _sight(entry, image, kinds.get(entry.get("category_id"), "animal"), subjects):
-                counts["have no box inside their image"] += 1
-    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        raise UserError(f"{path}: expected COCO-like annotations, but an entry does not fit ({error!r}).") from error
-    total = len(table["annotations"])
-    return [f"{path.name}: {count} of {total} annotations {what}" for what, count in counts.items() if count]
+        entries = listed(table, "annotations")
+        images, kinds = (
+            by_id(listed(table, "images"), "file_name", str),
+            by_id(listed({"categories": []} | table, "categories"), "name", str),
+        )
+    except ValueError as error:
+        raise UserError(f"{path}: expected COCO-like annotations, got {error}.") from error
+    for key in ("video_id", "track_id"):
+        if entries and not any(isinstance(entry, dict) and key in entry for entry in entries):
+            raise UserError(f"{path}: expected annotations with video_id and track_id, got none with {key}.")
+    left = LeftOut()
+    for species, track, outside, sighting in left.usable(entries, partial(_sighting, images, kinds)):
+        if (str(sighting.file), track) in seen:
+            continue
+        seen.add((str(sighting.file), track))
+        name = f"{sighting.file.parent}@{track}"
+        subject = subjects.setdefault(name, Subject(name, track, species))
+        subject.outside += outside
+        subject.sightings.append(sighting)
+    return left
 
 
-def _sight(entry: dict[str, Any], image: dict[str, Any], species: str, subjects: dict[str, Subject]) -> bool:
-    """Add one annotation to its subject; False where its box lies outside the image."""
-    file, size = clean_path(str(image["file_name"])), (int(image["width"]), int(image["height"]))
-    left, top, width, height = map(float, entry["bbox"])
+def _sighting(images: dict[Any, Entry], kinds: dict[Any, Entry], entry: Entry) -> tuple[str, int, int, Sighting]:
+    """Species, track, the number of keypoints outside the image, and the sighting of one annotation.
+
+    Raises:
+        Unusable: one that is not there or makes no sense.
+    """
+    image, kind = image_of(images, entry), look_up(kinds, entry, "category_id")
+    species = str(kind["name"]) if kind else "animal"
+    file = clean_path(image["file_name"])
+    try:
+        size = _size(image)
+        box = _within(box_of(entry), size, entry)
+        values = triples_of(entry, len(APT)) if entry.get("keypoints") else [0.0] * (3 * len(APT))
+        keypoints, outside = coco_keypoints(values, APT, size)
+        return (
+            NAMES.get(species, species),
+            _track(entry),
+            outside,
+            Sighting(file, _number(file.stem), size, box, keypoints),
+        )
+    except Unusable as fault:
+        fault.group = str(file.parent)
+        raise
+
+
+def _size(image: Entry) -> tuple[int, int]:
+    try:
+        return int(image["width"]), int(image["height"])
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        got = f"image_id {image['id']} with {shown(image, 'width')} and {shown(image, 'height')}"
+        raise Unusable("name an image without width and height in pixels", got) from error
+
+
+def _track(entry: Entry) -> int:
+    """The number of an animal in its clip; nobody may guess it."""
+    found = numbers([entry.get("track_id")])
+    if not found or not found[0].is_integer():
+        raise Unusable("have no whole number as track_id", shown(entry, "track_id"))
+    return int(found[0])
+
+
+def _within(
+    box: tuple[float, float, float, float], size: tuple[int, int], entry: Entry
+) -> tuple[float, float, float, float]:
+    """The part of a box that lies in its image."""
+    left, top, width, height = box
     right, bottom = min(left + width, size[0]), min(top + height, size[1])
     left, top = max(left, 0.0), max(top, 0.0)
     if not (right > left and bottom > top):  # also where a number is NaN
-        return False
-    values = entry.get("keypoints") or [0] * (3 * len(APT))
-    keypoints, outside = coco_keypoints(values, APT, size)
-    track = int(entry.get("track_id", 0))
-    name = f"{file.parent}@{track}"
-    subject = subjects.setdefault(name, Subject(name, track, NAMES.get(species, species)))
-    subject.outside += outside
-    box = (left, top, right - left, bottom - top)
-    subject.sightings.append(Sighting(file, _number(file.stem), size, box, keypoints))
-    return True
+        raise Unusable("have no box inside their image", shown(entry, "bbox"))
+    return left, top, right - left, bottom - top
 
 
 def clean_path(text: str) -> PurePosixPath:

@@ -116,13 +116,18 @@ class AptV2:
                 f"{place}: expected masks of {case} (this one and its neighbours), got none; APTv2 has none of its "
                 "own, `rewild4d-bench masks` makes some."
             )
-        first = subject.sightings[0].number
+        first, faults = subject.sightings[0].number, self._annotations.clip_faults
         points = repr([sighting.keypoints.points.tolist() for sighting in subject.sightings])
         track = subject.track if subject.track in masks.ids else None
         notes = (
             f"the frame rate is not known: {FPS:g} frames a second assumed",
             f"{subject.outside} keypoints outside their image taken as not visible" if subject.outside else "",
             f"a {subject.species} is no quadruped: no four-legged template fits" if subject.species in PRIMATES else "",
+            *faults.get(str(subject.sightings[0].file.parent), ()),
+            *faults.get("", ()),
+            f"masks hold objects {', '.join(map(str, masks.ids))}, none of them track {subject.track}: taken together"
+            if track is None and len(masks.ids) > 1
+            else "",
         )
         video = Video(
             title=str(files[0].parent), name=case, species=subject.species, fps=FPS, licence=LICENCE,

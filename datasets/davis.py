@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property, partial
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,11 @@ RESOLUTIONS = ("480p", "1080p", "Full-Resolution")
 LICENCE = "CC BY-NC 4.0 (DAVIS, Perazzi et al. 2016, Pont-Tuset et al. 2017): attribute, non-commercial"
 
 
-def known_sequences() -> dict[str, dict[str, str | int | bool]]:
+Facts = dict[str, Any]
+"""What davis.toml says of a sequence."""
+
+
+def known_sequences() -> dict[str, Facts]:
     """What is known of the animals in DAVIS, by sequence (davis.toml)."""
     return tomllib.loads((resources.files("rewild4d.datasets") / "davis.toml").read_text(encoding="utf-8"))
 
@@ -87,13 +92,17 @@ class Davis:
         return list(self._table)
 
     def default_cases(self, selection: Selection) -> list[str]:
-        """The quadrupeds among the known sequences (all sequences where there is none), one object at a time."""
+        """The quadrupeds among the known sequences (all sequences where there is none), one object at a time.
+
+        Objects that are known to be people or things are none of them (`animals` in davis.toml).
+        """
         known = known_sequences()
         several = {sequence for sequence, number in self._table.values() if number is not None}
         single = {
             case: sequence for case, (sequence, number) in self._table.items() if number or sequence not in several
         }
-        chosen = [case for case, name in single.items() if known.get(name, {}).get("quadruped", name in known)]
+        fit = [case for case, name in single.items() if known.get(name, {}).get("quadruped", name in known)]
+        chosen = [case for case in fit if not self._strangers(case)]
         return chosen or list(single)
 
     def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
@@ -124,17 +133,19 @@ class Davis:
         files = self._frames(sequence)
         size = image_size(files[0])
         own = self._own_masks(sequence, files)
-        given, note = self._given_masks(sequence, files)
+        given, note = self._given_masks(sequence, files, object_id)
         used, every = given or own, range(len(files))
         joints, outside = self._joints(sequence, files, size)
         facts = known_sequences().get(sequence, {})
-        notes = (note, outside, str(facts.get("note", "")), _odd_animal(facts))
+        species, strangers = str(facts.get("species", sequence)), self._strangers(case)
+        told = f"no {species}: object {', '.join(map(str, strangers))} of its masks" if strangers else ""
+        notes = (note, outside, str(facts.get("note", "")), _odd_animal(facts), told)
         video = Video(
-            title=str(files[0].parent), name=case, species=str(facts.get("species", sequence)), fps=FPS,
+            title=str(files[0].parent), name=case, species=case if object_id in strangers else species, fps=FPS,
             licence=LICENCE, identity=files_identity(*files, *own.files, *used.files) + f" {object_id}", size=size,
             moments=tuple(Moment(file.name, i / FPS, joints.get(file.stem)) for i, file in enumerate(files)),
             images=partial(read_images, files, size),
-            masks=partial(read_masks, used, object_id if object_id in used.ids else None, every, size),
+            masks=partial(read_masks, used, object_id, every, size),
             true_masks=partial(read_masks, own, object_id, every, size) if given or self.parts != "all" else None,
             notes=tuple(text for text in notes if text),
         )  # fmt: skip
@@ -180,22 +191,48 @@ class Davis:
                 return open_masks(match_masks(found, [file.stem for file in files], folder)[0])
         return MaskFiles((None,) * len(files), ())
 
-    def _given_masks(self, sequence: str, files: list[Path]) -> tuple[MaskFiles | None, str]:
+    def _given_masks(self, sequence: str, files: list[Path], object_id: int | None) -> tuple[MaskFiles | None, str]:
+        """Masks of --masks, and a sentence on them; those without object ids are of the one animal of the case.
+
+        Raises:
+            UserError: they hold object ids, but not this one.
+        """
         if self.masks is None:
             return None, ""
         folder = self.masks / sequence
         found, note = match_masks(list_images(folder), [file.stem for file in files], folder)
-        return open_masks(found), f"masks of the input from {folder}" + (f"; {note}" if note else "")
+        masks, note = open_masks(found), f"masks of the input from {folder}" + (f"; {note}" if note else "")
+        if object_id is None or object_id in masks.ids:
+            return masks, note
+        if masks.ids:
+            raise UserError(
+                f"{folder}: expected masks of object {object_id} for the case {sequence}@{object_id}, got those of "
+                f"{', '.join(map(str, masks.ids))} (masks of one animal alone hold 0 and 255)."
+            )
+        return masks, f"{note}; they hold no object ids: all of them is taken as object {object_id}"
 
     def _joints(self, sequence: str, files: list[Path], size: tuple[int, int]) -> tuple[dict[str, Keypoints], str]:
-        """Keypoints by the frame's stem, and a sentence on those that lie outside."""
+        """Keypoints by the frame's stem, and a sentence on what their file holds but is not used."""
+        stems = [file.stem for file in files]
+        own = next((file for file in _badja_files(self.root, sequence) if file.is_file()), None)
         if self.keypoints is not None:
-            stems = [file.stem for file in files]
             found = read_keypoints(self.keypoints, stems, size)
-            known = {stem: points for stem, points in zip(stems, found, strict=True) if points is not None}
-            return known, told_outside(found, size)
-        file = next((f for f in _badja_files(self.root, sequence) if f.is_file()), None)
-        return read_badja(file, size) if file else {}, ""
+        elif own is not None:
+            found = read_badja(own, stems, size)
+        else:
+            return {}, ""
+        known = {stem: points for stem, points in zip(stems, found, strict=True) if points is not None}
+        return known, told_outside(found, size)
+
+    def _strangers(self, case: str) -> list[int]:
+        """Ids of the objects of a case that are known to be no animal of the sequence (`animals` in davis.toml)."""
+        sequence, object_id = self._table[case]
+        facts, masks = known_sequences().get(sequence, {}), self._mask_folder(sequence)
+        # masks from elsewhere may number their objects otherwise
+        if "animals" not in facts or masks is None or not masks.is_relative_to(self.root / _ANNOTATIONS[0]):
+            return []
+        ids = [number for name, number in self._table.values() if name == sequence and object_id in (None, number)]
+        return [number for number in ids if number is not None and number not in facts["animals"]]
 
 
 _ANNOTATIONS = ("Annotations", "Annotations_unsupervised")
@@ -206,5 +243,5 @@ def _badja_files(root: Path, sequence: str) -> Iterator[Path]:
         yield root / folder / f"{sequence}.json"
 
 
-def _odd_animal(facts: dict[str, str | int | bool]) -> str:
+def _odd_animal(facts: Facts) -> str:
     return "" if facts.get("quadruped", True) else f"a {facts['species']} is no quadruped: no four-legged template fits"

@@ -272,4 +272,12 @@ def _png_fault(data: bytes) -> str:
 def _jpeg_fault(data: bytes) -> str:
     if not data.startswith(b"\xff\xd8"):
         return "a file that is neither PNG nor JPEG" if data else "an empty file"
-    return "" if b"\xff\xd9" in data[-1024:] else f"a JPEG that is cut off after {len(data)} bytes"
+    return "" if b"\xff\xd9" in data[_jpeg_scan(data) :] else f"a JPEG that is cut off after {len(data)} bytes"
+
+
+def _jpeg_scan(data: bytes) -> int:
+    """Where the pixels of a JPEG begin: a thumbnail before them has an end of its own, and a trailer may follow."""
+    position = 2
+    while position + 4 <= len(data) and data[position : position + 2] != b"\xff\xda":
+        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+    return position

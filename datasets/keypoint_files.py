@@ -8,13 +8,26 @@ import csv
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from rewild4d.datasets.keypoints import BADJA_SIZE
+from rewild4d.datasets.entries import (
+    Entry,
+    LeftOut,
+    Unusable,
+    box_of,
+    by_id,
+    image_of,
+    listed,
+    look_up,
+    shown,
+    triples_of,
+)
+from rewild4d.datasets.keypoints import BADJA_SIZE, FoundKeypoints, badja_joints, bounded, inside
 from rewild4d.errors import UserError
 from rewild4d.types import Keypoints
 
@@ -25,7 +38,7 @@ Points = list[tuple[str, float, float, bool]]
 """(name, x, y, visible), pixel centres at +0.5."""
 
 
-def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int]) -> list[Keypoints | None]:
+def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int]) -> FoundKeypoints:
     """Keypoints of the frames of a folder.
 
     Args:
@@ -37,73 +50,95 @@ def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int]) -> l
         One entry per frame; points outside the frame are not visible (`told_outside`).
 
     Raises:
-        UserError: the file is none of these, is broken, or names no frame of the folder.
+        UserError: the file is none of these, is broken, holds no usable keypoints, or names no frame of the folder.
     """
+    left = LeftOut()
     try:
         if path.suffix.lower() == ".csv":
             found = _csv(path.read_text(encoding="utf-8-sig"), stems)
         else:
-            found = _json(json.loads(path.read_text(encoding="utf-8")), size)
+            found = _json(json.loads(path.read_text(encoding="utf-8")), size, left)
     except OSError as error:
         raise UserError(f"{path}: expected a keypoint file, but: {error.strerror}.") from error
-    except (LookupError, TypeError, ValueError, AttributeError, StopIteration, RecursionError, csv.Error) as error:
+    except (
+        LookupError, TypeError, ValueError, ArithmeticError, AttributeError, StopIteration, RecursionError, csv.Error
+    ) as error:  # fmt: skip
         raise UserError(
             f"{path}: expected keypoints as BADJA, COCO, DeepLabCut or SLEAP write them, got others ({error!r})."
         ) from error
-    result = [_checked(found[stem], size) if stem in found else None for stem in stems]
+    wanted = f"expected keypoints of the frames {stems[0]} to {stems[-1]}"
+    faults = "; ".join(left.told())
+    if not any(found.values()):
+        raise UserError(f"{path}: {wanted}, got none{f': {faults}' if faults else ''}.")
+    result = FoundKeypoints(_checked(found[stem], size) if found.get(stem) else None for stem in stems)
     if not any(result):
-        named = ", ".join(list(found)[:3]) or "none"
-        raise UserError(f"{path}: expected keypoints of the frames {stems[0]} to {stems[-1]}, got those of {named}.")
+        raise UserError(
+            f"{path}: {wanted}, got those of {', '.join(list(found)[:3])}{f' ({faults})' if faults else ''}."
+        )
+    result.left_out = f"{path.name}: {faults}" if faults else ""
     return result
 
 
-def told_outside(found: Sequence[Keypoints | None], size: tuple[int, int]) -> str:
-    """A sentence on the points that a file marks as seen but that lie outside their frame; "" where there are none."""
-    limit = torch.tensor(size)
-    count = sum(int(((k.points < 0) | (k.points > limit)).any(dim=1).sum()) for k in found if k is not None)
-    return f"{count} keypoints outside their frame taken as not visible" if count else ""
+def told_outside(found: Iterable[Keypoints | None], size: tuple[int, int]) -> str:
+    """A sentence on what a file holds but is not used; "" where there is no such thing.
+
+    That is: points that it marks as seen but that lie outside their frame, and entries that were left out.
+    """
+    count = sum(int((~inside(keypoints.points, size)).sum()) for keypoints in found if keypoints is not None)
+    outside = f"{count} keypoints outside their frame taken as not visible" if count else ""
+    left_out = found.left_out if isinstance(found, FoundKeypoints) else ""
+    return "; ".join(text for text in (outside, left_out) if text)
 
 
 def _checked(points: Points, size: tuple[int, int]) -> Keypoints:
-    inside = [seen and 0 <= x <= size[0] and 0 <= y <= size[1] for _, x, y, seen in points]
-    places = [(x, y) if seen else (0.0, 0.0) for _, x, y, seen in points]
-    return Keypoints(tuple(name for name, *_ in points), torch.tensor(places), torch.tensor(inside))
+    places = torch.tensor([(x, y) if seen else (0.0, 0.0) for _, x, y, seen in points])
+    return bounded([name for name, *_ in points], places, torch.tensor([seen for *_, seen in points]), size)
 
 
-def _json(content: Any, size: tuple[int, int]) -> dict[str, Points]:
+def _json(content: Any, size: tuple[int, int], left: LeftOut) -> dict[str, Points]:
+    """Points by the stem of their frame; ``left`` gets the entries that cannot be used."""
     if isinstance(content, list):
-        return _badja(content, size)
-    return _coco(content)
+        return dict(left.usable(content, partial(_badja, size=size)))
+    return _coco(content, left)
 
 
-def _badja(entries: list[Mapping[str, Any]], size: tuple[int, int]) -> dict[str, Points]:
+def _badja(entry: Entry, size: tuple[int, int]) -> tuple[str, Points]:
     across, down = size[0] / BADJA_SIZE[0], size[1] / BADJA_SIZE[1]
-    return {
-        Path(entry["image_path"]).stem: [
-            (str(joint), (column + 0.5) * across, (row + 0.5) * down, bool(seen))
-            for joint, ((row, column), seen) in enumerate(zip(entry["joints"], entry["visibility"], strict=True))
-        ]
-        for entry in entries
-    }
+    stem, places, visible = badja_joints(entry)
+    return stem, [
+        (str(joint), column * across, row * down, seen)
+        for joint, ((column, row), seen) in enumerate(zip(places, visible, strict=True))
+    ]
 
 
-def _coco(content: Mapping[str, Any]) -> dict[str, Points]:
+def _coco(content: Any, left: LeftOut) -> dict[str, Points]:
     """The annotation with the largest box of each image."""
-    stems = {image["id"]: _stem(image["file_name"]) for image in content["images"]}
-    names = {category["id"]: category["keypoints"] for category in content["categories"]}
+    images = by_id(listed(content, "images"), "file_name", str)
+    kinds = by_id(listed(content, "categories"), "keypoints", list)
     largest: dict[str, float] = {}
     found: dict[str, Points] = {}
-    for entry in content["annotations"]:
-        stem, box = stems[entry["image_id"]], entry["bbox"]
-        if box[2] * box[3] > largest.get(stem, 0.0):
-            values = entry["keypoints"]
-            triples = zip(values[0::3], values[1::3], values[2::3], strict=True)
-            largest[stem] = box[2] * box[3]
-            found[stem] = [
-                (name, x + 0.5, y + 0.5, v > 0)
-                for name, (x, y, v) in zip(names[entry["category_id"]], triples, strict=True)
-            ]
+    for stem, area, points in left.usable(listed(content, "annotations"), partial(_annotated, images, kinds)):
+        if area > largest.get(stem, 0.0):
+            largest[stem], found[stem] = area, points
     return found
+
+
+def _annotated(images: Mapping[Any, Entry], kinds: Mapping[Any, Entry], entry: Entry) -> tuple[str, float, Points]:
+    """The stem of an annotation's image, the area of its box, and its points.
+
+    Raises:
+        Unusable: one of them is not there.
+    """
+    image, kind = image_of(images, entry), look_up(kinds, entry, "category_id")
+    if kind is None or not kind["keypoints"]:
+        raise Unusable("name a category without names of keypoints", shown(entry, "category_id"))
+    _, _, width, height = box_of(entry)
+    if not (width > 0 and height > 0):
+        raise Unusable("have an empty bbox", shown(entry, "bbox"))
+    names = [str(name) for name in kind["keypoints"]]
+    values = triples_of(entry, len(names))
+    triples = zip(names, values[0::3], values[1::3], values[2::3], strict=True)
+    return _stem(image["file_name"]), width * height, [(name, x + 0.5, y + 0.5, v > 0) for name, x, y, v in triples]
 
 
 def _csv(text: str, stems: Sequence[str]) -> dict[str, Points]:

@@ -2,11 +2,14 @@
 
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
+from rewild4d.datasets.entries import Entry, LeftOut, Unusable, numbers, short, shown
 from rewild4d.errors import UserError
 from rewild4d.types import Crop, Keypoints
 
@@ -42,30 +45,87 @@ def read_json(path: Path) -> Any:
         raise UserError(f"{path}: expected JSON, but it cannot be parsed ({error}).") from error
 
 
-def read_badja(path: Path, size: tuple[int, int]) -> dict[str, Keypoints]:
-    """BADJA's joints of one sequence, by the stem of the frame.
+class FoundKeypoints(list[Keypoints | None]):
+    """Of each frame of a video.
+
+    Attributes:
+        left_out: a sentence on the entries of the file that could not be used; "" where there are none.
+    """
+
+    left_out = ""
+
+
+def badja_joints(entry: Entry) -> tuple[str, list[tuple[float, float]], list[bool]]:
+    """An entry of BADJA's: the stem of its frame, and (column, row) and visibility of every joint.
+
+    Places are in a frame of `BADJA_SIZE`, pixel centres at +0.5.
+
+    Raises:
+        Unusable: one of them is not there, or they do not fit each other.
+    """
+    path, joints, visible = entry.get("image_path"), entry.get("joints"), entry.get("visibility")
+    if not isinstance(path, str):
+        raise Unusable("have no image_path", shown(entry, "image_path"))
+    if not isinstance(joints, list) or not joints:
+        raise Unusable("have no joints", shown(entry, "joints"))
+    if not isinstance(visible, list) or len(visible) != len(joints):
+        raise Unusable("have no visibility for each joint", shown(entry, "visibility"))
+    places = [numbers(joint) for joint in joints]
+    wrong = next((number for number, place in enumerate(places) if len(place) != 2), None)
+    if wrong is not None:
+        raise Unusable("have a joint that is no pair of numbers", f"joint {wrong} {short(joints[wrong])}")
+    return Path(path).stem, [(column + 0.5, row + 0.5) for row, column in places], [bool(value) for value in visible]
+
+
+def bounded(names: Sequence[str], points: Tensor, seen: Tensor, size: tuple[int, int]) -> Keypoints:
+    """Keypoints of which those outside their frame are not visible.
+
+    Args:
+        names: [n].
+        points: (column, row) in pixels, [n, 2].
+        seen: which of them the file says are visible, bool, [n].
+        size: width and height of the frame.
+    """
+    return Keypoints(tuple(names), points, seen & inside(points, size))
+
+
+def inside(points: Tensor, size: tuple[int, int]) -> Tensor:
+    """Which points lie in their frame, bool, [n]; one that is not finite does not."""
+    return ((points >= 0) & (points <= torch.tensor(size))).all(dim=1)
+
+
+def read_badja(path: Path, stems: Sequence[str], size: tuple[int, int]) -> FoundKeypoints:
+    """BADJA's joints of one sequence, those outside the frame not visible (`told_outside`).
 
     Args:
         path: joint_annotations/<sequence>.json.
+        stems: of the frames that are used, in order.
         size: width and height of the frames that are used.
 
     Raises:
         UserError: no such file, or not what BADJA writes.
     """
-    found = {}
-    try:
-        for entry in read_json(path):
-            joints, visible = entry["joints"], entry["visibility"]
-            points = [(joints[i][1], joints[i][0]) for i in BADJA]
-            scale = torch.tensor((size[0] / BADJA_SIZE[0], size[1] / BADJA_SIZE[1]))
-            seen = torch.tensor([bool(visible[i]) for i in BADJA])
-            centres = (torch.tensor(points, dtype=torch.float32) + 0.5) * scale
-            found[Path(entry["image_path"]).stem] = Keypoints(tuple(BADJA.values()), centres, seen)
-    except (KeyError, TypeError, IndexError, AttributeError, ValueError) as error:
-        raise UserError(
-            f"{path}: expected BADJA's list of image_path, joints[37] and visibility[37], got another ({error!r})."
-        ) from error
+    content, left = read_json(path), LeftOut()
+    named = {}
+    if isinstance(content, list):
+        named = dict(left.usable(content, partial(_named_joints, size=size)))
+    if not named:
+        reasons = "; ".join(left.told()) or "no list of such"
+        raise UserError(f"{path}: expected BADJA's list of image_path, joints[37] and visibility[37], got {reasons}.")
+    found = FoundKeypoints(named.get(stem) for stem in stems)
+    found.left_out = "; ".join(f"{path.name}: {sentence}" for sentence in left.told())
     return found
+
+
+def _named_joints(entry: Entry, size: tuple[int, int]) -> tuple[str, Keypoints]:
+    stem, places, visible = badja_joints(entry)
+    if len(places) <= max(BADJA):
+        raise Unusable("have fewer joints than 37", f"{len(places)} joints")
+    scale = torch.tensor((size[0] / BADJA_SIZE[0], size[1] / BADJA_SIZE[1]))
+    points, seen = torch.tensor([places[i] for i in BADJA]) * scale, torch.tensor([visible[i] for i in BADJA])
+    # a joint that nobody saw may lie anywhere, which nobody need be told
+    points[~seen & ~inside(points, size)] = 0.0
+    return stem, bounded(tuple(BADJA.values()), points, seen, size)
 
 
 def coco_keypoints(values: Sequence[float], names: Sequence[str], size: tuple[int, int]) -> tuple[Keypoints, int]:
@@ -78,16 +138,11 @@ def coco_keypoints(values: Sequence[float], names: Sequence[str], size: tuple[in
 
     Returns:
         The keypoints and how many lay outside the image.
-
-    Raises:
-        ValueError: another count of numbers.
     """
-    if len(values) != 3 * len(names):
-        raise ValueError(f"expected {3 * len(names)} numbers for {len(names)} keypoints, got {len(values)}")
     table = torch.tensor(values, dtype=torch.float32).reshape(len(names), 3)
-    points, marked = table[:, :2] + 0.5, table[:, 2] > 0
-    inside = ((points >= 0) & (points <= torch.tensor(size))).all(dim=1) & torch.isfinite(points).all(dim=1)
-    return Keypoints(tuple(names), points, marked & inside), int((marked & ~inside).sum())
+    seen = table[:, 2] > 0
+    found = bounded(names, table[:, :2] + 0.5, seen, size)
+    return found, int((seen & ~found.visible).sum())
 
 
 def in_crop(keypoints: Keypoints | None, crop: Crop, size: int) -> Keypoints | None:

@@ -25,6 +25,8 @@ BLACK = 31
 """Colours without a channel above this are background: a JPEG's black is not quite black."""
 NOISE = 0.04
 """Parts smaller than this share of the largest one do not widen the animal's box."""
+FILM_TINT = 40
+"""Largest difference of two channels where a film of masks is grey: compression tints it."""
 CUT_SHARE = 0.1
 """The animal is cut where it touches the image's border along more than this share of its shorter side."""
 
@@ -159,9 +161,18 @@ def _opened(file: Path, what: str = "a mask image") -> Iterator[Image.Image]:
 def _from_channels(values: np.ndarray, mode: str) -> np.ndarray:
     if mode in ("LA", "RGBA", "PA") and values[..., -1].min() < values[..., -1].max():
         return values[..., -1]
-    colors = values[..., :3] if mode in ("RGB", "RGBA") else values[..., :1]
-    if (colors == colors[..., :1]).all():
-        return np.ascontiguousarray(colors[..., 0])
+    return shades(values[..., :3] if mode in ("RGB", "RGBA") else values[..., :1])
+
+
+def shades(colors: np.ndarray, tint: int = 0) -> np.ndarray:
+    """The mask that colours mean: grey is a shade, any other colour the foreground unless nearly black.
+
+    Args:
+        colors: uint8, [h, w, 3] or [h, w, 1].
+        tint: channels that differ by no more are grey.
+    """
+    if not (np.ptp(colors, axis=2) > tint).any():
+        return colors.max(axis=2)
     return np.where(colors.max(axis=2) > BLACK, 255, 0).astype(np.uint8)
 
 
@@ -238,7 +249,7 @@ def match_masks(masks: Sequence[Path], stems: Sequence[str], folder: Path) -> tu
         folder: of the masks, for messages.
 
     Returns:
-        A file or None for each frame, and a sentence where names did not settle it ("" where they did).
+        A file or None for each frame, and a sentence where names did not settle it or masks are left over ("" else).
 
     Raises:
         UserError: no mask, or masks that fit no frame.
@@ -250,19 +261,30 @@ def match_masks(masks: Sequence[Path], stems: Sequence[str], folder: Path) -> tu
     numbers = [number for stem in stems if (number := _number(stem)) is not None]
     counted = len(by_number) == len(masks) and len({*numbers}) == len(stems)
     shift = min(by_number) - min(numbers) if counted else 0
-    if abs(shift) == 1 and len(masks) == len(stems) and {number + shift for number in numbers} == {*by_number}:
+    # Numbers that fit no frame as they are, and all fit one by one: counted from 1 beside frames from 0, or vice versa.
+    if abs(shift) == 1 and not {*by_number} <= {*numbers} and {mask - shift for mask in by_number} <= {*numbers}:
         note = f"masks are numbered from {min(by_number)}, frames from {min(numbers)}"
-        return [by_number[number + shift] for number in numbers], note
+        return [by_number.get(number + shift) for number in numbers], note
     if any(stem in by_name for stem in stems):
-        return [by_name.get(stem) for stem in stems], ""
+        found = [by_name.get(stem) for stem in stems]
+        return found, _left_over(masks, found)
     if counted and any(number in by_number for number in numbers):
-        return [by_number.get(number) for number in numbers], ""
+        found = [by_number.get(number) for number in numbers]
+        return found, _left_over(masks, found)
     if len(masks) == len(stems):
         return list(masks), f"masks and frames share no names: matched in order, {masks[0].name} first"
     raise UserError(
         f"{folder}: expected masks named like the frames ({stems[0]}, ...) or one for each of the {len(stems)} frames, "
         f"got {len(masks)} ({masks[0].name}, ...)."
     )
+
+
+def _left_over(masks: Sequence[Path], found: Sequence[Path | None]) -> str:
+    """A sentence on the masks that fit no frame; "" where there are none."""
+    rest = [mask.name for mask in masks if mask not in {*found}]
+    if not rest:
+        return ""
+    return f"{len(rest)} of {len(masks)} masks fit no frame: {', '.join(rest[:3])}{', ...' if len(rest) > 3 else ''}"
 
 
 def _number(stem: str) -> int | None:

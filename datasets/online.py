@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from rewild4d.contracts import Finding, Selection
+from rewild4d.datasets import masks as mask_files
 from rewild4d.datasets.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
 from rewild4d.datasets.keypoint_files import read_keypoints, told_outside
 from rewild4d.datasets.mask_check import check_videos
@@ -332,8 +333,10 @@ def _picked(frames: Iterator[np.ndarray], indices: Sequence[int]) -> Iterator[np
 
 def _mask_stream(path: Path, indices: Sequence[int], size: tuple[int, int], alpha: bool) -> Iterator[np.ndarray | None]:
     for frame in _picked(read_video(path), indices):
-        values = frame[..., 3] if alpha else frame[..., :3].max(axis=2)
-        yield fit_size(np.ascontiguousarray(values), size, str(path))
+        values = (
+            np.ascontiguousarray(frame[..., 3]) if alpha else mask_files.shades(frame[..., :3], mask_files.FILM_TINT)
+        )
+        yield fit_size(values, size, str(path))
 
 
 def _file_alpha(file: Path, size: tuple[int, int]) -> np.ndarray | None:

@@ -182,10 +182,9 @@ def usable(
 
 
 def original_images(video: Video, selection: Selection) -> Iterator[np.ndarray]:
-    """The whole frames that the clip's images were cut from, in its order, uint8 [h, w, 3]; none that is held out."""
-    layout, _ = _laid_out(video, selection)
-    shown = {index for index, tested in zip(layout.used, layout.tested, strict=True) if not tested}
-    return (image for index, image in enumerate(video.images()) if index in shown)
+    """The whole frames that the images were cut from, held-out ones too, in the order of time, uint8 [h, w, 3]."""
+    used = {*_laid_out(video, selection)[0].used}
+    return (image for index, image in enumerate(video.images()) if index in used)
 
 
 def _laid_out(video: Video, selection: Selection) -> tuple[Layout, Path]:

@@ -64,7 +64,8 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         networks: SHA-256 of the weights of the metric networks that scores leaned on.
         features: SHA-256 of what `metrics.sets.FILE` beside the record holds: the features that ``distances`` were
             computed from, for scores pooled over cases; "" where there is no such file.
-        diagnostics: what the method says of itself (Gaussians, joint motion, ...).
+        diagnostics: what the method says of itself (Gaussians, joint motion, ...), and ``input_psnr_db``, the mean PSNR
+            of the frames that it was shown, full frame, dB: a fit, not a score.
         marks: what a table has to say beside the numbers, such as "upper bound: ..."; such rows compete with nobody.
         pictures: files written beside the record, relative to it.
         machine: see `rewild4d.machine.machine`; records from before there was a choice do not name the rasterizer.

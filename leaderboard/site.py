@@ -188,8 +188,8 @@ def _provenance(record: RunRecord) -> list[tuple[str, list[tuple[str, str]]]]:
     parts = {
         "Settings of the method": record.config, "Data": record.data, "Prior": record.prior,
         "Protocol": record.protocol, "What the numbers lean on": record.coverage,
-        "What the method says of itself": record.diagnostics, "Networks of the metrics": record.networks,
-        "Code": record.code, "Machine": record.machine,
+        "What the method says of itself, and how it fits its input": record.diagnostics,
+        "Networks of the metrics": record.networks, "Code": record.code, "Machine": record.machine,
         "Time": {"started": record.timing.started, "fit, s": record.timing.fit_seconds,
                  "evaluation, s": record.timing.evaluate_seconds, "peak memory, MiB": record.timing.peak_memory_mib},
     }  # fmt: skip

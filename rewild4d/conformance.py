@@ -19,9 +19,10 @@ from rewild4d.files import digest
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.motion import pose_at, pose_gaussians, quats_from_normals, sample_surface
 from rewild4d.priors.template import MIRROR, PARENTS, quadruped
+from rewild4d.progress import Progress
 from rewild4d.protocol import render
 from rewild4d.registry import load_method
-from rewild4d.runner import Progress, save_reconstruction
+from rewild4d.runner import save_reconstruction
 from rewild4d.transforms import (
     camera_in_object,
     look_at,

@@ -164,9 +164,9 @@ class Finding:
 class DatasetReader(Protocol):
     """Reads one dataset folder into clips and truths.
 
-    It may have more: ``originals(case, selection)``, the whole frames that the images of the clip were cut from, in the
-    clip's order, uint8 [h, w, 3] each, one after the other; for pictures of a finished run, never for a method;
-    ``default_cases(selection)``, what is run where no case is named; ``settings``, options for the record.
+    It may have more: ``originals(case, selection)``, the whole frames that the images of the clip and of the truth were
+    cut from, in the order of time, uint8 [h, w, 3] each, one after the other; for pictures of a finished run, never for
+    a method; ``default_cases(selection)``, what is run where no case is named; ``settings``, options for the record.
     """
 
     licence: str

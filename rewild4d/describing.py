@@ -7,6 +7,7 @@ import msgspec
 
 from rewild4d.contracts import DatasetReader, Reconstruction
 from rewild4d.priors.choose import PriorChoice
+from rewild4d.protocol import input_psnr
 from rewild4d.registry import load_method
 from rewild4d.types import Clip, Prior
 
@@ -52,10 +53,17 @@ def keypoints(choice: PriorChoice, clip: Clip) -> dict[str, str]:
     return {"keypoints": choice.use, "mapping": choice.mapping}
 
 
-def diagnostics(reconstruction: Reconstruction) -> dict[str, Any]:
-    """What the method says of its result, if it does."""
+def diagnostics(reconstruction: Reconstruction, shown: Clip, background: float) -> dict[str, Any]:
+    """What the method says of its result, if it does, and how closely that fits what the method was shown.
+
+    Args:
+        reconstruction: of the clip.
+        shown: what the method saw.
+        background: of the protocol.
+    """
     describe = getattr(reconstruction, "diagnostics", None)
-    return describe() if describe else {}
+    fits = input_psnr(reconstruction, shown, background)
+    return (describe() if describe else {}) | {"input_psnr_db": fits.value}
 
 
 def inputs(method: str, config: msgspec.Struct, case: str) -> dict[str, str]:

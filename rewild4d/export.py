@@ -2,7 +2,7 @@
 
 ply/00000.ply ...   the Gaussians of each frame in the INRIA layout, in the world
 animated.glb        the canonical Gaussians as coloured squares, their skeleton and its motion, in the world
-cameras.json        the camera of each frame, and which square of the original frame it shows
+cameras.json        time and camera of each frame, one row a .ply, and which square of the original frame it shows
 input_view.mp4, orbit.mp4
 """
 

@@ -30,7 +30,7 @@ SHEET_WIDTH = 360
 
 
 def original_frames(reader: DatasetReader, clip: Clip, selection: Selection) -> Iterable[np.ndarray] | None:
-    """The whole frames that a clip was cut from, where its reader has them; for pictures, never for a method."""
+    """The whole frames that a clip and its truth were cut from, where the reader has them; never for a method."""
     read = getattr(reader, "originals", None)
     return None if read is None else read(clip.name, selection)
 
@@ -42,7 +42,7 @@ def save_original_view(
 
     Args:
         reconstruction: of the clip.
-        clip: crops of a video; of another clip nothing is written.
+        clip: crops of a video, with the held-out moments (`recropping.all_moments`); of other data nothing is written.
         originals: the whole frames in the clip's order, uint8 [h, w, 3]; None: the render is laid on white alone.
         folder: of the run.
 

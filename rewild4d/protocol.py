@@ -208,6 +208,23 @@ def evaluate(
     return Evaluation({name: scores[name] for name in protocol.scores}, items, distances, alignments, used, compared)
 
 
+@torch.no_grad()
+def input_psnr(reconstruction: Reconstruction, shown: Clip, background: float) -> Score:
+    """PSNR of the frames that the method was shown, over the full frame: how closely it fits them, which tells nothing
+    of what it was not shown, and beside the held-out PSNR whether it lacks freedom or evidence.
+
+    Args:
+        reconstruction: of the clip.
+        shown: what the method saw, with cameras where the reconstruction knows none.
+        background: grey level in [0, 1] behind prediction and truth alike.
+    """
+    values: list[float | None] = []
+    for batch in _batches(shown.frames, 16):
+        beside = _beside(batch, list(_render_frames(reconstruction, batch)), background)
+        values += image_scores.measure("psnr", beside, {})
+    return image_scores.summarize("psnr", values)
+
+
 def _families(scores: Iterable[str]) -> list[str]:
     """The networks that scores need, by the names of `scoring.load_networks`."""
     found = set()
@@ -261,7 +278,7 @@ def _render_frames(reconstruction: Reconstruction, frames: Iterable[Frame]) -> I
             yield torch.zeros_like(frame.rgb), torch.zeros_like(frame.mask)
         else:
             raise UserError(
-                f"the held-out frame at {frame.time:.4f} s needs a camera, but neither the data set nor the "
+                f"the frame at {frame.time:.4f} s needs a camera, but neither the data set nor the "
                 "reconstruction knows it."
             )
 

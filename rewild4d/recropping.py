@@ -48,6 +48,19 @@ def recropped(camera: Camera, shown: Clip, frame: Frame) -> Camera:
     return frame.crop.cropped_camera(expected.original_camera(camera), camera.width)
 
 
+def all_moments(clip: Clip, truth: Truth) -> Clip:
+    """A video with its held-out moments in their places: for files and films of a finished run, never for a method.
+
+    Args:
+        clip: of a video; of other data, whose held-out views add no moments, it is returned as it is.
+        truth: its held-out frames.
+    """
+    if any(frame.crop is None for frame in clip.frames):
+        return clip
+    frames = sorted((*clip.frames, *truth.held_out), key=lambda frame: frame.time)
+    return replace(clip, frames=tuple(frames), travel=None)
+
+
 def seen_by(reconstruction: Reconstruction, clip: Clip, truth: Truth, shown: Clip) -> tuple[Clip, Truth]:
     """A clip and its truth with the reconstruction's cameras wherever the data set has none and the method knows one.
 

@@ -7,18 +7,16 @@ import shutil
 import sys
 import time
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from operator import itemgetter
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import msgspec
 import torch
-from tqdm import tqdm
 
 from rewild4d import describing
 from rewild4d.contracts import DatasetReader, Reconstruction
@@ -30,6 +28,7 @@ from rewild4d.machine import code_of, machine, peak_memory_mib
 from rewild4d.original_view import original_frames
 from rewild4d.priors.choose import PriorChoice, make_prior
 from rewild4d.priors.placing import known_frames, with_cameras
+from rewild4d.progress import Progress
 from rewild4d.protocol import Protocol, evaluate, may_be_scored_now
 from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.recropping import seen_by
@@ -74,30 +73,6 @@ class Plan:
     rasterizer: str = "auto"
 
 
-class Progress:
-    """A contracts.Log that shows a bar on standard error and appends every line to a file."""
-
-    def __init__(self, title: str, path: Path | None = None):
-        self.bar: tqdm | None = None
-        self.title, self.path = title, path
-
-    def __call__(self, step: int, total: int, values: Mapping[str, float] = MappingProxyType({})) -> None:
-        if self.bar is None:
-            pause = 0.5 if sys.stderr.isatty() else 10.0
-            self.bar = tqdm(desc=self.title, total=total, file=sys.stderr, mininterval=pause)
-        self.bar.total = total
-        self.bar.update(step - self.bar.n)
-        if values:
-            self.bar.set_postfix({key: f"{value:.4g}" for key, value in values.items()}, refresh=False)
-            if self.path is not None:
-                with self.path.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps({"step": step, **values}) + "\n")
-
-    def close(self) -> None:
-        if self.bar is not None:
-            self.bar.close()
-
-
 def choose_cases(names: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]:
     """The cases that any of the wanted names or patterns ("wolf/*") names; all where none is given.
 
@@ -113,16 +88,14 @@ def choose_cases(names: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]
 def execute(plan: Plan) -> list[RunRecord]:
     """Run all that the plan lists and has no finished record; give every record, in the plan's order.
 
-    A run that fails leaves a record with its message and does not stop the others.
+    A run that fails leaves a record with its message and does not stop the others; nor does a case that cannot be read,
+    which has no records.
 
     Raises:
-        UserError: data that cannot be read or a rasterizer that cannot be used, before anything is fitted.
+        UserError: none of the cases can be read or the rasterizer cannot be used, before anything is fitted.
     """
-    plan = replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device))
+    plan = _readable(replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device)))
     plan.out.mkdir(parents=True, exist_ok=True)
-    for name in plan.cases:
-        for note in plan.reader.load(name, plan.protocol.selection)[0].notes:
-            print(f"{name}: {note}", file=sys.stderr)
     parts = [(name, entry, seed) for name in plan.cases for entry in plan.entries for seed in entry.seeds]
     floors = [entry.method in plan.protocol.floors for _, entry, _ in parts]
     # A floor is done at once, unless sets of novel views are scored: those take minutes of every row.
@@ -145,9 +118,29 @@ def execute(plan: Plan) -> list[RunRecord]:
         return [record for _, record in sorted(zip(order, made, strict=True), key=itemgetter(0))]
 
 
+def _readable(plan: Plan) -> Plan:
+    """The plan without the cases that cannot be read; notes and faults are told.
+
+    Raises:
+        UserError: none can be read.
+    """
+    notes: list[str] = []
+    faults: dict[str, UserError] = {}
+    for name in plan.cases:
+        try:
+            notes += [f"{name}: {note}" for note in plan.reader.load(name, plan.protocol.selection)[0].notes]
+        except UserError as error:
+            faults[name] = error
+    if faults and len(faults) == len(plan.cases):
+        raise next(iter(faults.values()))
+    for line in (*notes, *(f"{name}: left out: {error}" for name, error in faults.items())):
+        print(line, file=sys.stderr)
+    return replace(plan, cases=tuple(name for name in plan.cases if name not in faults))
+
+
 def pieces(plan: Plan) -> list["Job"]:
-    """All that the plan lists, in its order, finished or not; nothing is run."""
-    plan = replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device))
+    """All that the plan lists and can be read, in its order, finished or not; nothing is run."""
+    plan = _readable(replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device)))
     return [job for name in plan.cases for job in _jobs(plan, name, *plan.reader.load(name, plan.protocol.selection))]
 
 
@@ -253,7 +246,7 @@ class Job:
             )  # fmt: skip
             record = self._record(
                 case, "ok", "", **found.keep(self.folder), coverage=seen, pictures=pictures,
-                diagnostics=describing.diagnostics(reconstruction),
+                diagnostics=describing.diagnostics(reconstruction, case.clip, self.plan.protocol.background),
                 marks=describing.marks(self.entry.method, self.plan.prior.name, reconstruction),
                 timing=self._timing(fit_seconds, seconds),
             )  # fmt: skip

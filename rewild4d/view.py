@@ -12,6 +12,7 @@ from rewild4d.contracts import Reconstruction
 from rewild4d.novel_views import input_camera
 from rewild4d.original_view import save_original_view
 from rewild4d.pictures import PANEL, beside, film_rate, header, over, save_mp4, save_png, widen
+from rewild4d.recropping import all_moments
 from rewild4d.transforms import look_at
 from rewild4d.turntable import find_stance, four_views, turn
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Splats, Truth
@@ -34,7 +35,7 @@ def save_pictures(
     input.mp4       input beside render, in the input view
     orbit.mp4       one turn around the moving animal, upright
     orbit.png       the animal from four sides
-    original.mp4    original frame beside the render over its background (crops of a video)
+    original.mp4    original frame beside the render over its background, held-out frames too (crops of a video)
     original.png    the same at six moments
 
     Args:
@@ -42,8 +43,8 @@ def save_pictures(
         clip: what the method saw.
         truth: what it did not see.
         folder: of the run.
-        originals: the whole frames that the clip's images were cut from, uint8 [h, w, 3], in its order; None: the
-            renders in the original frame are laid on white.
+        originals: the whole frames that the images of both were cut from, uint8 [h, w, 3], in the order of time; None:
+            the renders in the original frame are laid on white.
     """
     names = ["comparison.png", "input.mp4", "orbit.mp4", "orbit.png"]
     save_png(comparison(reconstruction, clip, truth), folder / names[0])
@@ -52,7 +53,7 @@ def save_pictures(
     stance = find_stance(reconstruction, clip, truth.up)
     save_mp4(turn(reconstruction, clip, stance), folder / names[2], fps)
     save_png(four_views(reconstruction, clip, stance), folder / names[3])
-    names += save_original_view(reconstruction, clip, originals, folder)
+    names += save_original_view(reconstruction, all_moments(clip, truth), originals, folder)
     if hasattr(reconstruction, "canonical") and hasattr(reconstruction, "weights"):
         save_png(canonical(reconstruction.canonical(), reconstruction.weights), folder / "canonical.png")
         names.append("canonical.png")

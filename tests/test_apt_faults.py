@@ -10,22 +10,71 @@ from test_wild import SELECTION, cache  # noqa: F401
 from rewild4d.datasets.aptv2 import AptV2
 from rewild4d.errors import UserError
 
+FAULTS: list[tuple[dict[str, object], str, str]] = [
+    ({"image_id": 5000}, "name an image that is not listed", "image_id 5000"),
+    ({"image_id": [1]}, "name an image that is not listed", "image_id [1]"),
+    ({"bbox": [200, 200, 5, 5]}, "have no box inside their image", "bbox [200, 200, 5, 5]"),
+    ({"bbox": [float("nan"), 0, 5, 5]}, "have no box inside their image", "bbox [NaN, 0, 5, 5]"),
+    ({"bbox": None}, "have no bbox of four numbers", "bbox null"),
+    ({"bbox": [10**400, 0, 5, 5]}, "have no bbox of four numbers", "bbox [100000"),
+    ({"keypoints": [1, 2]}, "have other keypoints than 51 numbers", "keypoints [1, 2]"),
+    ({"track_id": None}, "have no whole number as track_id", "track_id null"),
+    ({"track_id": 3.5}, "have no whole number as track_id", "track_id 3.5"),
+]
 
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"image_id": 5000}, "12 of 12 annotations name an image that is not listed"),
-        ({"bbox": [200, 200, 5, 5]}, "12 of 12 annotations have no box inside their image"),
-        ({"keypoints": [1, 2]}, "expected COCO-like annotations, but an entry does not fit"),
-        ({"bbox": [float("nan"), 0, 5, 5]}, "12 of 12 annotations have no box inside their image"),
-        ({"bbox": None}, "expected COCO-like annotations, but an entry does not fit"),
-    ],
-)
-def test_wrong_annotations(change: dict[str, object], sentence: str, tmp_path: Path) -> None:
+
+@pytest.mark.parametrize(("change", "what", "got"), FAULTS)
+def test_annotations_that_are_all_wrong(change: dict[str, object], what: str, got: str, tmp_path: Path) -> None:
     reader = AptV2(moving.apt(tmp_path, **change))
     with pytest.raises(UserError) as error:
         reader.cases(SELECTION)
-    assert sentence in str(error.value)
+    told = f"train_annotations.json: 12 of 12 annotations {what} and are left out; the first (id 100) has {got}"
+    assert told in str(error.value)
+
+
+def one_entry_changed(root: Path, change: dict[str, object], remove: str = "") -> AptV2:
+    """A reader of annotations whose entry with id 104 is another; a key of it can be taken away."""
+    file = moving.apt(root) / "annotations" / "train_annotations.json"
+    table = json.loads(file.read_text())
+    table["annotations"][4] |= change
+    table["annotations"][4].pop(remove, None)
+    file.write_text(json.dumps(table))
+    return AptV2(root)
+
+
+@pytest.mark.parametrize(("change", "what", "got"), FAULTS)
+def test_one_wrong_annotation_is_left_out_and_told(
+    change: dict[str, object], what: str, got: str, tmp_path: Path
+) -> None:
+    reader = one_entry_changed(tmp_path, change)
+    assert reader.cases(SELECTION) == ["easy/29wolf/v1C1@3"]
+    clip, truth = reader.load("easy/29wolf/v1C1@3", SELECTION)
+    assert len(clip.frames) + len(truth.held_out) == 11
+    group = "of 12 annotations" if "image_id" in change else "annotations of easy/29wolf/v1C1"
+    told = f"train_annotations.json: 1 {group} {what} and are left out; the first (id 104) has {got}"
+    assert any(note.startswith(told) for note in clip.notes)
+    assert any(
+        finding.message.startswith(f"train_annotations.json: 1 of 12 annotations {what}") for finding in reader.check()
+    )
+
+
+@pytest.mark.parametrize("key", ["track_id", "bbox", "image_id"])
+def test_an_annotation_that_lacks_something_is_filed_nowhere(key: str, tmp_path: Path) -> None:
+    reader = one_entry_changed(tmp_path, {}, remove=key)
+    assert reader.cases(SELECTION) == ["easy/29wolf/v1C1@3"]
+    assert any(f"the first (id 104) has no {key}" in note for note in reader.video("easy/29wolf/v1C1@3").notes)
+
+
+def test_annotations_that_are_no_objects(tmp_path: Path) -> None:
+    file = moving.apt(tmp_path) / "annotations" / "train_annotations.json"
+    table = json.loads(file.read_text())
+    file.write_text(json.dumps(table | {"annotations": [None, *table["annotations"]]}))
+    told = "1 of 13 annotations are no objects with named values and are left out; the first (number 0) has null"
+    assert any(told in note for note in AptV2(tmp_path).video("easy/29wolf/v1C1@3").notes)
+    for change in ({"images": 5}, {"annotations": None}, {"categories": 5}):
+        file.write_text(json.dumps(table | change))
+        with pytest.raises(UserError, match=f"expected COCO-like annotations, got no list called {next(iter(change))}"):
+            AptV2(tmp_path).cases(SELECTION)
 
 
 def test_annotations_without_tracks(tmp_path: Path) -> None:
@@ -64,7 +113,8 @@ def test_images_of_another_size_than_their_annotations_state(tmp_path: Path) -> 
 
 
 def test_an_image_of_infinite_width(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="expected COCO-like annotations, but an entry does not fit .OverflowError"):
+    sentence = "12 of 12 annotations name an image without width and height .* has image_id 0 with width Infinity"
+    with pytest.raises(UserError, match=sentence):
         resized(tmp_path, float("inf"), 64).cases(SELECTION)
 
 
@@ -78,3 +128,12 @@ def test_keypoints_outside_the_frame_are_not_visible(tmp_path: Path) -> None:
 def test_an_apt_clip_without_masks(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="expected masks of easy/29wolf/v1C1@3 .*`rewild4d-bench masks` makes some"):
         AptV2(moving.apt(tmp_path, with_masks=False)).load("easy/29wolf/v1C1@3", SELECTION)
+
+
+def test_masks_of_other_tracks_are_told(tmp_path: Path) -> None:
+    reader = AptV2(moving.apt(tmp_path))
+    for i in range(12):
+        values = moving.mask(i) // 255 + 2 * (moving.mask(i, left=65) // 255)
+        moving.save(tmp_path / "masks" / "easy/29wolf/v1C1" / f"{i:04d}_3.png", values.clip(0, 2), "P")
+    told = "masks hold objects 1, 2, none of them track 3: taken together"
+    assert told in reader.video("easy/29wolf/v1C1@3").notes

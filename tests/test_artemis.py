@@ -21,7 +21,9 @@ from rewild4d.datasets.artemis_files import (
     read_parents,
 )
 from rewild4d.datasets.artemis_volume import is_surface, lattice
+from rewild4d.datasets.images import read_rgb
 from rewild4d.datasets.selection import placed_view, selected_views, up_direction
+from rewild4d.errors import UserError
 from rewild4d.types import Frame
 
 SWEEP = Selection(cameras="sweep", size=WIDTH)
@@ -248,6 +250,21 @@ def test_jpeg_and_matte_of_another_mode(animal: Path) -> None:
     torch.testing.assert_close(after.frames[0].mask, before.frames[0].mask)
     assert (after.frames[0].rgb - before.frames[0].rgb).abs().mean() < 0.01
     assert after.digest != before.digest
+
+
+def test_a_jpeg_is_whole_where_its_pixels_end(tmp_path: Path) -> None:
+    """A phone's trailer hides the end, and that of a thumbnail stands before it."""
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    whole, small = (cv2.imencode(".jpg", image)[1].tobytes() for image in (noise, noise[:16, :16]))
+    thumbed = whole[:2] + b"\xff\xe1" + (len(small) + 2).to_bytes(2, "big") + small + whole[2:]
+    file = tmp_path / "image.jpg"
+    for data in (whole, whole + bytes(5000), thumbed):
+        file.write_bytes(data)
+        assert (read_rgb(file) == cv2.imdecode(np.frombuffer(whole, np.uint8), 1)[..., ::-1]).all()
+    for data in (whole[:-200], thumbed[:-200]):
+        file.write_bytes(data)
+        with pytest.raises(UserError, match="image.jpg: expected a whole image, got a JPEG that is cut off after"):
+            read_rgb(file)
 
 
 def test_digests_depend_on_content_and_not_on_the_place(animal: Path, tmp_path: Path) -> None:

@@ -106,6 +106,9 @@ def test_the_command_makes_masks_that_run_reads(tmp_path: Path, capsys: pytest.C
     assert "12 masks by 'rough', 0 of them without the animal" in capsys.readouterr().out
     clip, truth = Online(tmp_path / "clip", masks=tmp_path / "m").load("clip", SELECTION)
     assert len(clip.frames) + len(truth.held_out) == 12
+    with pytest.raises(SystemExit):
+        cli.main([*words, "--end", "0.2"])  # six frames at 25 a second
+    assert "it holds 6 other masks, which readers take too: remove them?" in capsys.readouterr().err
     for words, sentence in (
         (["--tool", "rogh"], "unknown tool 'rogh'. Did you mean 'rough'?"),
         (["--tool", "program"], "--command: expected a command line with {frames} and {masks} in it, got none"),

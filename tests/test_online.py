@@ -73,6 +73,10 @@ def test_a_video_of_masks(walk: Path, tmp_path: Path) -> None:
     matte = moving.film(tmp_path / "matte.mp4", walk / "masks", *H264)
     clip, truth = load(film, masks=matte)
     assert iou(restored(whole(clip, truth)[5], moving.SIZE), moving.mask(5) > 0) > 0.9
+    for i in range(12):
+        moving.save(tmp_path / "red" / f"{i:05d}.png", moving.mask(i)[..., None] // 255 * np.uint8((128, 0, 0)))
+    clip, truth = load(film, masks=moving.film(tmp_path / "red.mp4", tmp_path / "red", *H264))
+    assert iou(restored(whole(clip, truth)[5], moving.SIZE), moving.mask(5) > 0) > 0.8, "a dark colour is an animal too"
     short = moving.film(tmp_path / "short.mp4", walk / "masks", *H264, "-frames:v", 5)
     with pytest.raises(UserError, match="expected a mask for each of the 12 frames of walk.mp4, got 5"):
         load(film, masks=short)

@@ -23,6 +23,7 @@ from rewild4d.errors import UserError
 from rewild4d.orbit import orbit_cameras
 from rewild4d.original_view import original_frames, save_original_view
 from rewild4d.pictures import PANEL, over
+from rewild4d.recropping import all_moments
 from rewild4d.turntable import Stance, find_stance, four_views, turn
 from rewild4d.types import Camera, Clip, Crop, Frame, Splats
 from rewild4d.view import save_pictures
@@ -36,13 +37,14 @@ def kernels() -> None:
 
 
 def footage(root: Path) -> tuple[DatasetReader, Clip]:
+    """A reader and all its moments."""
     moving.frames(root / "clip" / "frames", 24, step=0.5)
     moving.masks(root / "clip" / "masks", 24, step=0.5)
     reader = Online(root / "clip", fps=10)
-    return reader, reader.load("clip", SELECTION)[0]
+    return reader, all_moments(*reader.load("clip", SELECTION))
 
 
-def test_readers_give_the_whole_frames_of_the_clip_and_no_other(tmp_path: Path) -> None:
+def test_readers_give_the_whole_frames_of_all_moments(tmp_path: Path) -> None:
     online, _ = footage(tmp_path)
     readers = {
         "clip": (online, 0.5),
@@ -54,8 +56,8 @@ def test_readers_give_the_whole_frames_of_the_clip_and_no_other(tmp_path: Path) 
         shown = original_frames(reader, clip, SELECTION)
         assert shown is not None
         wholes = list(shown)
-        assert len(wholes) == len(clip.frames) and len(truth.held_out)
-        for frame, whole in zip(clip.frames, wholes, strict=True):
+        assert len(wholes) == len(clip.frames) + len(truth.held_out)
+        for frame, whole in zip(all_moments(clip, truth).frames, wholes, strict=True):
             index = round(frame.time * (24 if name == "camel" else 10))
             off = [np.abs(whole - moving.image(i, step=step).astype(float)).mean() for i in range(24)]
             assert whole.dtype == np.uint8 and off.index(min(off)) == index and min(off) < 3
@@ -105,7 +107,7 @@ def test_the_film_and_the_sheet(tmp_path: Path) -> None:
     save_original_view(Plate(clip), clip, None, tmp_path)
     assert imageio.imread(tmp_path / "original.png").shape == (24 + 3 * 240, 2 * 360, 3)
     assert imageio.get_reader(tmp_path / "original.mp4").get_data(0)[:4, :4].min() > 250, "on white"
-    with pytest.raises(UserError, match="expected 19 original frames for its pictures, got 3"):
+    with pytest.raises(UserError, match="expected 24 original frames for its pictures, got 3"):
         save_original_view(Plate(clip), clip, list(original_frames(reader, clip, SELECTION) or ())[:3], tmp_path)
     still = tiny_case().clip
     assert save_original_view(EmptyReconstruction(), still, None, tmp_path / "none") == []

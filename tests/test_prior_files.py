@@ -1,4 +1,4 @@
-"""Camera clusters, 3D-Fauna's files and the command, at tiny size."""
+"""Camera clusters and the command `prior fit`, at tiny size."""
 
 import json
 import math
@@ -16,12 +16,10 @@ from rewild4d.commands import prior as command
 from rewild4d.datasets.travel import TravelMeter
 from rewild4d.errors import UserError
 from rewild4d.priors.config import FOOTAGE
-from rewild4d.priors.fauna import read_fauna
-from rewild4d.priors.fauna_bones import estimate_bones, joint_transforms, skinning_weights
 from rewild4d.priors.io import load_prior, save_prior
 from rewild4d.priors.steady import REACH, clusters, steady, without_hops
 from rewild4d.priors.template import quadruped
-from rewild4d.transforms import look_at, skin_points
+from rewild4d.transforms import look_at
 from rewild4d.types import Camera, Prior
 
 
@@ -108,61 +106,6 @@ def test_travel_is_measured_against_a_background_that_moves() -> None:
         mask[360:720, 720:1080] = 255
         large.add(image, mask)
     assert torch.allclose(large.result(), torch.tensor(((90.0, 0.0),)), atol=3.0)
-
-
-def write_fauna(folder: Path, rest: torch.Tensor, faces: torch.Tensor, angles: torch.Tensor, pose: np.ndarray) -> None:
-    folder.mkdir()
-    bones, parents = estimate_bones(rest)
-    weights = skinning_weights(rest, bones)
-    for frame, each in enumerate(angles):
-        posed = skin_points(rest, weights, joint_transforms(bones, parents, each))
-        stem = folder / f"0001000_{frame:>10}"
-        lines = [f"v {x:.8f} {y:.8f} {z:.8f}" for x, y, z in posed.tolist()]
-        lines += [f"f {a + 1}//{a + 1} {b + 1}//{b + 1} {c + 1}//{c + 1}" for a, b, c in faces.tolist()]
-        Path(f"{stem}_mesh.obj").write_text("\n".join(lines))
-        np.savetxt(f"{stem}_pose.txt", pose, fmt="%.6f")
-        np.savetxt(f"{stem}_arti_params.txt", each.numpy())
-
-
-def test_fauna_files_become_a_prior(tmp_path: Path) -> None:
-    template = quadruped()
-    rest = 0.8 * template.vertices.double()
-    angles = 0.15 * torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    angles[1] *= 0.2  # the strongly bent first frame is not the one whose rest mesh is kept
-    # looking along the animal's -x: object +z (its head) points to the camera's left
-    rotation = np.array(((0.0, 0, -1), (0, 1, 0), (1, 0, 0)))
-    write_fauna(tmp_path / "f", rest, template.faces, angles, np.concatenate((rotation.T.ravel(), (0.1, 0.2, 0.3))))
-    prior = read_fauna(tmp_path / "f", flip=None, boxes=None, size=512, fps=10.0)
-    assert prior.times.tolist() == [0.0, 0.1] and prior.cameras[0].width == 512
-    assert prior.cameras[0].intrinsics[0, 0] == pytest.approx(256 / math.tan(math.radians(12.5)))
-    assert float((prior.vertices - template.vertices).norm(dim=1).mean()) < 0.05
-    assert prior.quality["unposed_residual"] < 0.01 and prior.quality["rest_asymmetry"] < 0.01
-    assert prior.provenance.endswith("of frame 1.")
-    # FORMATS 4.7: x right, y up, the camera 10 units from the origin; u grows with x, v against y
-    eye = torch.from_numpy(rotation) @ rest[5] + torch.tensor((0.1, 0.2, 0.3 - 10.0), dtype=torch.float64)
-    focal = 256 / math.tan(math.radians(12.5))
-    wanted = torch.stack((256 + focal * eye[0] / -eye[2], 256 - focal * eye[1] / -eye[2]))
-    scale = 5.0 / float((rest.amax(0) - rest.amin(0)).norm())
-    assert torch.allclose(prior.cameras[1].project(scale * rest[5])[0], wanted, atol=1e-3)
-
-
-def test_fauna_boxes_place_the_crop_and_faults_are_one_sentence(tmp_path: Path) -> None:
-    template = quadruped()
-    pose = np.concatenate((np.eye(3).ravel(), np.zeros(3)))
-    write_fauna(tmp_path / "f", template.vertices.double(), template.faces, torch.zeros(2, 20, 3).double(), pose)
-    (tmp_path / "b").mkdir()
-    for frame in range(2):
-        (tmp_path / "b" / f"{frame}_box.txt").write_text(f"{frame} 30 40 100 100 320 240 1.0")
-    prior = read_fauna(tmp_path / "f", flip=tmp_path / "f", boxes=tmp_path / "b", size=256, fps=24.0)
-    origin = torch.zeros(3).double()
-    assert (prior.cameras[0].width, prior.cameras[0].height) == (320, 240)
-    assert prior.cameras[0].project(origin)[0].tolist() == pytest.approx([30 + 50, 40 + 50])
-    assert prior.cameras_flip[0].project(origin)[0].tolist() == pytest.approx([320 - 30 - 50, 40 + 50])
-    next((tmp_path / "f").glob("*1_pose.txt")).write_text("1 2 3")
-    with pytest.raises(UserError, match="expected 12 finite numbers, got 3"):
-        read_fauna(tmp_path / "f", flip=None, boxes=None, size=256, fps=24.0)
-    with pytest.raises(UserError, match="expected files named <step>_<frame>_mesh.obj"):
-        read_fauna(tmp_path / "b", flip=None, boxes=None, size=256, fps=24.0)
 
 
 def write_frames(folder: Path, count: int) -> None:

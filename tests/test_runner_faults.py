@@ -14,16 +14,17 @@ from external_program import OneCase
 from rewild4d import registry, runner
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig, PriorOnlyReconstruction
 from rewild4d.commands.evaluate import Options, score_again
-from rewild4d.commands.shared import require_writable
+from rewild4d.commands.shared import exit_code, require_writable
 from rewild4d.conformance import tiny_case
 from rewild4d.describing import FROM_TRUTH, marks
+from rewild4d.errors import UserError
 from rewild4d.leaderboard.records import RunRecord, Timing
 from rewild4d.machine import _sources, code_of, code_version
 from rewild4d.metrics import weights
 from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import STANDARD
 from rewild4d.priors.io import save_prior
-from rewild4d.protocol import find_protocol
+from rewild4d.protocol import find_protocol, render
 from rewild4d.registry import load_method
 from rewild4d.types import Case
 from rewild4d.workers import Threads, Workers
@@ -70,6 +71,40 @@ def test_a_prior_that_is_gone_fails_only_what_was_not_finished(
     first, second = runner.execute(replace(plan, entries=(*plan.entries, more)))
     assert first == done[0]
     assert (second.status, second.error) == ("failed", "the fit of the prior is not finite")
+
+
+def test_a_case_that_cannot_be_read_does_not_stop_the_others(
+    plan: runner.Plan, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load = plan.reader.load
+
+    def partly(name: str, selection: Any) -> Any:
+        if name == "broken":
+            raise UserError("broken/masks: expected masks, got none.")
+        return load(name, selection)
+
+    monkeypatch.setattr(plan.reader, "load", partly)
+    both = replace(plan, cases=("broken", *plan.cases))
+    (record,) = runner.execute(both)
+    assert record.status == "ok" and capsys.readouterr().err.startswith(
+        "broken: left out: broken/masks: expected masks"
+    )
+    assert exit_code([both], [record]) == 2 and exit_code([plan], [record]) == 0
+    assert capsys.readouterr().err == "1 of 2 cases cannot be read and have no rows: broken\n"
+    with pytest.raises(UserError, match="broken/masks: expected masks, got none"):
+        runner.execute(replace(plan, cases=("broken",)))
+
+
+def test_the_record_says_how_closely_its_input_is_fitted(plan: runner.Plan, case: Case) -> None:
+    (record,) = runner.execute(plan)
+    made = load_method("prior-only").load(only_job(plan).folder / "reconstruction", torch.device("cpu"))
+    grey = plan.protocol.background
+    errors = []
+    for frame in case.clip.frames:
+        assert frame.camera is not None
+        color, alpha = render(made.at(frame.time), frame.camera)
+        errors.append(-10 * ((color + (1 - alpha) * grey - frame.over(grey)).square().mean()).log10())
+    assert record.diagnostics["input_psnr_db"] == pytest.approx(float(torch.stack(errors).mean()), abs=1e-4)
 
 
 def test_a_failure_never_takes_the_place_of_a_good_record(plan: runner.Plan, case: Case) -> None:
@@ -120,7 +155,7 @@ def test_evaluate_makes_a_failed_record_whole(plan: runner.Plan, monkeypatch: py
     monkeypatch.setattr("rewild4d.commands.evaluate.find_protocol", lambda *_: plan.protocol)
     folder = only_job(plan).folder
     renewed = score_again(folder, Options(runs=(folder,)))
-    assert renewed.marks == ["upper bound: it was told"] and renewed.diagnostics == {"gaussians": 500.0}
+    assert renewed.marks == ["upper bound: it was told"] and renewed.diagnostics["gaussians"] == 500.0
     assert still(renewed) == still(whole)
     assert renewed.timing.fit_seconds == round(runner.fit_seconds(folder), 2)
     assert renewed.timing.evaluate_seconds > 0 and renewed.timing.peak_memory_mib > 0

@@ -217,6 +217,9 @@ def test_masks_are_matched_by_name_number_or_order(tmp_path: Path) -> None:
     assert match("frame_0.png", "frame_2.png") == (["frame_0.png", None, "frame_2.png"], "")
     assert match("m_0.png", "m_1.png", "m_2.png")[0] == ["m_0.png", "m_1.png", "m_2.png"]
     assert match("1.png", "2.png", "3.png") == (["1.png", "2.png", "3.png"], "masks are numbered from 1, frames from 0")
+    assert match("1.png", "3.png") == (["1.png", None, "3.png"], "masks are numbered from 1, frames from 0")
+    assert match("1.png", "2.png") == ([None, "1.png", "2.png"], ""), "frame 0 has none"
+    assert match("1.png", "2.png", "9.png") == ([None, "1.png", "2.png"], "1 of 3 masks fit no frame: 9.png")
     assert match("a.png", "b.png", "c.png")[1].startswith("masks and frames share no names: matched in order")
     with pytest.raises(UserError, match="expected masks named like the frames \\(frame_0, ...\\) or one for each of"):
         match("a.png", "b.png")
@@ -256,7 +259,8 @@ def test_badja_is_row_then_column(tmp_path: Path) -> None:
     joints = [[0, 0]] * 33 + [[540 - 0.5, 1440 - 0.5]] + [[0, 0]] * 3
     entry = {"image_path": "x/00002.png", "joints": joints, "visibility": [i == 33 for i in range(37)]}
     (tmp_path / "camel.json").write_text(json.dumps([entry]))
-    found = read_badja(tmp_path / "camel.json", (960, 540))["00002"]
+    (found,) = read_badja(tmp_path / "camel.json", ["00002"], (960, 540))
+    assert found is not None
     nose = found.names.index("nose")
     assert found.points[nose].tolist() == [1440 / 1920 * 960, 540 / 1080 * 540]
     assert found.visible.nonzero().flatten().tolist() == [nose]

@@ -17,11 +17,12 @@ from rewild4d.leaderboard.records import FILE, RunRecord, Timing, read_record, t
 from rewild4d.leaderboard.tables import markdown
 from rewild4d.machine import code_of, machine, peak_memory_mib, pick_device
 from rewild4d.original_view import original_frames
+from rewild4d.progress import Progress
 from rewild4d.protocol import evaluate, find_protocol
 from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.recropping import seen_by
 from rewild4d.registry import load_dataset, load_method
-from rewild4d.runner import STAMP, Progress, fit_seconds
+from rewild4d.runner import STAMP, fit_seconds
 from rewild4d.view import save_pictures
 from rewild4d.workers import share_cores, this_process
 
@@ -84,7 +85,8 @@ def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: s
             raise UserError(f"{root}: the {name} of {record.case} is not the one that {folder} was fitted to.")
     reconstruction = load_method(record.method).load(saved, device)
     begin = time.perf_counter()
-    clip, truth = seen_by(reconstruction, clip, truth, describing.shown_of(clip, record.prior))
+    shown = describing.shown_of(clip, record.prior)
+    clip, truth = seen_by(reconstruction, clip, truth, shown)
     progress = Progress(f"{record.case}: evaluate")
     found = evaluate(reconstruction, clip, truth, protocol, progress, device)
     progress.close()
@@ -94,7 +96,7 @@ def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: s
     described = {"digest": protocol.digest, **msgspec.to_builtins(protocol)}
     renewed = msgspec.structs.replace(
         record, status="ok", error="", **found.keep(folder), coverage=coverage(clip, truth), pictures=pictures,
-        diagnostics=describing.diagnostics(reconstruction), protocol=described,
+        diagnostics=describing.diagnostics(reconstruction, shown, protocol.background), protocol=described,
         marks=describing.marks(record.method, record.prior.get("choice", ""), reconstruction),
         code=code_of(record.method), machine=machine(device, rasterizer), timing=_timing(record, folder, seconds),
     )  # fmt: skip

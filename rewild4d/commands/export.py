@@ -16,12 +16,13 @@ from rewild4d.leaderboard.records import FILE, RunRecord, read_record
 from rewild4d.machine import pick_device
 from rewild4d.protocol import find_protocol
 from rewild4d.rasterizer import pick_rasterizer, set_default
-from rewild4d.recropping import seen_by
+from rewild4d.recropping import all_moments, seen_by
 from rewild4d.registry import load_dataset, load_method
 from rewild4d.types import Clip, Truth
 
 DESCRIPTION = """Write a run's reconstruction as files for other programs: Gaussians of every frame (ply), an animated
-skinned mesh (glb), cameras (OpenCV axes, JSON) and films (mp4)."""
+skinned mesh (glb), cameras (OpenCV axes, JSON) and films (mp4). Of a video that is every frame which shows the animal,
+the held-out ones too."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,9 @@ def main(arguments: list[str]) -> int:
     saved = options.run / "reconstruction"
     if not saved.is_dir():
         raise UserError(f"{saved}: expected a saved reconstruction, but there is no such folder.")
-    clip = load_clip(record, options.data)
+    clip, truth = load_data(record, options.data)
     reconstruction = load_method(record.method).load(saved, device)
-    clip, _ = seen_by(reconstruction, clip, Truth((), None, ""), describing.shown_of(clip, record.prior))
+    clip = all_moments(*seen_by(reconstruction, clip, truth, describing.shown_of(clip, record.prior)))
     reasons = {kind: why_not(reconstruction, kind, clip) for kind in kinds}
     if all(reasons.values()):
         raise UserError(f"{options.run}: nothing can be written: {'; '.join(f'{k}: {r}' for k, r in reasons.items())}.")
@@ -69,8 +70,8 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def load_clip(record: RunRecord, data: Path | None) -> Clip:
-    """The clip that a run was fitted to.
+def load_data(record: RunRecord, data: Path | None) -> tuple[Clip, Truth]:
+    """The clip that a run was fitted to, and what was held out.
 
     Raises:
         UserError: the data is not there any more.
@@ -79,4 +80,4 @@ def load_clip(record: RunRecord, data: Path | None) -> Clip:
     settings = json.loads(record.data.get("settings", "{}"))
     return load_dataset(record.dataset)(data or Path(record.data["root"]), **settings).load(
         record.case, protocol.selection
-    )[0]
+    )

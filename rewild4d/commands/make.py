@@ -7,7 +7,7 @@ from pathlib import Path
 from rewild4d.config import parse_flags
 from rewild4d.datasets.studio import make_artemis
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.runner import Progress
+from rewild4d.progress import Progress
 
 DESCRIPTION = """Render a skinned, animated glTF from a ring of cameras and write it as an Artemis folder: images,
 mattes, cameras, bones and the voxel volume with its skinning weights."""

@@ -13,6 +13,7 @@ from rewild4d.datasets.grabcut import rough_masks
 from rewild4d.datasets.grounded_sam import DETECTOR, SEGMENTER, grounded_masks
 from rewild4d.datasets.mask_check import SPLIT
 from rewild4d.datasets.mask_makers import MaskMaker, parse_boxes, run_program, write_masks
+from rewild4d.datasets.masks import list_images
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.machine import pick_device
 from rewild4d.runner import choose_cases
@@ -79,6 +80,8 @@ def main(arguments: list[str]) -> int:
         folder = options.out if is_one else options.out / case
         paths, empty = write_masks(source, maker, folder)
         print(f"{folder}: {len(paths)} masks by '{options.tool}', {empty} of them without the animal")
+        if older := set(list_images(folder)) - set(paths):
+            print(f"{folder}: it holds {len(older)} other masks, which readers take too: remove them?", file=sys.stderr)
     print("look at them before you use them: rewild4d-bench check with --masks draws a contact sheet", file=sys.stderr)
     return 0
 

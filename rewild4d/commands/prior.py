@@ -1,5 +1,6 @@
 """`prior fit` and `prior import`: a posed template for real footage, as an npz and as pictures to judge it by."""
 
+import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from rewild4d.errors import UserError, unknown_name
 from rewild4d.priors.choose import Use, split_marks
 from rewild4d.priors.config import FOOTAGE
 from rewild4d.priors.fauna import read_fauna
+from rewild4d.priors.fauna_files import LARGEST
 from rewild4d.priors.footage import Evidence, fit_footage
 from rewild4d.priors.io import save_prior, seal
 from rewild4d.priors.judge import doubts, joint_scores
@@ -21,7 +23,7 @@ from rewild4d.priors.landmarks import Marks, load_mapping, marks
 from rewild4d.priors.overlay import save_overlay
 from rewild4d.priors.placing import resized
 from rewild4d.priors.steady import without_hops
-from rewild4d.runner import Progress
+from rewild4d.progress import Progress
 from rewild4d.types import Clip, Prior
 
 USAGE = """usage: rewild4d-bench prior fit --frames DIR --masks DIR --out prior.npz [--keypoints FILE --mapping NAME]
@@ -90,13 +92,21 @@ def main(arguments: list[str]) -> int:
     prog = f"rewild4d-bench prior {arguments[0]}"
     if arguments[0] == "import":
         chosen = parse_flags(ImportOptions, arguments[1:], prog=prog, description=IMPORT)
-        prior = read_fauna(chosen.files, flip=chosen.flip, boxes=chosen.boxes, size=chosen.size, fps=chosen.fps)
-        save_prior(prior, chosen.out)
-        _tell(prior, [chosen.out])
+        _import(chosen)
         return 0
     options = parse_flags(FitOptions, arguments[1:], prog=prog, description=DESCRIPTION)
     _fit(options)
     return 0
+
+
+def _import(options: ImportOptions) -> None:
+    if not 0 < options.fps < math.inf:
+        raise UserError(f"--fps: expected a number above 0, got {options.fps:g}.")
+    if not 0 < options.size <= LARGEST:
+        raise UserError(f"--size: expected 1 to {LARGEST} pixels, got {options.size}.")
+    prior = read_fauna(options.files, flip=options.flip, boxes=options.boxes, size=options.size, fps=options.fps)
+    save_prior(prior, options.out)
+    _tell(prior, [options.out])
 
 
 def _fit(options: FitOptions) -> None:

@@ -8,7 +8,14 @@ from typing import Any
 import msgspec
 
 from rewild4d.commands import run_table
-from rewild4d.commands.shared import check_numbers, choose_prior, floor_entry, open_dataset, require_writable
+from rewild4d.commands.shared import (
+    check_numbers,
+    choose_prior,
+    exit_code,
+    floor_entry,
+    open_dataset,
+    require_writable,
+)
 from rewild4d.config import load_preset, parse_flags, with_method_flags
 from rewild4d.datasets.parts import Parts
 from rewild4d.errors import UserError
@@ -87,7 +94,7 @@ class Options:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the command; 0 where every run has scores, 1 where one failed."""
+    """Run the command; 0 where every run has scores, 1 where one failed, 2 where a case cannot be read."""
     if any(word.split("=")[0] == "--table" for word in arguments):
         return run_table.main(arguments)
     wanted = _peek(arguments, "--method") or Options.method
@@ -97,13 +104,14 @@ def main(arguments: list[str]) -> int:
     options: Any = parse_flags(
         options_type, arguments, prog="rewild4d-bench run", description=DESCRIPTION, also=["--table"]
     )
-    records = execute(make_plan(options, options.config))
+    plan = make_plan(options, options.config)
+    records = execute(plan)
     if options.json:
         print("[" + ",\n".join(to_json(record) for record in records) + "]")
     else:
         print(markdown(records))
         _print_pictures(records, options)
-    return 0 if all(record.status == "ok" for record in records) else 1
+    return exit_code([plan], records)
 
 
 def make_plan(options: Options, config: msgspec.Struct) -> Plan:

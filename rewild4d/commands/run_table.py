@@ -9,7 +9,14 @@ import msgspec
 
 from rewild4d import planning
 from rewild4d.commands.choice import cases_of, chosen
-from rewild4d.commands.shared import check_numbers, choose_prior, floor_entry, open_dataset, require_writable
+from rewild4d.commands.shared import (
+    check_numbers,
+    choose_prior,
+    exit_code,
+    floor_entry,
+    open_dataset,
+    require_writable,
+)
 from rewild4d.config import parse_flags
 from rewild4d.contracts import DatasetReader
 from rewild4d.datasets.parts import Parts
@@ -80,7 +87,7 @@ class Options:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the command; 0 where every run has scores, 1 where one failed."""
+    """Run the command; 0 where every run has scores, 1 where one failed, 2 where a case cannot be read."""
     place = arguments.index("--table") if "--table" in arguments else None
     if place is not None and (place + 1 == len(arguments) or arguments[place + 1].startswith("--")):
         if "--help" not in arguments:
@@ -101,7 +108,7 @@ def main(arguments: list[str]) -> int:
     else:
         print(markdown(_table(options, spec, records)))
         print(f"\nrecords: {options.out}", file=sys.stderr)
-    return 0 if all(record.status == "ok" for record in records) else 1
+    return exit_code(plans, records)
 
 
 def make_plans(options: Options, spec: Spec) -> list[Plan]:

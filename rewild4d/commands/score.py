@@ -13,7 +13,7 @@ from rewild4d.leaderboard.reports import Report, markdown, to_json
 from rewild4d.machine import pick_device
 from rewild4d.metrics.samples import Progress as ShowProgress
 from rewild4d.pairing import Inputs
-from rewild4d.runner import Progress
+from rewild4d.progress import Progress
 from rewild4d.scoring import FAMILIES, load_networks, score_pictures
 
 DESCRIPTION = """Score a folder of images or clips, or a .ply file, against the truth. Images are matched by file name,

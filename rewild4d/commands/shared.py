@@ -1,16 +1,20 @@
 """What several commands ask of folders, numbers and floors."""
 
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from rewild4d.config import load_preset, preset_names
 from rewild4d.contracts import DatasetReader
 from rewild4d.errors import UserError
+from rewild4d.leaderboard.records import RunRecord
 from rewild4d.priors.choose import PriorChoice, Use
 from rewild4d.priors.config import PRESETS, STANDARD
 from rewild4d.priors.landmarks import load_mapping
+from rewild4d.progress import Progress
 from rewild4d.registry import load_builtin, load_dataset, load_method
-from rewild4d.runner import Entry, Progress
+from rewild4d.runner import Entry, Plan
 
 SOURCE_FLAGS = ("masks", "parts", "start", "end", "fps", "keypoints")
 """Flags that a reader takes if its `options` name them."""
@@ -98,3 +102,14 @@ def floor_entry(name: str) -> Entry:
     presets = preset_names(name)
     config_type = load_method(name).Config
     return Entry(name, "default", load_preset(name, config_type, presets[0]) if presets else config_type(), (0,))
+
+
+def exit_code(plans: Sequence[Plan], records: Sequence[RunRecord]) -> int:
+    """0 where every run of the plans has scores, 1 where one failed, 2 where a case cannot be read, which is told."""
+    done = {record.case for record in records}
+    lacking = list(dict.fromkeys(name for plan in plans for name in plan.cases if name not in done))
+    if lacking:
+        total = len({name for plan in plans for name in plan.cases})
+        print(f"{len(lacking)} of {total} cases cannot be read and have no rows: {', '.join(lacking)}", file=sys.stderr)
+        return 2
+    return 0 if all(record.status == "ok" for record in records) else 1

@@ -6,7 +6,6 @@ of undoing the pose. One image's mesh is kept and all poses are recomputed with 
 """
 
 import math
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,18 +16,18 @@ from torch import Tensor
 
 from rewild4d.errors import UserError
 from rewild4d.priors.fauna_bones import estimate_bones, joint_transforms, skinning_weights
-from rewild4d.priors.io import seal
+from rewild4d.priors.fauna_files import frames, read_obj, stems
+from rewild4d.priors.io import require_loadable, seal
 from rewild4d.priors.template import MIRROR
-from rewild4d.transforms import mirror_camera, mirror_points, mirror_transforms, rigid, skin_points
+from rewild4d.transforms import mirror_camera, mirror_points, mirror_transforms, skin_points
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Prior
 
-FIELD_OF_VIEW, OFFSET = math.radians(25.0), 10.0
-NATIVE = 256
 SWEEPS = 12
 """Rounds of undoing the pose; the rest mesh moves by less than a thousandth after a few."""
 TRIED = 4
 """Least bent poses that are undone; the most symmetric rest mesh is taken."""
-_NAME = re.compile(r"(?P<step>\d+)_\s*(?P<frame>\S+)_mesh\.obj")
+FLAT = 1e-3
+"""Thickness over length of a cloud of vertices below which it is a plane: no animal is that thin."""
 
 
 def read_fauna(folder: Path, *, flip: Path | None, boxes: Path | None, size: int, fps: float) -> Prior:
@@ -42,11 +41,11 @@ def read_fauna(folder: Path, *, flip: Path | None, boxes: Path | None, size: int
         fps: frames per second.
 
     Raises:
-        UserError: files are missing or hold something else.
+        UserError: files are missing or hold something else, or `load_prior` would refuse what comes of them.
     """
-    stems = _stems(folder)
-    angles, cameras = _frames(folder, stems, boxes, size, flipped=False)
-    rest, faces, used, quality = _rest(folder, list(stems.values()), angles)
+    stem_of = stems(folder)
+    angles, cameras = frames(folder, stem_of, boxes, size, flipped=False)
+    rest, faces, used, quality = _rest(folder, list(stem_of.values()), angles)
     bones, parents = estimate_bones(rest)
     weights = skinning_weights(rest, bones)
     scale = OBJECT_DIAGONAL / float((rest.amax(0) - rest.amin(0)).norm())
@@ -54,25 +53,25 @@ def read_fauna(folder: Path, *, flip: Path | None, boxes: Path | None, size: int
     cameras_flip = [mirror_camera(camera) for camera in cameras]
     transforms_flip = mirror_transforms(transforms, torch.tensor(MIRROR))
     if flip is not None:
-        other = _stems(flip)
-        lacking = [frame for frame in stems if frame not in other]
+        other = stems(flip)
+        lacking = [frame for frame in stem_of if frame not in other]
         if lacking:
             raise UserError(f"{flip}: expected the frames of {folder}, but {', '.join(lacking[:3])} are missing.")
-        kept = {frame: other[frame] for frame in stems}
-        angles_flip, cameras_flip = _frames(flip, kept, boxes, size, flipped=True)
+        kept = {frame: other[frame] for frame in stem_of}
+        angles_flip, cameras_flip = frames(flip, kept, boxes, size, flipped=True)
         transforms_flip = torch.stack([joint_transforms(bones, parents, each) for each in angles_flip])
     prior = Prior(
         name="fauna",
-        provenance=f"3D-Fauna's files of {len(stems)} frames in {folder.name}; rest mesh by undoing the pose of frame "
-        f"{list(stems)[used]}.",
+        provenance=f"3D-Fauna's files of {len(stem_of)} frames in {folder.name}; rest mesh by undoing the pose of "
+        f"frame {list(stem_of)[used]}.",
         vertices=(scale * rest).float(),
         faces=faces,
         weights=weights.float(),
         bones=(scale * bones).float(),
         parents=torch.tensor(parents),
         mirror=torch.tensor(MIRROR),
-        times=torch.arange(len(stems), dtype=torch.float64) / fps,
-        object_to_world=torch.eye(4, dtype=torch.float64).repeat(len(stems), 1, 1),
+        times=torch.arange(len(stem_of), dtype=torch.float64) / fps,
+        object_to_world=torch.eye(4, dtype=torch.float64).repeat(len(stem_of), 1, 1),
         cameras=tuple(_scaled(camera, scale) for camera in cameras),
         transforms=_moved(transforms, scale),
         cameras_flip=tuple(_scaled(camera, scale) for camera in cameras_flip),
@@ -80,105 +79,28 @@ def read_fauna(folder: Path, *, flip: Path | None, boxes: Path | None, size: int
         quality=quality,
         digest="",
     )
+    require_loadable(prior, folder)
     return seal(prior)
 
 
-def _stems(folder: Path) -> dict[str, str]:
-    """Frame name -> file stem, of the latest step, in order of the frames.
-
-    Raises:
-        UserError: no folder, or no meshes in it.
-    """
-    if not folder.is_dir():
-        raise UserError(f"{folder}: expected 3D-Fauna's result folder, but there is none.")
-    found: dict[str, tuple[int, str]] = {}
-    for file in folder.iterdir():
-        if match := _NAME.fullmatch(file.name):
-            step = int(match["step"])
-            if step >= found.get(match["frame"], (-1, ""))[0]:
-                found[match["frame"]] = (step, file.name.removesuffix("_mesh.obj"))
-    if not found:
-        raise UserError(f"{folder}: expected files named <step>_<frame>_mesh.obj as 3D-Fauna's test run writes them.")
-    ordered = sorted(found, key=lambda name: (int(name) if name.isdecimal() else 0, name))
-    return {frame: found[frame][1] for frame in ordered}
-
-
-def _frames(
-    folder: Path, stems: dict[str, str], boxes: Path | None, size: int, *, flipped: bool
-) -> tuple[list[Tensor], list[Camera]]:
-    angles, cameras = [], []
-    for frame, stem in stems.items():
-        angles.append(_numbers(folder / f"{stem}_arti_params.txt", 60).reshape(20, 3))
-        pose = _numbers(folder / f"{stem}_pose.txt", 12)
-        cameras.append(_placed(_camera(pose), boxes / f"{frame}_box.txt" if boxes else None, size, flipped))
-    return angles, cameras
-
-
-def _camera(pose: Tensor) -> Camera:
-    """Fauna's twelve numbers: rows right, up, forward (the transposed rotation), then a translation; OpenGL axes."""
-    open_gl = rigid(pose[:9].reshape(3, 3).T, pose[9:] + pose.new_tensor((0.0, 0.0, -OFFSET)))
-    world_to_camera = torch.diag(pose.new_tensor((1.0, -1.0, -1.0, 1.0))) @ open_gl
-    focal, half = NATIVE / 2 / math.tan(FIELD_OF_VIEW / 2), NATIVE / 2
-    intrinsics = pose.new_tensor(((focal, 0.0, half), (0.0, focal, half), (0.0, 0.0, 1.0)))
-    return Camera(world_to_camera, intrinsics, NATIVE, NATIVE)
-
-
-def _placed(camera: Camera, box: Path | None, size: int, flipped: bool) -> Camera:
-    """The camera of the crop at another size, or of the whole frame that a box file places the crop in."""
-    if box is None:
-        return camera.resized(size, size)
-    left, top, width, height, full_width, full_height = (int(x) for x in _numbers(box, 8)[1:7])
-    if flipped:
-        left = full_width - left - width
-    return camera.resized(width, height).shifted(-left, -top, full_width, full_height)
-
-
-def _numbers(path: Path, count: int) -> Tensor:
-    """Whitespace-separated numbers, float64, [count].
-
-    Raises:
-        UserError: no such file, or other numbers of numbers.
-    """
-    try:
-        values = np.array(path.read_text(encoding="utf-8").split(), dtype=np.float64)
-    except OSError as error:
-        raise UserError(f"{path}: expected a file of 3D-Fauna, but: {error.strerror}.") from error
-    except ValueError as error:
-        raise UserError(f"{path}: expected {count} numbers, got text ({error}).") from error
-    if len(values) != count or not np.isfinite(values).all():
-        raise UserError(f"{path}: expected {count} finite numbers, got {len(values)}.")
-    return torch.from_numpy(values)
-
-
-def _read_obj(path: Path) -> tuple[Tensor, Tensor]:
-    """Vertices, float64, [n, 3], and triangles, int64, [f, 3]."""
-    vertices, faces = [], []
-    try:
-        for line in path.read_text(encoding="utf-8").splitlines():
-            kind, _, rest = line.partition(" ")
-            if kind == "v":
-                vertices.append([float(x) for x in rest.split()[:3]])
-            elif kind == "f":
-                faces.append([int(corner.split("/")[0]) - 1 for corner in rest.split()])
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: expected a mesh as 3D-Fauna writes it, but: {error}.") from error
-    table, corners = np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64)
-    if table.ndim != 2 or corners.ndim != 2 or corners.shape[1] != 3 or corners.max() >= len(table):
-        raise UserError(f"{path}: expected a mesh of triangles, got {len(vertices)} vertices and {len(faces)} faces.")
-    return torch.from_numpy(table), torch.from_numpy(corners)
-
-
-def _rest(folder: Path, stems: list[str], angles: list[Tensor]) -> tuple[Tensor, Tensor, int, dict[str, float]]:
+def _rest(folder: Path, names: list[str], angles: list[Tensor]) -> tuple[Tensor, Tensor, int, dict[str, float]]:
     """The most symmetric rest mesh among the first image's and those of the least bent poses; Fauna's are symmetric.
 
     Returns:
         Vertices, faces, the index of the image they are from, and the figures of the undoing.
+
+    Raises:
+        UserError: a mesh cannot be read, or has no room for bones.
     """
     bent = torch.stack(angles).square().sum((1, 2)).argsort().tolist()
     found = []
     for index in dict.fromkeys([0, *bent[:TRIED]]):
-        posed, faces = _read_obj(folder / f"{stems[index]}_mesh.obj")
-        rest, residual = _unposed(posed, angles[index])
+        mesh = folder / f"{names[index]}_mesh.obj"
+        posed, faces = read_obj(mesh)
+        try:
+            rest, residual = _unposed(posed, angles[index])
+        except (ValueError, torch.linalg.LinAlgError) as error:
+            raise UserError(f"{mesh}: expected a mesh with room for bones, posed and at rest, got {error}.") from error
         diagonal = float((rest.amax(0) - rest.amin(0)).norm())
         asymmetry = float(np.mean(cKDTree(rest.numpy()).query(mirror_points(rest).numpy())[0]))
         found.append((asymmetry / diagonal, index, residual / diagonal, rest, faces))
@@ -187,18 +109,49 @@ def _rest(folder: Path, stems: list[str], angles: list[Tensor]) -> tuple[Tensor,
 
 
 def _unposed(posed: Tensor, angles: Tensor) -> tuple[Tensor, float]:
-    """The rest mesh whose pose is the given one, and how far posing it again stays from that (mean distance)."""
+    """The rest mesh whose pose is the given one, and how far posing it again stays from that (mean distance).
+
+    Raises:
+        ValueError: there is no room for bones.
+    """
     rest = posed.clone()
     for _ in range(SWEEPS):
-        bones, parents = estimate_bones(rest)
+        bones, parents = _bones(rest)
         transforms = joint_transforms(bones, parents, angles)
         weights = skinning_weights(rest, bones)
         blended = torch.einsum("nj,jab->nab", weights, transforms)
         lifted = torch.cat((posed, torch.ones_like(posed[:, :1])), dim=1)
         rest = torch.linalg.solve(blended, lifted[..., None])[:, :3, 0]
-    bones, parents = estimate_bones(rest)
+    bones, parents = _bones(rest)
     again = skin_points(rest, skinning_weights(rest, bones), joint_transforms(bones, parents, angles))
     return rest, float((again - posed).norm(dim=1).mean())
+
+
+def _bones(vertices: Tensor) -> tuple[Tensor, tuple[int, ...]]:
+    """`estimate_bones` of vertices that have room for them.
+
+    Raises:
+        ValueError: they lie in a plane, too few of them are low enough to be feet, or a bone has no direction.
+    """
+    box = " x ".join(f"{side:.3g}" for side in (vertices.amax(0) - vertices.amin(0)).tolist())
+    came, height = f"{len(vertices)} vertices in a box of {box}", vertices[:, 1]
+    if _is_flat(vertices) or not (height < height.quantile(0.4)).any():
+        raise ValueError(f"{came}, too few or too flat")
+    bones, parents = estimate_bones(vertices)
+    # A bone's frame has an axis normal to the bone and to x, which a bone along x lacks.
+    if not ((bones[:, 1] - bones[:, 0])[:, 1:].norm(dim=1) > 0).all():
+        raise ValueError(f"{came}, where a bone has no length or lies along x")
+    return bones, parents
+
+
+def _is_flat(vertices: Tensor) -> bool:
+    """Whether points lie (nearly) in a plane, whichever way it is turned, or are no shape at all, [n, 3]."""
+    diagonal = (vertices.amax(0) - vertices.amin(0)).norm()
+    if not 0 < float(diagonal) < math.inf:
+        return True
+    centered = (vertices - vertices.mean(0)) / diagonal
+    spread = torch.linalg.eigvalsh(centered.T @ centered)
+    return bool(spread[0] <= FLAT**2 * spread[2])
 
 
 def _scaled(camera: Camera, scale: float) -> Camera:

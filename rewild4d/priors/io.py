@@ -85,6 +85,21 @@ def save_prior(prior: Prior, path: Path) -> None:
     Raises:
         UserError: the file cannot be written.
     """
+    with atomic(path) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, **_arrays(prior))
+
+
+def require_loadable(prior: Prior, source: Path) -> None:
+    """Hold a prior against all that `load_prior` asks of a file, before one is written.
+
+    Raises:
+        UserError: naming what the prior is made from and the first array that breaks its promise.
+    """
+    _validated(source, _arrays(prior))
+
+
+def _arrays(prior: Prior) -> dict[str, Any]:
+    """What a prior file holds."""
     arrays: dict[str, Any] = {
         name: getattr(prior, name).detach().cpu().numpy()
         for name in (*SHAPES, *FLIPPED)
@@ -95,8 +110,7 @@ def save_prior(prior: Prior, path: Path) -> None:
         arrays[f"intrinsics{suffix}"] = torch.stack([camera.intrinsics for camera in cameras]).numpy()
     arrays["sizes"] = np.array([(camera.width, camera.height) for camera in prior.cameras])
     arrays |= {"name": prior.name, "provenance": prior.provenance, "quality": json.dumps(prior.quality)}
-    with atomic(path) as temporary, temporary.open("wb") as stream:
-        np.savez_compressed(stream, **arrays)
+    return {name: np.asarray(array) for name, array in arrays.items()}
 
 
 def load_prior(path: Path) -> Prior:
@@ -106,10 +120,7 @@ def load_prior(path: Path) -> Prior:
         UserError: no such file, not an npz, an array is missing, or has another shape, kind or values than documented.
     """
     raw = _read(path)
-    sizes: dict[str, int] = {}
-    arrays = {key: _checked(path, raw, key, shape, sizes) for key, shape in SHAPES.items()}
-    flipped = {key: _checked(path, raw, key, shape, sizes) for key, shape in FLIPPED.items() if key in raw}
-    _check_values(path, arrays, flipped)
+    arrays, flipped = _validated(path, raw)
     cameras = _cameras(arrays["world_to_camera"], arrays["intrinsics"], arrays["sizes"])
     mirrored = tuple(mirror_camera(camera) for camera in cameras)
     if len(flipped) == len(FLIPPED):
@@ -131,6 +142,15 @@ def load_prior(path: Path) -> Prior:
             **shared,
         )
     )
+
+
+def _validated(path: Path, raw: Mapping[str, np.ndarray]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """The arrays of `SHAPES` and those of `FLIPPED` that are there, after all checks."""
+    sizes: dict[str, int] = {}
+    arrays = {key: _checked(path, raw, key, shape, sizes) for key, shape in SHAPES.items()}
+    flipped = {key: _checked(path, raw, key, shape, sizes) for key, shape in FLIPPED.items() if key in raw}
+    _check_values(path, arrays, flipped)
+    return arrays, flipped
 
 
 def _read(path: Path) -> Mapping[str, np.ndarray]:
@@ -217,18 +237,18 @@ def _check_values(path: Path, arrays: Mapping[str, Tensor], flipped: Mapping[str
     ]
     for key, array in {**arrays, **flipped}.items():
         if key in RIGID:
-            fault = _off_similarity(array, rigid=True)
+            fault = off_similarity(array, rigid=True)
             promises.append((fault <= OFF_ROTATION, f"rigid matrices in '{key}'", f"some that are {fault:.2g} off"))
         elif key.startswith("intrinsics"):
             promises.append((_is_pinhole(array), f"positive focal lengths and a last row 0 0 1 in '{key}'", "others"))
-    fault = _off_similarity(arrays["object_to_world"], rigid=False)
+    fault = off_similarity(arrays["object_to_world"], rigid=False)
     promises.append((fault <= OFF_ROTATION, "similarities in 'object_to_world'", f"some that are {fault:.2g} off"))
     for kept, expected, came in promises:
         if not kept:
             raise UserError(f"{path}: expected {expected}, got {came}.")
 
 
-def _off_similarity(matrices: Tensor, *, rigid: bool) -> float:
+def off_similarity(matrices: Tensor, *, rigid: bool) -> float:
     """How far matrices are from rotation, translation and (unless rigid) one scale, [..., 4, 4]; 0 where they are."""
     linear, last = matrices[..., :3, :3].double(), matrices[..., 3, :].double()
     scale = linear.det().sign().clamp_min(0) if rigid else linear.det().clamp_min(0) ** (1 / 3)

@@ -1,0 +1,33 @@
+"""Progress of long work: a bar for the person who waits, a line a step for the file."""
+
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+from tqdm import tqdm
+
+
+class Progress:
+    """A contracts.Log that shows a bar on standard error and appends every line to a file."""
+
+    def __init__(self, title: str, path: Path | None = None):
+        self.bar: tqdm | None = None
+        self.title, self.path = title, path
+
+    def __call__(self, step: int, total: int, values: Mapping[str, float] = MappingProxyType({})) -> None:
+        if self.bar is None:
+            pause = 0.5 if sys.stderr.isatty() else 10.0
+            self.bar = tqdm(desc=self.title, total=total, file=sys.stderr, mininterval=pause)
+        self.bar.total = total
+        self.bar.update(step - self.bar.n)
+        if values:
+            self.bar.set_postfix({key: f"{value:.4g}" for key, value in values.items()}, refresh=False)
+            if self.path is not None:
+                with self.path.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps({"step": step, **values}) + "\n")
+
+    def close(self) -> None:
+        if self.bar is not None:
+            self.bar.close()
