@@ -105,6 +105,18 @@ def test_no_nan_from_any_finite_input(seed: int) -> None:
         assert torch.isfinite(slope).all(), name
 
 
+def test_features_up_to_their_limit_have_gradients() -> None:
+    inputs = {name: value.float() for name, value in scene(50, 3, 1, 40, 30, 0).items()}
+    loud = inputs | {"features": 2.0**100 * (2 * (torch.arange(150).view(50, 3) % 2) - 1).float()}
+    for name, slope in gradients(loud, 40, 30)[1].items():
+        assert torch.isfinite(slope).all(), name
+    loud["features"][7, 1] = -1e31
+    with pytest.raises(
+        ValueError, match=r"features: expected magnitudes up to 1.3e\+30, got -1e\+31 at index \[7, 1\]"
+    ):
+        render(loud, 40, 30)
+
+
 @pytest.fixture(autouse=True)
 def same_threads() -> Iterator[None]:
     """Workers that are threads of this process set its number of threads."""

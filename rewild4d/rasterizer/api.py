@@ -9,6 +9,9 @@ from torch import Tensor
 from rewild4d.rasterizer import backends
 from rewild4d.rasterizer.conventions import EPS2D, RasterInfo
 
+MOST_FEATURE = 2.0**100
+"""Single precision ends at 3e38, and the backward pass multiplies channels by derivatives."""
+
 
 def rasterize(
     means: Tensor,
@@ -36,7 +39,7 @@ def rasterize(
         quats: orientations, wxyz, of any length but zero (normalised here), [N, 4].
         scales: standard deviations along the Gaussian's own axes, [N, 3].
         opacities: in [0, 1], [N].
-        features: any number of channels (colour, normal, depth, part), [N, C].
+        features: any number of channels (colour, normal, depth, part), magnitudes up to `MOST_FEATURE`, [N, C].
         world_to_camera: OpenCV axes; converted to the dtype and device of ``means``, [V, 4, 4].
         intrinsics: pinhole without skew, pixel centres at +0.5; converted likewise, [V, 3, 3].
         width: image width in pixels.
@@ -53,7 +56,8 @@ def rasterize(
         features [V, C, height, width], alpha [V, 1, height, width], and the info densification needs.
 
     Raises:
-        ValueError: a shape, type, device or option is wrong, or a value is not finite; names the tensor and the index.
+        ValueError: a shape, type, device or option is wrong, or a value is not finite or too large; names the tensor
+            and the index.
     """
     named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features}
     _check_gaussians(named)
@@ -69,6 +73,7 @@ def rasterize(
         background = background.to(means).expand(views, channels)
         named["background"] = background
     _check_finite(named)
+    _check_range(named)
     if not (eps2d >= 0 and near > 0):
         raise ValueError(f"expected eps2d >= 0 and near > 0, got eps2d={eps2d} and near={near}.")
     render = backends.load(backends.resolve(backend, means.device, means.dtype))
@@ -126,3 +131,13 @@ def _check_finite(named: dict[str, Tensor]) -> None:
             if not math.isfinite(total) and len(bad := (~torch.isfinite(values)).nonzero()):
                 index = tuple(bad[0].tolist())
                 raise ValueError(f"{name}: expected finite values, got {values[index].item()} at index {list(index)}.")
+
+
+def _check_range(named: dict[str, Tensor]) -> None:
+    """Channels whose products with each other's derivatives would overflow, and leave NaN in a gradient."""
+    for name in ("features", "background"):
+        values = named[name].detach() if name in named else torch.empty(0)
+        if values.numel() and float(torch.maximum(values.max(), -values.min())) > MOST_FEATURE:
+            index = tuple((values.abs() > MOST_FEATURE).nonzero()[0].tolist())
+            found = f"{values[index].item():g} at index {list(index)}"
+            raise ValueError(f"{name}: expected magnitudes up to {MOST_FEATURE:.2g}, got {found}.")
