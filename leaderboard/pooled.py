@@ -12,7 +12,7 @@ from rewild4d.errors import UserError
 from rewild4d.leaderboard.layout import Cell, Column, Row, Table
 from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.statistics import Estimate, estimate, ranks
-from rewild4d.leaderboard.tables import Entrant, Frame, by_protocol, kind_of
+from rewild4d.leaderboard.tables import Entrant, Frame, by_protocol, cases_of, kind_of, rests_on
 from rewild4d.leaderboard.titles import TITLES, digits_of
 from rewild4d.leaderboard.variants import latest, marks, variants
 from rewild4d.metrics.samples import Distance
@@ -39,8 +39,7 @@ def pooled_tables(found: Sequence[Found]) -> list[Table]:
         if not any(name in NAMES for name in protocol["scores"]):
             continue
         kept, remarks = latest(group)
-        cases = list(dict.fromkeys(record.case for record in kept))
-        caption = f"`{protocol['name']}`; {len(cases)} cases: {', '.join(cases)}"
+        caption = f"`{protocol['name']}`"
         frame = Frame(protocol["name"], protocol["title"], caption, ("",), tuple(protocol["scores"]), tuple(remarks))
         entrants = [Entrant(variant.label, (variant.records,)) for variant in variants(kept)]
         tables.append(pooled_table(frame, entrants, found))
@@ -64,18 +63,19 @@ def pooled_table(frame: Frame, entrants: Sequence[Entrant], found: Sequence[Foun
     names = [name for name in frame.scores if name in NAMES]
     if not names:
         raise UserError(f"table '{frame.name}': expected scores of sets to pool ({', '.join(NAMES)}), got none.")
-    folders = {id(record): folder for folder, record in found}
+    # By what the file holds: a row may have a copy of the record, with other marks.
+    folders = {record.features: folder for folder, record in found}
     rows = []
     for entrant in entrants:
         cells: list[Cell] = []
         for index, records in enumerate(entrant.records):
-            cases = list(dict.fromkeys(record.case for other in entrants for record in other.records[index]))
-            cells += _row(entrant, records, cases, names, folders)
+            cells += _row(entrant, records, cases_of(entrants, index), names, folders)
         everything = [record for under in entrant.records for record in under]
         rows.append(Row((entrant.label,), tuple(cells), kind_of(entrant), (*entrant.notes, *marks(everything))))
     columns = tuple(Column(TITLES[name], "lower", condition, name) for condition in frame.conditions for name in names)
     title, ranked = f"{frame.title}: all cases pooled", _ranked(rows, columns)
-    return Table(f"{frame.name}-pooled", title, frame.caption, ("method",), columns, ranked, frame.remarks)
+    remarks = (*rests_on(frame, entrants, "Pooled over"), *frame.remarks)
+    return Table(f"{frame.name}-pooled", title, frame.caption, ("method",), columns, ranked, remarks)
 
 
 def _row(
@@ -83,7 +83,7 @@ def _row(
     records: Sequence[RunRecord],
     cases: Sequence[str],
     names: Sequence[str],
-    folders: Mapping[int, Path],
+    folders: Mapping[str, Path],
 ) -> list[Cell]:
     """The cells of one row under one condition, in the order of the names."""
     if entrant.absent or not records:
@@ -99,7 +99,7 @@ def _row(
 
 
 def _pooled(
-    records: Sequence[RunRecord], cases: Sequence[str], kind: str, folders: Mapping[int, Path]
+    records: Sequence[RunRecord], cases: Sequence[str], kind: str, folders: Mapping[str, Path]
 ) -> dict[int, list[Distance]]:
     """Seed -> the distances of one kind over all cases.
 
@@ -111,7 +111,7 @@ def _pooled(
         by_case = {record.case: record for record in records if record.seed == seed}
         if missing := [case for case in cases if case not in by_case]:
             raise NotPooled(f"no result with seed {seed} for {', '.join(missing)}")
-        parts = [_sets(by_case[case], kind, folders[id(by_case[case])]) for case in cases]
+        parts = [_sets(by_case[case], kind, folders[by_case[case].features]) for case in cases]
         try:
             found[seed] = distances(pool(parts))
         except ValueError as error:

@@ -10,6 +10,7 @@ from rewild4d.leaderboard.cells import cell, difference, values_of
 from rewild4d.leaderboard.formats import markdown as to_markdown
 from rewild4d.leaderboard.layout import Cell, Column, Row, Table
 from rewild4d.leaderboard.records import RunRecord
+from rewild4d.leaderboard.remarks import cases_said, seeds_said
 from rewild4d.leaderboard.specs import Reported, ReportedCell
 from rewild4d.leaderboard.statistics import Estimate, estimate, ranks
 from rewild4d.leaderboard.titles import LESS_IS_BETTER, TITLES, digits_of
@@ -113,7 +114,8 @@ def named_table(frame: Frame, entrants: Sequence[Entrant], reported: Reported | 
     """Rows are entrants, columns are scores under conditions, a cell is the mean over the cases of its condition.
 
     The best of a column is bold and the second underlined, as `rewild4d.leaderboard.statistics.ranks` tells them apart
-    by the spread over seeds. Reported rows and those that had what the others had not are never ranked.
+    by the spread over seeds. Reported rows and those that had what the others had not are never ranked. Remarks say
+    over which cases the means are, and where nothing is known of the spread.
 
     Args:
         frame: titles, conditions and scores.
@@ -124,7 +126,7 @@ def named_table(frame: Frame, entrants: Sequence[Entrant], reported: Reported | 
     columns = _columns(frame, everything)
     rows = [_named_row(entrant, entrants, columns, frame) for entrant in entrants]
     rows = _apart(_ranked(rows, columns))
-    remarks = list(frame.remarks)
+    remarks = [*rests_on(frame, entrants), *frame.remarks]
     if reported is not None:
         rows += _reported_rows(reported, columns)
         remarks += [f"Reported: {reported.source}. {reported.note}"]
@@ -158,13 +160,38 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
     return Table(
         f"{frame.name}-difference",
         f"{frame.title}: difference to {reference.label}",
-        f"The row less {reference.label}: behind it is a minus where ↑ stands and a plus where ↓ stands. Mean of the "
-        "cases' differences; in brackets the 95 % interval of a bootstrap over cases and seeds. Bold: ahead of "
-        f"{reference.label} by an interval without 0",
+        _difference_caption(reference.label, entrants),
         ("method",),
         columns,
         tuple(_apart(rows)),
-        frame.remarks,
+        (*_over(frame, entrants, "Mean over"), *frame.remarks),
+    )
+
+
+def rests_on(frame: Frame, entrants: Sequence[Entrant], words: str = "Mean over") -> list[str]:
+    """A sentence on the cases that the rows' figures are over, and one on their seeds; none where nothing was run."""
+    seeds = seeds_said([under for entrant in entrants if kind_of(entrant) != "floor" for under in entrant.records])
+    return _over(frame, entrants, words) + ([seeds] if seeds else [])
+
+
+def _over(frame: Frame, entrants: Sequence[Entrant], words: str) -> list[str]:
+    cases = [cases_of(entrants, index) for index in range(len(frame.conditions))]
+    said = cases_said(words, frame.conditions, cases)
+    return [said] if said else []
+
+
+def cases_of(entrants: Sequence[Entrant], condition: int) -> list[str]:
+    """The cases that any row was run on under a condition."""
+    return list(dict.fromkeys(record.case for entrant in entrants for record in entrant.records[condition]))
+
+
+def _difference_caption(reference: str, entrants: Sequence[Entrant]) -> str:
+    several = any(len(under) > len({run.case for run in under}) for each in entrants for under in each.records)
+    drawn = "cases and seeds" if several else "cases alone, as every row has one seed"
+    return (
+        f"The row less {reference}: behind it is a minus where ↑ stands and a plus where ↓ stands. Mean of the cases' "
+        f"differences; in brackets the 95 % interval of a bootstrap over {drawn}. Bold: ahead of {reference} by an "
+        "interval without 0"
     )
 
 
@@ -238,7 +265,7 @@ def _timed_row(title: str, variant: Variant, cases: list[str], scores: Sequence[
 def _named_row(entrant: Entrant, entrants: Sequence[Entrant], columns: Sequence[Column], frame: Frame) -> Row:
     cells = []
     for index in range(len(frame.conditions)):
-        cases = list(dict.fromkeys(record.case for other in entrants for record in other.records[index]))
+        cases = cases_of(entrants, index)
         for name in frame.scores:
             if entrant.absent or not cases:
                 cells.append(Cell("n/a", note=entrant.absent or "no record yet"))

@@ -126,9 +126,11 @@ def _digests(record: RunRecord) -> tuple[Any, Any]:
 def _settings(record: RunRecord) -> dict[str, Any]:
     """Everything that tells variants of a method apart, flat: "deform.enabled" -> False."""
     fit = json.dumps(record.prior.get("config"), sort_keys=True).encode()
+    seen = record.prior.get("keypoints", "none")
     return _flat(record.config) | {
         "--prior": record.prior.get("choice", record.prior.get("name")),
         "prior fit": hashlib.sha256(fit).hexdigest()[:4],
+        **({"--use-keypoints": seen} if seen != "none" else {}),
     }
 
 

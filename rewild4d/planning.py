@@ -1,6 +1,6 @@
 """From a table's file to what has to be run for it, and to which records are its rows."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any
@@ -14,6 +14,7 @@ from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.specs import Condition, Line, Spec, load_reported
 from rewild4d.leaderboard.tables import Entrant, Frame
 from rewild4d.leaderboard.variants import is_floor, latest
+from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import PRESETS as PRIOR_PRESETS
 from rewild4d.priors.config import STANDARD
 from rewild4d.protocol import Protocol, load_protocols
@@ -44,7 +45,7 @@ def with_choice(name: str, spec: Spec, choice: Choice) -> Spec:
     if choice.protocol:
         if len(conditions) > 1:
             raise UserError(f"--protocol: the table '{name}' compares {len(conditions)} conditions of its own.")
-        conditions = (msgspec.structs.replace(conditions[0], protocol=choice.protocol),)
+        conditions = (msgspec.structs.replace(conditions[0], protocol=known_protocol(choice.protocol)),)
     full = tuple(msgspec.structs.replace(one, protocol=newest_protocol(one.protocol)) for one in conditions)
     return msgspec.structs.replace(spec, conditions=full, preset=choice.preset or spec.preset)
 
@@ -54,6 +55,18 @@ def newest_protocol(name: str) -> str:
     protocols = load_protocols()
     family = [known for known in protocols if known.rpartition("-v")[0] == name]
     return max(family, key=lambda known: int(known.rpartition("-v")[2])) if family else name
+
+
+def known_protocol(name: str, recorded: Iterable[str] = ()) -> str:
+    """The full name of a protocol or family that ships or is installed, or of which there are records.
+
+    Raises:
+        UserError: unknown.
+    """
+    full, known = newest_protocol(name), {*load_protocols(), *recorded}
+    if full not in known:
+        raise unknown_name("protocol", name, known)
+    return full
 
 
 def row_entry(table: str, row: Line, spec: Spec, seeds: tuple[int, ...]) -> Entry:
@@ -132,7 +145,7 @@ def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[
         )
         if any(own):
             rows.append(Entrant(floor, own))
-    return rows, remarks
+    return rows, [*remarks, *_missing(spec, cases)]
 
 
 def reported(spec: Spec) -> Any:
@@ -159,8 +172,34 @@ def _is_under(record: RunRecord, condition: Condition, spec: Spec) -> bool:
     wanted = spec.dataset, condition.protocol, condition.prior
     fits = not condition.cases or any(fnmatchcase(record.case, pattern) for pattern in condition.cases)
     effort = record.prior.get("config")  # records from before it was written have none
-    same_effort = effort is None or _equals(effort, PRIOR_PRESETS.get(spec.preset, STANDARD))
+    asked = PriorChoice(condition.prior, PRIOR_PRESETS.get(spec.preset, STANDARD)).settings_under(_has_cameras(record))
+    same_effort = effort is None or _equals(effort, asked)
     return (record.dataset, record.protocol["name"], choice) == wanted and fits and same_effort
+
+
+def _has_cameras(record: RunRecord) -> bool:
+    match record.protocol:
+        case {"selection": {"cameras": "unknown"}}:
+            return False
+        case _:
+            return True
+
+
+def _missing(spec: Spec, cases: Sequence[Collection[str]]) -> list[str]:
+    """A sentence on the cases that the table's file names and no row has; conditions without any say so in the cells.
+
+    Args:
+        spec: the table.
+        cases: that the rows were run on, under each condition.
+    """
+    absent = [
+        pattern
+        for condition, found in zip(spec.conditions, cases, strict=True)
+        for pattern in condition.cases
+        if found and not any(fnmatchcase(case, pattern) for case in found)
+    ]
+    names = ", ".join(dict.fromkeys(absent))
+    return [f"Missing: there is no record here of {names}, which the table's file names too."] if absent else []
 
 
 def _beside_equals(record: RunRecord) -> RunRecord:

@@ -88,6 +88,16 @@ def test_a_protocol_without_a_version_is_the_newest(monkeypatch: pytest.MonkeyPa
     assert planning.newest_protocol("c") == "c"
 
 
+def test_comparisons_have_a_row_of_every_method() -> None:
+    """The noise of a prior says nothing of a method that takes none."""
+    specs = load_specs()
+    rows = {name: [(row.label, row.method) for row in specs[name].rows] for name in specs}
+    assert rows["protocols"] == rows["sweep-random"] == rows["artemis"]
+    asked = [(label, method) for label, method in rows["artemis"] if load_method(method).info.uses_prior]
+    assert rows["prior-mismatch"] == asked and len(asked) == len(rows["artemis"]) - 1
+    assert "D-3DGS does not see the prior" in specs["prior-mismatch"].description
+
+
 def test_conditions_of_one_protocol_are_one_plan() -> None:
     found = spec([], conditions=(
         Condition(protocol="p", cases=("*@side",)), Condition(protocol="p", cases=("*@frontal",)),
@@ -301,6 +311,8 @@ def test_parts_of_a_case_are_run_side_by_side(demo: Spec, tmp_path: Path, monkey
         (["run", "--table", "ablation", "--jobs", "-1"], "--jobs: expected a number of at least 0, got -1"),
         (["run", "--table", "ablation", "--protocol", "artemis-swep-128-v1"], "Did you mean 'artemis-sweep-128-v1'?"),
         (["table", "ablatoin"], "unknown table 'ablatoin'. Did you mean 'ablation'?"),
+        (["table", "artemis", "--protocol", "nope"], "unknown protocol 'nope'. Available: "),
+        (["table", "artemis", "--protocol", "artemis-swep-256"], "Did you mean 'artemis-sweep-256-v"),
         (["table", "ablation", "--format", "pdf"], "unknown format 'pdf'. Available: csv, html, latex, md"),
         (["table", "--against", "ours"], "--against: expected the name of a table too"),
         (["table", "ablation", "artemis"], "table: expected the name of one table, got ablation artemis"),

@@ -218,6 +218,17 @@ def test_a_named_table_is_pooled_under_each_condition(tmp_path: Path) -> None:
     assert [(cell.text, cell.note) for cell in made.rows[1].cells] == [("n/a", "not written yet")] * 2
 
 
+def test_a_copy_of_a_record_has_its_features(tmp_path: Path) -> None:
+    """Rows of named tables are records without some of their marks."""
+    found = [run(tmp_path / case, case, 0) for case in ("a", "bb")]
+    copies = tuple(msgspec.structs.replace(one, marks=["other"]) for _, one in found)
+    frame = Frame("t", "T", "", ("",), ("kid_v",))
+    made = pooled_table(frame, [Entrant("ours", (copies,))], found)
+    parts = [read_features(folder / FILE)["kid_v"] for folder, _ in found]
+    assert made.rows[0].cells[0].value == distances(pool(parts))[0].value is not None
+    assert made.remarks[0] == "Pooled over 2 cases: a, bb."
+
+
 class Counting:
     """A network and how often it was asked."""
 

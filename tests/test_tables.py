@@ -171,7 +171,7 @@ def test_reported_rows_are_marked_and_never_ranked() -> None:
         "ours": ("20.00", "", "best"), "g": ("10.00", "", "second"), "Ours (reported)": ("99.00", "", ""),
         "GART (reported)": ("ours − 4.0", "", ""), "None (reported)": ("", "", ""),
     }  # fmt: skip
-    assert made.remarks == ("Reported: Paper, its table. Loose.",)
+    assert made.remarks[-1] == "Reported: Paper, its table. Loose."
     assert latex(made).count(r"\midrule") == 2, "a rule before the methods, one before what was reported"
 
 

@@ -1,6 +1,9 @@
 """The tables of videos in the wild: which cases and protocols they plan, what they say where data has none."""
 
+import csv
+import io
 from pathlib import Path
+from typing import Any
 
 import cv2
 import msgspec
@@ -12,13 +15,15 @@ from rewild4d import cli, planning
 from rewild4d.commands import run_table
 from rewild4d.commands.choice import cases_of, chosen
 from rewild4d.datasets.davis import known_sequences
-from rewild4d.leaderboard.records import Score, write_record
+from rewild4d.leaderboard.records import RunRecord, Score, find_records, write_record
 from rewild4d.leaderboard.specs import load_specs
 from rewild4d.planning import Choice
+from rewild4d.priors.config import FOOTAGE, QUICK, STANDARD, PriorConfig
 from rewild4d.protocol import load_protocols
 
 DAVIS = Path("/work/shared/data/davis")
 NAMES = ("input-view", "novel-view")
+COMMITTED = Path(__file__).resolve().parents[1] / "leaderboard" / "results" / "2026-11-22-davis-standard"
 
 
 @pytest.fixture(autouse=True)
@@ -44,6 +49,18 @@ def call(*words: str) -> int:
     with pytest.raises(SystemExit) as stop:
         cli.main(list(words))
     return int(stop.value.code or 0)
+
+
+def run_of(protocol: str, case: str, prior: PriorConfig, preset: str = "standard", **changes: Any) -> RunRecord:
+    """A run of `ours` as the runner records it: all settings, those of the prior's fit among them."""
+    spec = chosen("novel-view", load_specs()["novel-view"], Choice(preset))
+    config = msgspec.to_builtins(planning.row_entry("novel-view", spec.rows[-1], spec, (0,)).config)
+    found = load_protocols()[protocol]
+    return record(
+        dataset=found.dataset, case=case, config=config, preset=preset,
+        protocol={**msgspec.to_builtins(found), "digest": "d"},
+        prior={"choice": "template", "config": msgspec.to_builtins(prior)}, **changes,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -132,22 +149,80 @@ def test_the_real_sequences_can_be_planned(name: str, tmp_path: Path) -> None:
 
 def test_distances_that_were_not_computed_say_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One run fills both tables; what the networks' weights are missing for is n/a, with the reason below."""
-    spec = chosen("novel-view", load_specs()["novel-view"], Choice())
-    entry = planning.row_entry("novel-view", spec.rows[-1], spec, (0,))
     scores = {
         "psnr": Score(21.0, "dB", "higher", 1, [21.0]),
         "kid_v": Score(0.125, "1", "lower", 128, [], "n = 128, m = 40"),
         "fvd_f": Score(None, "1", "lower", 0, [], "not computed: weights missing"),
     }
-    protocol = {**msgspec.to_builtins(load_protocols()["davis-512-v2"]), "digest": "d"}
-    made = record(
-        dataset="davis", case="camel", config=msgspec.to_builtins(entry.config), preset="standard", scores=scores,
-        protocol=protocol, prior={"choice": "template"},
-    )  # fmt: skip
-    write_record(made, tmp_path / "runs" / "one")
+    write_record(run_of("davis-512-v2", "camel", FOOTAGE, scores=scores), tmp_path / "runs" / "one")
     shown = {}
     for name in NAMES:
         assert call("table", name, "--runs", str(tmp_path / "runs")) == 0
         shown[name] = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| Ours"))
     assert shown["input-view"].startswith("| Ours | 21.00 |")
     assert shown["novel-view"] == "| Ours | 0.1250 | n/a [2] | n/a [3] |"
+
+
+@pytest.mark.parametrize(
+    ("table", "protocol", "case", "preset", "fitting"),
+    [
+        ("input-view", "davis-512-v2", "camel", "standard", FOOTAGE),
+        ("input-view", "davis-512-v2", "camel", "quick", FOOTAGE),
+        ("artemis", "artemis-sweep-256-v2", "wolf/Run", "standard", STANDARD),
+        ("artemis", "artemis-sweep-256-v2", "wolf/Run", "quick", QUICK),
+    ],
+)
+def test_a_row_takes_only_runs_whose_prior_was_fitted_as_the_tables_is(
+    table: str, protocol: str, case: str, preset: str, fitting: PriorConfig
+) -> None:
+    """Footage without cameras has one fit for all presets, and under known cameras that fit is another prior."""
+    spec = chosen(table, load_specs()[table], Choice(preset))
+    other = msgspec.structs.replace(fitting, yaw_starts=fitting.yaw_starts + 1)
+    for tried in (FOOTAGE, STANDARD, QUICK, other):
+        rows, _ = planning.entrants(table, spec, [run_of(protocol, case, tried, preset)])
+        ours = next(row for row in rows if row.label == "Ours")
+        assert bool(ours.records[0]) == (tried is fitting)
+
+
+def test_the_committed_records_fill_both_tables(capsys: pytest.CaptureFixture[str]) -> None:
+    """Every row has a figure: the mean of what the two records say of camel and of cows."""
+    scores = {(made.method, made.case): made.scores for _, made in find_records(COMMITTED)}
+    for name in NAMES:
+        spec = load_specs()[name]
+        assert call("table", name, "--runs", str(COMMITTED), "--format", "csv") == 0
+        lines = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+        found = {(line["method"], line["score"]): line["value"] for line in lines}
+        for row in spec.rows:
+            for score in spec.scores:
+                camel, cows = (scores[row.method, case][score].value or 0.0 for case in ("camel", "cows"))
+                assert float(found[row.label, score]) == pytest.approx((camel + cows) / 2)
+        if name == "input-view":
+            assert f"{float(found['Ours', 'psnr']):.2f}" == "25.04", "25.92 and 24.16, as the notes on them say"
+
+
+def test_pooling_without_features_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("table", "novel-view", "--pooled", "--runs", str(COMMITTED)) == 0
+    out = capsys.readouterr().out
+    assert "Pooled over 2 cases: camel, cows." in out and "expected the features of a run, but there is no such" in out
+
+
+def test_cases_that_are_missing_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rest = "Missing: there is no record here of bear, dog, dog-agility, elephant, goat, rhino, which the table's file"
+    for case in ("camel", "cows"):
+        write_record(run_of("davis-512-v2", case, FOOTAGE, run_id=case), tmp_path / case)
+    assert call("table", "input-view", "--runs", str(tmp_path)) == 0
+    out = capsys.readouterr().out
+    assert "Mean over 2 cases: camel, cows." in out and rest in out
+    assert call("table", "input-view", "--runs", str(tmp_path), "--case", "cows") == 0
+    out = capsys.readouterr().out
+    assert "Mean over 1 case: cows." in out and "of bear, camel, dog," in out
+    assert call("table", "artemis", "--runs", str(tmp_path)) == 0
+    assert "Missing" not in capsys.readouterr().out, "that table is for whatever the data has"
+
+
+def test_the_page_has_both_tables(tmp_path: Path) -> None:
+    page = tmp_path / "page"
+    assert call("leaderboard", "build", "--runs", str(COMMITTED), "--out", str(page)) == 0
+    text = (page / "index.html").read_text()
+    for name in NAMES:
+        assert f'<table id="{name}">' in text and f'<table id="{name}-difference">' in text

@@ -32,7 +32,8 @@ class Options:
         runs: folder of runs (what `run --out` named).
         format: md, latex (booktabs), html or csv (one line a figure, for programs).
         against: label of a row: adds the difference of all others to it, case by case, with a bootstrap interval.
-        protocol: only this protocol's runs; of a table with one condition, that condition.
+        protocol: only this protocol's runs, without a version those of the newest; of a table with one condition, that
+            condition.
         preset: of the runs in a named table; the table's own where it is left out.
         case: only these cases, names or patterns ("wolf/*").
         pooled: KID and FVD over all cases at once, from the features kept beside the records.
@@ -64,7 +65,10 @@ def main(arguments: list[str]) -> int:
 
 
 def _everything(options: Options) -> list[Table]:
-    found = [pair for pair in _found(options) if options.protocol in ("", pair[1].protocol["name"])]
+    found = _found(options)
+    if options.protocol:
+        name = planning.known_protocol(options.protocol, [record.protocol["name"] for _, record in found])
+        found = [pair for pair in found if pair[1].protocol["name"] == name]
     return pooled_tables(found) if options.pooled else protocol_tables([record for _, record in found])
 
 

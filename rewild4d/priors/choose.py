@@ -77,7 +77,11 @@ class PriorChoice:
 
     def settings(self, clip: Clip) -> PriorConfig:
         """Settings of the fit that this clip asks for: footage without cameras has its own."""
-        return FOOTAGE if self.name == "template" and not _has_cameras(clip) else self.config
+        return self.settings_under(_has_cameras(clip))
+
+    def settings_under(self, known_cameras: bool) -> PriorConfig:
+        """Settings of the fit where cameras are known or not."""
+        return FOOTAGE if self.name == "template" and not known_cameras else self.config
 
     def keypoints(self, clip: Clip) -> tuple[Marks | None, Marks | None]:
         """The clip's keypoints for the fit and those to score it by; None where there are none."""

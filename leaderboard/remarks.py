@@ -1,0 +1,57 @@
+"""Sentences that only the records can say of a table: over which cases its means are, what is known of the spread."""
+
+from collections.abc import Sequence
+
+from rewild4d.leaderboard.records import RunRecord
+
+FEW = 12
+"""More cases than these are counted, not named."""
+
+
+def cases_said(words: str, titles: Sequence[str], cases: Sequence[Sequence[str]]) -> str:
+    """How many cases the figures are over, and which; "" where there is no record.
+
+    Args:
+        words: that the sentence starts with.
+        titles: of the conditions.
+        cases: names under each of them; told one by one only where they differ.
+    """
+    found = [(title, names) for title, names in zip(titles, cases, strict=True) if names]
+    if len({frozenset(names) for _, names in found}) == 1:
+        found = [("", found[0][1])]
+    named = sum(len(names) for _, names in found) <= FEW
+    parts = [
+        f"{len(names)} case{'s' * (len(names) > 1)}"
+        + (f" ({title})" if title else "")
+        + (f": {', '.join(names)}" if named else "")
+        for title, names in found
+    ]
+    return f"{words} {'; '.join(parts)}." if parts else ""
+
+
+def seeds_said(groups: Sequence[Sequence[RunRecord]]) -> str:
+    """What is known of the spread over seeds; "" where there is no result.
+
+    Args:
+        groups: the records behind each mean that competes as a method.
+    """
+    known = [_has_spread(group) for group in groups if any(run.status == "ok" for run in group)]
+    unknown = "nothing is known of the spread over seeds: bold only orders the means."
+    if not known:
+        return ""
+    if all(known):
+        return "± is the spread over seeds."
+    if any(known):
+        return f"± is the spread over seeds; where a row has none, {unknown}"
+    if all(len({run.seed for run in group}) <= 1 for group in groups):
+        return f"Every row has one seed, so that {unknown}"
+    return f"No row has two seeds on all of its cases, so that {unknown}"
+
+
+def _has_spread(group: Sequence[RunRecord]) -> bool:
+    """Whether two seeds have a result on every case, as `statistics.estimate` wants for a spread."""
+    seeds: dict[str, set[int]] = {}
+    for run in group:
+        if run.status == "ok":
+            seeds.setdefault(run.case, set()).add(run.seed)
+    return len(set.intersection(*seeds.values())) > 1 if seeds else False
