@@ -28,6 +28,7 @@ from rewild4d.contracts import Log, MethodInfo
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import digest, load_tensors, save_tensors, write_text
 from rewild4d.meshes import Discs
+from rewild4d.ours.config import Count, Positive
 from rewild4d.ours.motion import camera_between, frame_position
 from rewild4d.priors.motion import pose_at
 from rewild4d.transforms import skin_points, split_similarity
@@ -54,9 +55,9 @@ class ExternalConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     """Whether results stand in the world of the cameras; "no" rotates them to the best input-view PSNR."""
     up: Literal["profile", "y", "-y", "z", "any"] = "profile"
     """Axis of its results that points up, where they are rotated; "any" tries all three."""
-    points: int = 20_000
+    points: Count = 20_000
     """Gaussians on a mesh."""
-    timeout: float = 6 * 3600.0
+    timeout: Positive = 6 * 3600.0
     """Seconds that the program may take."""
 
 
@@ -188,6 +189,8 @@ def _read(
     placed: Sequence[Moment] = moments
     marks: tuple[str, ...] = ()
     notes: dict[str, Any] = {"program": config.program or profile.title, "files": len(paths)}
+    if len(moments) != len(clip.frames):
+        notes["moments"] = f"{len(moments)} files for {len(clip.frames)} frames, spread evenly over the clip"
     if profile.crops:
         placed = [_placed_by_fauna(*pair, prior) for pair in zip(paths, moments, shots, strict=True)]
     elif not profile.placed:

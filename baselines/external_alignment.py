@@ -79,6 +79,9 @@ def place_by_search(
         up: the object's axis that points up, one of `UPS`.
         elevation: one more start, degrees.
         log: progress.
+
+    Raises:
+        UserError: an object without an extent.
     """
     picked = sorted({round(i) for i in np.linspace(0, len(frames) - 1, min(FRAMES, len(frames)))})
     shots = [_reduced(*frames[index]) for index in picked]
@@ -109,6 +112,8 @@ class _Search:
         first = moments[0]
         self.center = first.means.double().median(0).values
         self.spread = float((first.means.double() - self.center).norm(dim=1).quantile(0.9))
+        if not self.spread > 0:
+            raise UserError(f"external: expected an object with an extent, got {len(first)} Gaussians in one place.")
         centers = torch.stack([shot.camera.center for shot in shots])
         self.moves = float((centers - centers[0]).norm(dim=1).max()) > 0.05 * depth
 
@@ -190,7 +195,7 @@ def place_fauna(pose: Path, box: tuple[float, float, float], camera: Camera, dep
         depth: of the animal's centre, world units.
 
     Raises:
-        UserError: the file is missing or holds something else.
+        UserError: the file is missing or holds something else, or its mesh does not lie before its camera.
     """
     try:
         numbers = torch.tensor([float(word) for word in pose.read_text().split()], dtype=torch.float64)
@@ -203,6 +208,8 @@ def place_fauna(pose: Path, box: tuple[float, float, float], camera: Camera, dep
     to_opencv = torch.diag(torch.tensor((1.0, -1.0, -1.0), dtype=torch.float64))
     turn = to_opencv @ numbers[:9].view(3, 3).T
     place = to_opencv @ (numbers[9:] + torch.tensor((0.0, 0.0, -10.0), dtype=torch.float64))
+    if not float(place[2]) > 0:
+        raise UserError(f"{pose}: expected a mesh before 3D-Fauna's camera, got one at depth {float(place[2]):g}.")
     left, top, side = box
     focal = side / 2 / math.tan(math.radians(FAUNA_FOV / 2))
     k = camera.intrinsics.double()

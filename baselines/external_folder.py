@@ -6,7 +6,9 @@ import os
 import re
 import shlex
 import signal
+import string
 import subprocess
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 
@@ -119,17 +121,7 @@ def run_program(command: str, *, clip: Path, out: Path, case: str, seed: int, ti
     Raises:
         UserError: it cannot be started, does not end in time, or ends with another status than 0.
     """
-    given = {"clip": str(clip), "out": str(out), "case": case, "seed": str(seed)}
-    try:
-        words = [word.format(**given) for word in shlex.split(command)]
-    except (KeyError, IndexError, ValueError) as error:
-        raise UserError(
-            f"--command: expected words with {{clip}}, {{out}}, {{case}} or {{seed}}, got '{command}'."
-        ) from error
-    if "{clip}" not in command or "{out}" not in command:
-        raise UserError(
-            f"--command: expected {{clip}} and {{out}} for the two folders among its words, got '{command}'."
-        )
+    words = _words(command, {"clip": str(clip), "out": str(out), "case": case, "seed": str(seed)})
     out.mkdir(parents=True, exist_ok=True)
     with log.open("wb") as file:
         try:
@@ -154,11 +146,29 @@ def run_program(command: str, *, clip: Path, out: Path, case: str, seed: int, ti
         raise UserError(f"{words[0]}: ended with status {status}; its last words: '{_last_words(log)}' (log: {log}).")
 
 
+def _words(command: str, given: Mapping[str, str]) -> list[str]:
+    """A command's words with what {clip}, {out}, {case} and {seed} stand for; bare names only, as `str.format` would
+    look up attributes."""
+    try:
+        words = shlex.split(command)
+        fields = [field for word in words for field in string.Formatter().parse(word) if field[1] is not None]
+    except ValueError as error:  # a quote or a brace that does not end
+        raise UserError(f"--command: expected whole words and braces, got '{command}': {error}.") from error
+    if not all(name in given and not rule and not conversion for _, name, rule, conversion in fields):
+        raise UserError(f"--command: expected words with {{clip}}, {{out}}, {{case}} or {{seed}}, got '{command}'.")
+    if not {"clip", "out"} <= {name for _, name, _, _ in fields}:
+        raise UserError(
+            f"--command: expected {{clip}} and {{out}} for the two folders among its words, got '{command}'."
+        )
+    return [word.format(**given) for word in words]
+
+
 def find_outputs(folder: Path, profile: Profile, frames: int) -> list[Path]:
     """A program's files in the order of time, by the last number in their names.
 
     Raises:
-        UserError: the folder is not there, no file fits, or they are not numbered like the frames, from 0 or from 1.
+        UserError: the folder is not there, no file fits, or they are not numbered one after another from 0 or from 1
+            on, as many as the frames or, where the profile spreads them, as many as its program writes.
     """
     if not folder.is_dir():
         raise UserError(f"{folder}: expected the folder of a program's results, but there is no such folder.")
@@ -170,23 +180,38 @@ def find_outputs(folder: Path, profile: Profile, frames: int) -> list[Path]:
     single = found[0].suffix.lower() in (".glb", ".gltf")
     if single and len(found) > 1:
         raise UserError(f"{folder}: expected one animated file {wanted}, found {len(found)}.")
-    if not single and not profile.spread:
-        fault = _fault([number(path) for path in found], frames)
+    if not single:
+        counts, said = _wanted(profile, frames, len(found))
+        count = len(found) if len(found) in counts else counts[0]
+        fault = _fault([number(path) for path in found], count)
         if fault is not None:
-            raise UserError(f"{folder}: expected {frames} files {wanted}, one a frame, found {len(found)}{fault}.")
+            raise UserError(f"{folder}: expected {said.format(wanted)}, found {len(found)}{fault}.")
     return found
 
 
-def _fault(numbers: list[int], frames: int) -> str | None:
-    """What keeps ascending numbers from being those of the frames, from 0 or from 1 on; None where nothing does."""
+def _wanted(profile: Profile, frames: int, found: int) -> tuple[tuple[int, ...], str]:
+    """How many files a program may leave, the usual number first, and what to call them."""
+    if not profile.spread:
+        return (frames,), f"{frames} files {{}}, one a frame"
+    if profile.moments:
+        other = f" (or {frames}, one a frame)" if frames != profile.moments else ""
+        return (profile.moments, frames), f"{profile.moments} files {{}}{other}"
+    least = min(frames, 2)  # a single moment of a moving animal is what a killed program leaves
+    return (max(found, least),), f"at least {least} files {{}}, numbered one after another"
+
+
+def _fault(numbers: list[int], count: int) -> str | None:
+    """What keeps ascending numbers from being ``count``, from 0 or from 1 on; None where nothing does."""
     first = 1 if numbers[0] == 1 else 0
     twice = next((one for one, other in pairwise(numbers) if one == other), None)
-    missing = next((wanted for wanted in range(first, first + frames) if wanted not in numbers), None)
+    missing = next((wanted for wanted in range(first, first + count) if wanted not in numbers), None)
+    if numbers[0] < 0:
+        return "; at least one has no number in its name"
     if twice is not None:
         return f"; more than one has the number {twice}"
     if missing is not None:
         return f"; the first that is missing is {missing}"
-    return "" if len(numbers) != frames else None
+    return "" if len(numbers) != count else None
 
 
 def number(path: Path) -> int:

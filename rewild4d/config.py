@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import io
+import math
 import re
 import tomllib
 import typing
@@ -61,7 +62,7 @@ def parse_flags(
         also: flags that the command knows under other circumstances, for the nearest name.
 
     Raises:
-        UserError: a flag that does not exist, or a value of the wrong type.
+        UserError: a flag that does not exist, a value of the wrong type, or a number that is not finite.
         SystemExit: --help.
     """
     said = io.StringIO()
@@ -78,9 +79,25 @@ def parse_flags(
         raise unknown_name("option", unknown[0].split("=")[0], [*_flags(options_type), *also])
     if unknown:
         raise UserError(f"{prog}: expected options only, got '{unknown[0]}'; see {prog} --help.")
+    for flag, number in _floats(options):
+        if not math.isfinite(number):
+            raise UserError(f"--{flag}: expected a finite number, got {number}; see {prog} --help.")
     if isinstance(config := getattr(options, "config", None), msgspec.Struct):
         _require_ranges(config, prog)
     return options
+
+
+def _floats(node: Any, place: str = "") -> Iterator[tuple[str, float]]:
+    """Every float among parsed flags, with the flag that gave it ("rates.means[0]")."""
+    if isinstance(node, float):
+        yield place, node
+    elif isinstance(node, tuple | list):
+        for index, value in enumerate(node):
+            yield from _floats(value, f"{place}[{index}]")
+    else:
+        for name in getattr(node, "__struct_fields__", getattr(node, "__dataclass_fields__", ())):
+            flag = "" if name == "config" else name.replace("_", "-")
+            yield from _floats(getattr(node, name), ".".join(filter(None, (place, flag))))
 
 
 def _require_ranges(config: msgspec.Struct, prog: str) -> None:

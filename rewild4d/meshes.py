@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from rewild4d.errors import UserError
+from rewild4d.ply import LARGEST, require_at_most
 from rewild4d.ply import read_mesh as read_ply_mesh
 from rewild4d.ply_elements import read_elements
 from rewild4d.priors.motion import quats_from_normals
@@ -68,7 +69,7 @@ def read_mesh(path: Path) -> Mesh:
     """A mesh with its colours, from an .obj or a .ply file.
 
     Raises:
-        UserError: no such file, another kind of file, damaged, or without triangles.
+        UserError: no such file, another kind of file, damaged, without triangles, or beyond `ply.LARGEST`.
     """
     if path.suffix.lower() == ".obj":
         mesh = _read_obj(path)
@@ -85,6 +86,9 @@ def read_mesh(path: Path) -> Mesh:
         raise UserError(f"{path}: expected a mesh as .obj or .ply, got '{path.suffix}'.")
     if not len(mesh.faces):
         raise UserError(f"{path}: expected a mesh with triangles, got {len(mesh.vertices)} points without any.")
+    require_at_most(path, "coordinates", mesh.vertices, LARGEST["means"])
+    if mesh.colors is not None:
+        _require_finite(path, "colours", mesh.colors, "vertex")
     return mesh
 
 
@@ -175,21 +179,34 @@ def _mesh(
     if not widths or min(widths) < 3:
         raise UserError(f"{path}: expected vertices with three coordinates, got {'fewer' if widths else 'no vertex'}.")
     values = torch.tensor([row[:3] for row in rows["v"]])
-    if not torch.isfinite(values).all():
-        bad = int((~torch.isfinite(values).all(1)).nonzero()[0])
-        raise UserError(f"{path}: expected finite coordinates, got a NaN or an infinite value in vertex {bad}.")
-    indices = torch.tensor(faces, dtype=torch.int64).reshape(-1, 3)
-    if len(indices) and not (int(indices.min()) >= 0 and int(indices.max()) < len(values)):
-        raise UserError(f"{path}: expected faces of vertices 1 to {len(values)}, got one of another.")
+    _require_finite(path, "coordinates", values, "vertex")
+    indices = _corners(path, faces, len(values), "vertices")
     colors = torch.tensor([row[3:6] for row in rows["v"]]).clamp(0, 1) if widths == {6} else None
     texture = _texture(path, library) if places and len(places) == len(faces) else None
     if texture is None:
         return Mesh(values, indices, colors)
-    corners = torch.tensor(places, dtype=torch.int64)
-    if not (int(corners.min()) >= 0 and int(corners.max()) < len(rows["vt"])):
-        raise UserError(f"{path}: expected faces of texture coordinates 1 to {len(rows['vt'])}, got one of another.")
-    uv = torch.tensor([row[:2] for row in rows["vt"]])[corners]
-    return Mesh(values, indices, colors, uv, texture)
+    corners = _corners(path, places, len(rows["vt"]), "texture coordinates")
+    short = next((index for index, row in enumerate(rows["vt"]) if len(row) < 2), None)
+    if short is not None:
+        raise UserError(
+            f"{path}: expected texture coordinates of two numbers, got {len(rows['vt'][short])} in vt {short}."
+        )
+    uv = torch.tensor([row[:2] for row in rows["vt"]])
+    _require_finite(path, "texture coordinates", uv, "vt")
+    return Mesh(values, indices, colors, uv[corners], texture)
+
+
+def _corners(path: Path, triples: list[tuple[int, int, int]], count: int, what: str) -> Tensor:
+    """Rows of ``count`` things that the corners of triangles name, int64, [f, 3]."""
+    if not all(0 <= corner < count for triple in triples for corner in triple):
+        raise UserError(f"{path}: expected faces of {what} 1 to {count}, got one of another.")
+    return torch.tensor(triples, dtype=torch.int64).reshape(-1, 3)
+
+
+def _require_finite(path: Path, what: str, values: Tensor, row: str) -> None:
+    bad = (~torch.isfinite(values).all(1)).nonzero()
+    if len(bad):
+        raise UserError(f"{path}: expected finite {what}, got a NaN or an infinite value in {row} {int(bad[0])}.")
 
 
 def _texture(path: Path, library: str) -> Tensor | None:

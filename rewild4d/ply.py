@@ -24,6 +24,8 @@ COLORS = tuple(f"f_dc_{i}" for i in range(3))
 SPLAT_PROPERTIES = (*COLORS, "opacity", *SCALES, *QUATS)
 REST_COUNTS = {0: 0, 1: 9, 2: 24, 3: 45}
 """Degree of the spherical harmonics -> number of `f_rest_*` properties."""
+LARGEST = {"means": 1e9, "scales": 1e6, "colors": 1e6}
+"""Of what is read, in absolute value: what a camera makes of more does not fit single precision."""
 BRIGHTEST_LOGIT = 15.0
 """Opacities are written within this logit of 0 and 1, so that 0 and 1 themselves stay finite."""
 
@@ -53,10 +55,14 @@ def read_splats(path: Path) -> Splats:
     """The Gaussians of a PLY file, activated values in single precision.
 
     Raises:
-        UserError: as `read_points`, or a property of a Gaussian is missing.
+        UserError: as `read_points`, a property of a Gaussian is missing, or a value is beyond `LARGEST`.
     """
     path = Path(path)
-    return _splats(path, _vertices(path, read_elements(path)))
+    splats = _splats(path, _vertices(path, read_elements(path)))
+    require_at_most(path, "coordinates", splats.means, LARGEST["means"])
+    require_at_most(path, "scales (e to the power of scale_0 to scale_2)", splats.scales, LARGEST["scales"])
+    require_at_most(path, "coefficients of colour", splats.colors, LARGEST["colors"])
+    return splats
 
 
 def read_surface(path: Path, count: int, seed: int) -> Tensor:
@@ -125,6 +131,19 @@ def write_splats(path: Path, splats: Splats) -> None:
         temporary.write_bytes(header.encode("ascii") + values.astype("<f4").tobytes())
 
 
+def require_at_most(path: Path, what: str, values: Tensor, most: float) -> None:
+    """Refuse a file one of whose vertices has a larger value than ``most``, or one that is not finite, [n, ...].
+
+    Raises:
+        UserError: names the file, the value and the vertex.
+    """
+    largest = values.flatten(1).abs().amax(1)
+    bad = (~(largest <= most)).nonzero()
+    if len(bad):
+        row = int(bad[0])
+        raise UserError(f"{path}: expected {what} of at most {most:g}, got {float(largest[row]):.3g} in vertex {row}.")
+
+
 def _vertices(path: Path, elements: dict[str, Element]) -> Element:
     found = elements.get("vertex")
     if found is None:
@@ -183,11 +202,12 @@ def _splats(path: Path, vertices: Element) -> Splats:
     lengths = np.linalg.norm(quats, axis=1, keepdims=True)
     if not lengths.all():
         raise UserError(f"{path}: expected quaternions that are not zero, got one in vertex {lengths.argmin()}.")
-    values = {
-        "means": _columns(path, vertices, ("x", "y", "z")),
-        "quats": quats / lengths,
-        "scales": np.exp(_columns(path, vertices, SCALES)),
-        "opacities": 1 / (1 + np.exp(-_columns(path, vertices, ("opacity",))[:, 0])),
-        "colors": colors,
-    }
+    with np.errstate(over="ignore"):  # an infinite scale is refused where scales count, and 1 / inf is an opacity of 0
+        values = {
+            "means": _columns(path, vertices, ("x", "y", "z")),
+            "quats": quats / lengths,
+            "scales": np.exp(_columns(path, vertices, SCALES)),
+            "opacities": 1 / (1 + np.exp(-_columns(path, vertices, ("opacity",))[:, 0])),
+            "colors": colors,
+        }
     return Splats(**{name: torch.from_numpy(value).float() for name, value in values.items()})

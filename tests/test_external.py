@@ -11,6 +11,7 @@ from torch import Tensor
 from rewild4d.baselines import external_alignment
 from rewild4d.baselines.external_folder import crop_box
 from rewild4d.conformance import tiny_case
+from rewild4d.errors import UserError
 from rewild4d.priors.motion import pose_at
 from rewild4d.protocol import render
 from rewild4d.transforms import similarity, skin_points
@@ -75,6 +76,7 @@ def test_a_result_elsewhere_is_rotated_to_the_best_input_view_and_marked(case: C
     size = float(means.std(0).norm() / truth.std(0).norm())
     assert 0.85 < size < 1.15
     assert found.diagnostics()["placed_scale"] == pytest.approx(1 / 4, rel=0.15)
+    assert "moments" not in found.diagnostics(), "as many files as frames need no remark"
 
 
 def test_gaussians_elsewhere_are_found_by_their_colours(case: Case, tmp_path: Path) -> None:
@@ -87,6 +89,36 @@ def test_gaussians_elsewhere_are_found_by_their_colours(case: Case, tmp_path: Pa
     assert len(found.moments) == 3 and found.times == pytest.approx(case.clip.times)
     notes = found.diagnostics()
     assert notes["program"] == "GVFDiffusion" and notes["placed_psnr"] > 20
+
+
+def test_files_for_other_moments_than_the_frames_are_told(case: Case, tmp_path: Path) -> None:
+    config = settings(tmp_path, "gvfdiffusion", bodies(case)[:2], profile="gvfdiffusion", placed="yes")
+    found = fit(case, config)
+    assert found.diagnostics()["moments"] == "2 files for 3 frames, spread evenly over the clip"
+    assert found.times == pytest.approx((0.1 / 3, 0.5 / 3)) and found.marks == ()
+
+
+def test_gaussians_in_one_place_are_not_searched_for(case: Case, tmp_path: Path) -> None:
+    content = [{**body, "points": [[1.0, 2.0, 3.0]] * 4000} for body in bodies(case)]
+    with pytest.raises(UserError, match="expected an object with an extent, got 4000 Gaussians in one place"):
+        fit(case, settings(tmp_path, "plain", content, placed="no"))
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["0"] * 11, "pose.txt: expected twelve finite numbers, got 11."),
+        (["0"] * 11 + ["nan"], "pose.txt: expected twelve finite numbers, got 12."),
+        (["0"] * 11 + ["x"], "pose.txt: expected twelve numbers, but: could not convert"),
+        (["1"] * 11 + ["10"], "pose.txt: expected a mesh before 3D-Fauna's camera, got one at depth 0."),
+    ],
+)
+def test_a_damaged_camera_of_fauna_is_one_sentence(case: Case, tmp_path: Path, words: list[str], sentence: str) -> None:
+    (tmp_path / "pose.txt").write_text(" ".join(words))
+    camera = case.clip.frames[0].camera
+    assert camera is not None
+    with pytest.raises(UserError, match=sentence):
+        external_alignment.place_fauna(tmp_path / "pose.txt", (0.0, 0.0, 64.0), camera, 2.0)
 
 
 def upright(case: Case, up: int, azimuth: float, sign: int = 1) -> Tensor:

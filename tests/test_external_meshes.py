@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pygltflib
 import pytest
 import torch
 from external_program import coarse_grid, fit, posed
+from external_stub import png
 
 from rewild4d.baselines.external import ExternalConfig
 from rewild4d.baselines.external_folder import find_outputs
@@ -123,7 +125,42 @@ def test_files_are_numbered_like_the_frames(tmp_path: Path, names: tuple[str, ..
         find_outputs(tmp_path, PROFILES["frames"], 3)
 
 
+DREAM = "32 files extracted_textured_meshes/extracted_mesh_*.obj or **/extracted_mesh_*.obj (or 8, one a frame)"
+GVF = "at least 2 files gaussians/*.ply or *.ply, numbered one after another"
+
+
+@pytest.mark.parametrize(
+    ("profile", "numbers", "fault"),
+    [
+        ("dreammesh4d", range(32), ""),
+        ("dreammesh4d", range(8), ""),  # somebody made it one a frame
+        ("dreammesh4d", range(16), f"expected {DREAM}, found 16; the first that is missing is 16."),
+        ("dreammesh4d", (*range(5), *range(6, 32)), f"expected {DREAM}, found 31; the first that is missing is 5."),
+        ("dreammesh4d", (0, 1, 2, 4, 5, 6, 7), f"expected {DREAM}, found 7; the first that is missing is 3."),
+        ("dreammesh4d", (0,), f"expected {DREAM}, found 1; the first that is missing is 1."),
+        ("dreammesh4d", range(33), f"expected {DREAM}, found 33."),
+        ("gvfdiffusion", range(24), ""),
+        ("gvfdiffusion", range(1, 5), ""),
+        ("gvfdiffusion", (0, 1, 2, 4, 5, 6, 7), f"expected {GVF}, found 7; the first that is missing is 3."),
+        ("gvfdiffusion", ("0", "1", "01", "2"), f"expected {GVF}, found 4; more than one has the number 1."),
+        ("gvfdiffusion", (0,), f"expected {GVF}, found 1; the first that is missing is 1."),
+        ("gvfdiffusion", ("canonical", 0, 1), f"expected {GVF}, found 3; at least one has no number in its name."),
+    ],
+)
+def test_spread_files_are_whole_too(tmp_path: Path, profile: str, numbers: Iterable[int | str], fault: str) -> None:
+    """A program with a number of moments of its own: nothing that it lost is spread over the clip unsaid."""
+    paths = [tmp_path / (f"extracted_mesh_{i}.obj" if profile == "dreammesh4d" else f"{i}.ply") for i in numbers]
+    for path in paths:
+        path.touch()
+    if fault:
+        with pytest.raises(UserError, match=re.escape(fault)):
+            find_outputs(tmp_path, PROFILES[profile], 8)
+    else:
+        assert find_outputs(tmp_path, PROFILES[profile], 8) == paths
+
+
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
+TEXTURED = f"mtllib a.mtl\n{OBJ}f 1/1 2/2 3/3\n"
 
 
 @pytest.mark.parametrize(
@@ -135,12 +172,29 @@ OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
         ("", "expected vertices with three coordinates, got no vertex"),
         (OBJ, "expected a mesh with triangles, got 4 points without any"),
         ("v 0 0 nan\n" + OBJ + "f 1 2 3\n", "expected finite coordinates, got a NaN or an infinite value in vertex 0"),
+        (OBJ + "v 0 0 -1e30\nf 1 2 3\n", "expected coordinates of at most 1e+09, got 1e+30 in vertex 4"),
+        (OBJ + f"f 1 2 {10**30}\n", "expected faces of vertices 1 to 4, got one of another"),
+        ("v 0 0 0 nan 1 1\n" * 3 + "f 1 2 3\n", "expected finite colours, got a NaN or an infinite value in vertex 0"),
+        (TEXTURED + "vt 0\nvt 0 0\nvt 0 1 0\n", "expected texture coordinates of two numbers, got 1 in vt 0"),
+        (TEXTURED + "vt 0 0\nvt\nvt 0 1\n", "expected texture coordinates of two numbers, got 0 in vt 1"),
+        (TEXTURED + "vt 0 0\nvt 0 1\nvt 0 inf\n", "expected finite texture coordinates, got a NaN or an infinite"),
+        (TEXTURED + "vt 0 0\n", "expected faces of texture coordinates 1 to 1, got one of another"),
     ],
 )
 def test_a_damaged_obj_is_one_sentence(tmp_path: Path, text: str, sentence: str) -> None:
     (tmp_path / "a.obj").write_text(text)
+    (tmp_path / "a.mtl").write_text("map_Kd a.png\n")
+    (tmp_path / "a.png").write_bytes(png(1, 1, b"\0\1\2\3"))
     with pytest.raises(UserError, match=re.escape(f"a.obj: {sentence}")):
         read_mesh(tmp_path / "a.obj")
+
+
+def test_texture_coordinates_may_have_a_third_number(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text(TEXTURED.replace("f ", "vt 0 0\nvt 0 0 0\nvt 1 1\nf "))
+    (tmp_path / "a.mtl").write_text("map_Kd a.png\n")
+    (tmp_path / "a.png").write_bytes(png(1, 1, b"\0\1\2\3"))
+    mesh = read_mesh(tmp_path / "a.obj")
+    assert mesh.uv is not None and mesh.uv.tolist() == [[[0, 0], [0, 0], [1, 1]]]
 
 
 def test_an_obj_has_polygons_backward_indices_and_colours(tmp_path: Path) -> None:

@@ -42,6 +42,7 @@ FAILURES = {
     "nan": r"frame_0001.ply: expected finite x to z, got a NaN or an infinite value in vertex 5",
     "empty": r"frame_0000.ply: expected Gaussians, got none",
     "cut": r"frame_0000.ply: expected 4000 rows of 'vertex', but the file ends before",
+    "huge": r"frame_0000.ply: expected scales \(.*\) of at most 1e\+06, got 1.65e\+38 in vertex 0",
 }
 
 
@@ -62,6 +63,12 @@ def test_a_failure_is_one_sentence_and_a_failed_record(case: Case, tmp_path: Pat
     assert record.status == "failed" and record.scores == {}
     assert re.search(FAILURES[what], record.error), record.error
     assert "\n" not in record.error
+
+
+def test_an_answer_with_gaps_is_not_spread_over_the_clip(case: Case, tmp_path: Path) -> None:
+    config = settings(tmp_path, "half", bodies(case), profile="gvfdiffusion", placed="yes")
+    (record,) = runner.execute(a_plan(case, tmp_path, config))
+    assert record.status == "failed" and record.error.endswith("found 2; the first that is missing is 1.")
 
 
 def test_a_record_carries_the_mark_and_the_table_does_not_rank_it(case: Case, tmp_path: Path) -> None:
@@ -148,14 +155,25 @@ def test_the_files_that_a_command_names(tmp_path: Path) -> None:
     assert program_digest("theirs {clip} {out}", "tiny__walk") == program_digest("'theirs {clip}", "tiny__walk") == ""
 
 
+FOLDERS = "--command: expected {clip} and {out} for the two folders among its words"
+NAMES = "--command: expected words with {clip}, {out}, {case} or {seed}"
+WHOLE = "--command: expected whole words and braces"
+
+
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
         ({"command": ""}, "external: expected either --command (a program to run) or --folder (its results)"),
         ({"folder": "x"}, "external: expected either --command (a program to run) or --folder (its results)"),
         ({"profile": "dreammesh"}, "unknown profile 'dreammesh'. Did you mean 'dreammesh4d'?"),
-        ({"command": "prog {clip}"}, "--command: expected {clip} and {out} for the two folders among its words"),
-        ({"command": "prog {clip} {out} {what}"}, "--command: expected words with {clip}, {out}, {case} or {seed}"),
+        ({"command": "prog {clip}"}, FOLDERS),
+        ({"command": "prog {{clip}} {out}"}, FOLDERS),
+        *(
+            ({"command": f"prog {{clip}} {{out}} {word}"}, f"{NAMES}, got 'prog {{clip}} {{out}} {word}'")
+            for word in ("{what}", "{}", "{clip.x}", "{clip[a]}", "{clip[0]}", "{clip!r}", "{clip:999999999999}")
+        ),
+        ({"command": "prog {clip} '{out}"}, f"{WHOLE}, got 'prog {{clip}} '{{out}}': No closing quotation"),
+        ({"command": "prog {clip} {out"}, f"{WHOLE}, got 'prog {{clip}} {{out': expected '}}' before end of string"),
         ({"command": "/no/such/program {clip} {out}"}, "that can be started, but '/no/such/program': No such file"),
         (
             {"command": "", "folder": "/no/such/{case}"},

@@ -160,6 +160,9 @@ def test_gaussians_stand_with_their_centres(tmp_path: Path) -> None:
     torch.testing.assert_close(read_surface(tmp_path / "a.ply", 500, 0), one.means[4:].double())
     assert len(read_surface(tmp_path / "a.ply", 2, 0)) == 2
     assert len(read_points(tmp_path / "a.ply")) == 7
+    header = f"{ASCII}element vertex 2\n{XYZ}{WHOLE}"
+    vast = file(tmp_path, header, b"1 2 3 0 0 0 9 888 88 88 1 0 0 0 4 5 6 0 0 0 -888 0 0 0 1 0 0 0")
+    assert read_surface(vast, 9, 0).tolist() == [[1, 2, 3]], "sizes do not count, a faint one does not"
 
 
 def test_a_file_without_points_is_no_error(tmp_path: Path) -> None:
@@ -251,6 +254,10 @@ def test_broken_files_say_so_in_one_sentence(name: str, tmp_path: Path) -> None:
             "finite opacity, got a NaN or an infinite value in vertex 0",
         ),
         (f"{XYZ}{WHOLE}property float f_rest_0\n", b"1 " * 15, "expected 0, 9, 24 or 45 properties f_rest_*, got 1"),
+        (f"{XYZ}{WHOLE}", b"1 " * 8 + b"88 " + b"1 " * 5, "scale_2) of at most 1e+06, got 1.65e+38 in vertex 0"),
+        (f"{XYZ}{WHOLE}", b"1 " * 8 + b"888 " + b"1 " * 5, "scale_0 to scale_2) of at most 1e+06, got inf in vertex 0"),
+        (f"{XYZ}{WHOLE}", b"-1e300 " + b"1 " * 13, "expected coordinates of at most 1e+09, got inf in vertex 0"),
+        (f"{XYZ}{WHOLE}", b"1 " * 3 + b"1e38 " + b"1 " * 10, "coefficients of colour of at most 1e+06, got 2.82e+37"),
     ],
 )
 def test_broken_gaussians_say_so(header: str, body: bytes, text: str, tmp_path: Path) -> None:
