@@ -105,13 +105,13 @@ def _require_records(folders: tuple[Path, ...], found: Sequence[object]) -> None
 
 def _named(records: list[RunRecord], preset: str) -> list[tuple[Table, ...]]:
     """The named tables that compare something, each with the differences to `REFERENCE`: two rows that are no floors
-    have records under every condition."""
+    have records under every condition, and not the same ones."""
     tables: list[tuple[Table, ...]] = []
     for name, spec in load_specs().items():
         full = chosen(name, spec, planning.Choice(preset=preset))
         rows, remarks = planning.entrants(name, full, records)
         whole = [row for row in rows[: len(full.rows)] if all(row.records)]
-        if len(whole) < 2:
+        if len({frozenset(record.run_id for under in row.records for record in under) for row in whole}) < 2:
             continue
         frame = replace(planning.frame(name, full), remarks=tuple(remarks))
         table = named_table(frame, rows, planning.reported(full))
