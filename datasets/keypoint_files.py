@@ -174,7 +174,9 @@ def _deeplabcut(rows: list[list[str]], stems: Sequence[str]) -> dict[str, Points
     heads = {row[0].strip(): row for row in rows[:4]}
     parts, coords = heads["bodyparts"], heads["coords"]
     people = heads.get("individuals", [""] * len(parts))
-    start = next(column for column, value in enumerate(coords) if value.strip() == "x")
+    start = next((column for column, value in enumerate(coords) if value.strip() == "x"), None)
+    if start is None:
+        raise ValueError("no column called x")
     columns: dict[str, dict[str, int]] = {}
     for column in range(start, len(coords)):
         if people[column] == people[start]:

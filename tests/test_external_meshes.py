@@ -168,6 +168,8 @@ TEXTURED = f"mtllib a.mtl\n{OBJ}f 1/1 2/2 3/3\n"
     [
         (OBJ + "f 1 2 9\n", "expected faces of vertices 1 to 4, got one of another"),
         (OBJ + "f 1 2 x\n", "expected numbers in line 5, got 'f 1 2 x'"),
+        (OBJ + "f 0 1 2\n", "expected a face of three or more corners, counted from 1, in line 5, got 'f 0 1 2'"),
+        (OBJ + "f 1 2 3\nf 2 3\n", "expected a face of three or more corners, counted from 1, in line 6, got 'f 2 3'"),
         ("v 0 0\nf 1 1 1\n", "expected vertices with three coordinates, got fewer"),
         ("", "expected vertices with three coordinates, got no vertex"),
         (OBJ, "expected a mesh with triangles, got 4 points without any"),
