@@ -156,8 +156,8 @@ def _read_obj(path: Path) -> Mesh:
             elif key == "f":
                 corners = [[int(part) if part else 0 for part in word.split("/")] for word in words]
                 if len(corners) < 3 or not all(corner[0] for corner in corners):
-                    raise UserError(f"{path}: expected a face of three or more corners, counted from 1, in line {number}, "
-                                    f"got '{line.strip()[:60]}'.")  # fmt: skip
+                    wanted = f"a face of three or more corners, counted from 1, in line {number}"
+                    raise UserError(f"{path}: expected {wanted}, got '{line.strip()[:60]}'.")
                 fan = [(0, i, i + 1) for i in range(1, len(corners) - 1)]
                 faces += [tuple(_index(corners[i][0], len(rows["v"])) for i in each) for each in fan]  # type: ignore[misc]
                 if all(len(corner) > 1 and corner[1] for corner in corners):
