@@ -72,7 +72,7 @@ def test_held_out_frames_are_seen_with_the_reconstructions_camera(case: tuple[Cl
 
 def test_without_any_camera_it_says_so(case: tuple[Clip, Truth]) -> None:
     clip, truth = case
-    with pytest.raises(UserError, match="held-out frame at 0.2000 s needs a camera, but neither the data set nor"):
+    with pytest.raises(UserError, match="the frame at 0.2000 s needs a camera, but neither the data set nor"):
         evaluate(Plate(clip, knows=False), clip, truth, PROTOCOL, lambda *_: None, CPU)
 
 
