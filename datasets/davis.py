@@ -20,7 +20,7 @@ import numpy as np
 
 from rewild4d.contracts import Finding, Selection
 from rewild4d.datasets.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
-from rewild4d.datasets.keypoint_files import read_keypoints, told_outside
+from rewild4d.datasets.keypoint_files import read_keypoints
 from rewild4d.datasets.keypoints import read_badja
 from rewild4d.datasets.mask_check import check_videos
 from rewild4d.datasets.masks import MaskFiles, list_images, match_masks, open_masks
@@ -216,13 +216,13 @@ class Davis:
         stems = [file.stem for file in files]
         own = next((file for file in _badja_files(self.root, sequence) if file.is_file()), None)
         if self.keypoints is not None:
-            found = read_keypoints(self.keypoints, stems, size)
+            found, told = read_keypoints(self.keypoints, stems, size)
         elif own is not None:
-            found = read_badja(own, stems, size)
+            found, told = read_badja(own, stems, size)
         else:
             return {}, ""
         known = {stem: points for stem, points in zip(stems, found, strict=True) if points is not None}
-        return known, told_outside(found, size)
+        return known, told
 
     def _strangers(self, case: str) -> list[int]:
         """Ids of the objects of a case that are known to be no animal of the sequence (`animals` in davis.toml)."""

@@ -8,7 +8,7 @@ import csv
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from rewild4d.datasets.entries import (
     shown,
     triples_of,
 )
-from rewild4d.datasets.keypoints import BADJA_SIZE, FoundKeypoints, badja_joints, bounded, inside
+from rewild4d.datasets.keypoints import BADJA_SIZE, OfFrames, badja_joints, bounded, not_used
 from rewild4d.errors import UserError
 from rewild4d.types import Keypoints
 
@@ -38,7 +38,7 @@ Points = list[tuple[str, float, float, bool]]
 """(name, x, y, visible), pixel centres at +0.5."""
 
 
-def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int]) -> FoundKeypoints:
+def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int]) -> OfFrames:
     """Keypoints of the frames of a folder.
 
     Args:
@@ -47,7 +47,7 @@ def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int]) -> F
         size: width and height of the frames in pixels.
 
     Returns:
-        One entry per frame; points outside the frame are not visible (`told_outside`).
+        One entry per frame, in which points outside the frame are not visible, and what of the file is not used.
 
     Raises:
         UserError: the file is none of these, is broken, holds no usable keypoints, or names no frame of the folder.
@@ -70,24 +70,12 @@ def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int]) -> F
     faults = "; ".join(left.told())
     if not any(found.values()):
         raise UserError(f"{path}: {wanted}, got none{f': {faults}' if faults else ''}.")
-    result = FoundKeypoints(_checked(found[stem], size) if found.get(stem) else None for stem in stems)
+    result = [_checked(found[stem], size) if found.get(stem) else None for stem in stems]
     if not any(result):
         raise UserError(
             f"{path}: {wanted}, got those of {', '.join(list(found)[:3])}{f' ({faults})' if faults else ''}."
         )
-    result.left_out = f"{path.name}: {faults}" if faults else ""
-    return result
-
-
-def told_outside(found: Iterable[Keypoints | None], size: tuple[int, int]) -> str:
-    """A sentence on what a file holds but is not used; "" where there is no such thing.
-
-    That is: points that it marks as seen but that lie outside their frame, and entries that were left out.
-    """
-    count = sum(int((~inside(keypoints.points, size)).sum()) for keypoints in found if keypoints is not None)
-    outside = f"{count} keypoints outside their frame taken as not visible" if count else ""
-    left_out = found.left_out if isinstance(found, FoundKeypoints) else ""
-    return "; ".join(text for text in (outside, left_out) if text)
+    return result, not_used(path, result, size, left)
 
 
 def _checked(points: Points, size: tuple[int, int]) -> Keypoints:

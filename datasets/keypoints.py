@@ -45,14 +45,8 @@ def read_json(path: Path) -> Any:
         raise UserError(f"{path}: expected JSON, but it cannot be parsed ({error}).") from error
 
 
-class FoundKeypoints(list[Keypoints | None]):
-    """Of each frame of a video.
-
-    Attributes:
-        left_out: a sentence on the entries of the file that could not be used; "" where there are none.
-    """
-
-    left_out = ""
+OfFrames = tuple[list[Keypoints | None], str]
+"""The keypoints of each frame of a video, and a sentence on what their file holds but is not used ("" for nothing)."""
 
 
 def badja_joints(entry: Entry) -> tuple[str, list[tuple[float, float]], list[bool]]:
@@ -94,8 +88,23 @@ def inside(points: Tensor, size: tuple[int, int]) -> Tensor:
     return ((points >= 0) & (points <= torch.tensor(size))).all(dim=1)
 
 
-def read_badja(path: Path, stems: Sequence[str], size: tuple[int, int]) -> FoundKeypoints:
-    """BADJA's joints of one sequence, those outside the frame not visible (`told_outside`).
+def not_used(path: Path, found: Sequence[Keypoints | None], size: tuple[int, int], left: LeftOut) -> str:
+    """A sentence on the points that a file marks as seen but that lie outside their frame, and on the entries that were
+    left out; "" where there are none.
+
+    Args:
+        path: of the file.
+        found: of each frame.
+        size: width and height of the frames in pixels.
+        left: entries of the file.
+    """
+    count = sum(int((~inside(keypoints.points, size)).sum()) for keypoints in found if keypoints is not None)
+    outside = [f"{count} keypoints outside their frame taken as not visible"] if count else []
+    return "; ".join([*outside, *(f"{path.name}: {sentence}" for sentence in left.told())])
+
+
+def read_badja(path: Path, stems: Sequence[str], size: tuple[int, int]) -> OfFrames:
+    """BADJA's joints of one sequence, those outside the frame not visible.
 
     Args:
         path: joint_annotations/<sequence>.json.
@@ -112,9 +121,8 @@ def read_badja(path: Path, stems: Sequence[str], size: tuple[int, int]) -> Found
     if not named:
         reasons = "; ".join(left.told()) or "no list of such"
         raise UserError(f"{path}: expected BADJA's list of image_path, joints[37] and visibility[37], got {reasons}.")
-    found = FoundKeypoints(named.get(stem) for stem in stems)
-    found.left_out = "; ".join(f"{path.name}: {sentence}" for sentence in left.told())
-    return found
+    found = [named.get(stem) for stem in stems]
+    return found, not_used(path, found, size, left)
 
 
 def _named_joints(entry: Entry, size: tuple[int, int]) -> tuple[str, Keypoints]:

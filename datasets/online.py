@@ -15,7 +15,7 @@ import numpy as np
 from rewild4d.contracts import Finding, Selection
 from rewild4d.datasets import masks as mask_files
 from rewild4d.datasets.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
-from rewild4d.datasets.keypoint_files import read_keypoints, told_outside
+from rewild4d.datasets.keypoint_files import read_keypoints
 from rewild4d.datasets.mask_check import check_videos
 from rewild4d.datasets.mask_makers import Unmasked
 from rewild4d.datasets.masks import MaskFiles, fit_size, list_images, match_masks, open_masks, read_transparency
@@ -170,11 +170,10 @@ class Online:
 
     @cached_property
     def _keypoints(self) -> tuple[list[Keypoints | None], str]:
-        """Of every frame, and a sentence on those that lie outside."""
+        """Of every frame, and a sentence on what of their file is not used."""
         if self.keypoints is None:
             return [None] * len(self._material.times), ""
-        found = read_keypoints(self.keypoints, self._stems, self._material.size)
-        return found, told_outside(found, self._material.size)
+        return read_keypoints(self.keypoints, self._stems, self._material.size)
 
     @property
     def name(self) -> str:

@@ -61,7 +61,7 @@ class Collection:
     remarks: list[str] = field(default_factory=list)
 
 
-def collect(found: Sequence[Found], out: Path, *, title: str, pictures: str = "open", limit: int) -> Collection:
+def collect(found: Sequence[Found], out: Path, *, title: str, pictures: str = "open", limit: float) -> Collection:
     """Write the records and the pictures of the first seed of every row; an earlier collection there is replaced.
 
     Args:

@@ -172,17 +172,10 @@ def _is_under(record: RunRecord, condition: Condition, spec: Spec) -> bool:
     wanted = spec.dataset, condition.protocol, condition.prior
     fits = not condition.cases or any(fnmatchcase(record.case, pattern) for pattern in condition.cases)
     effort = record.prior.get("config")  # records from before it was written have none
-    asked = PriorChoice(condition.prior, PRIOR_PRESETS.get(spec.preset, STANDARD)).settings_under(_has_cameras(record))
+    known_cameras = record.protocol.get("selection", {}).get("cameras") != "unknown"
+    asked = PriorChoice(condition.prior, PRIOR_PRESETS.get(spec.preset, STANDARD)).settings_under(known_cameras)
     same_effort = effort is None or _equals(effort, asked)
     return (record.dataset, record.protocol["name"], choice) == wanted and fits and same_effort
-
-
-def _has_cameras(record: RunRecord) -> bool:
-    match record.protocol:
-        case {"selection": {"cameras": "unknown"}}:
-            return False
-        case _:
-            return True
 
 
 def _missing(spec: Spec, cases: Sequence[Collection[str]]) -> list[str]:

@@ -259,7 +259,7 @@ def test_badja_is_row_then_column(tmp_path: Path) -> None:
     joints = [[0, 0]] * 33 + [[540 - 0.5, 1440 - 0.5]] + [[0, 0]] * 3
     entry = {"image_path": "x/00002.png", "joints": joints, "visibility": [i == 33 for i in range(37)]}
     (tmp_path / "camel.json").write_text(json.dumps([entry]))
-    (found,) = read_badja(tmp_path / "camel.json", ["00002"], (960, 540))
+    (found,), _ = read_badja(tmp_path / "camel.json", ["00002"], (960, 540))
     assert found is not None
     nose = found.names.index("nose")
     assert found.points[nose].tolist() == [1440 / 1920 * 960, 540 / 1080 * 540]

@@ -21,7 +21,6 @@ from rewild4d.planning import Choice
 from rewild4d.priors.config import FOOTAGE, QUICK, STANDARD, PriorConfig
 from rewild4d.protocol import load_protocols
 
-DAVIS = Path("/work/shared/data/davis")
 NAMES = ("input-view", "novel-view")
 COMMITTED = Path(__file__).resolve().parents[1] / "leaderboard" / "results" / "2026-11-22-davis-standard"
 
@@ -138,10 +137,9 @@ def test_a_video_of_ones_own_can_fill_the_table(tmp_path: Path, capsys: pytest.C
     assert "--masks: the data set 'artemis' does not take it" in capsys.readouterr().err
 
 
-@pytest.mark.skipif(not DAVIS.is_dir(), reason=f"no DAVIS sequences in {DAVIS}")
 @pytest.mark.parametrize("name", NAMES)
-def test_the_real_sequences_can_be_planned(name: str, tmp_path: Path) -> None:
-    options = run_table.Options(table=name, data=DAVIS, out=tmp_path / "runs", protocol="davis-256", seeds=(0,))
+def test_the_real_sequences_can_be_planned(name: str, tmp_path: Path, davis: Path) -> None:
+    options = run_table.Options(table=name, data=davis, out=tmp_path / "runs", protocol="davis-256", seeds=(0,))
     spec = chosen(name, load_specs()[name], Choice(protocol="davis-256"))
     (plan,) = run_table.make_plans(options, spec)
     assert plan.cases == ("camel", "cows")

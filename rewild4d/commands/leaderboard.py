@@ -44,10 +44,6 @@ class BuildOptions:
     preset: str = ""
 
 
-MOST_MB = 1e9
-"""More is no limit at all."""
-
-
 @dataclass(frozen=True)
 class CollectOptions:
     """Flags of `leaderboard collect`.
@@ -94,8 +90,7 @@ def collect_runs(arguments: list[str]) -> int:
     _require_records(options.runs, found)
     out = options.out.absolute()
     require_writable(out.parent)
-    limit = round(min(options.limit_mb, MOST_MB) * 1e6)
-    made = collect(found, out, title=options.title or out.name, pictures=options.pictures, limit=limit)
+    made = collect(found, out, title=options.title or out.name, pictures=options.pictures, limit=options.limit_mb * 1e6)
     for remark in made.remarks:
         print(remark, file=sys.stderr)
     print(f"{made.runs} runs, {made.pictured} of them with pictures, {made.size / 1e6:.1f} MB: {options.out}")

@@ -1,6 +1,5 @@
 """`prior fit` and `prior import`: a posed template for real footage, as an npz and as pictures to judge it by."""
 
-import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -100,7 +99,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _import(options: ImportOptions) -> None:
-    if not 0 < options.fps < math.inf:
+    if not options.fps > 0:
         raise UserError(f"--fps: expected a number above 0, got {options.fps:g}.")
     if not 0 < options.size <= LARGEST:
         raise UserError(f"--size: expected 1 to {LARGEST} pixels, got {options.size}.")
