@@ -30,6 +30,9 @@ from rewild4d.types import Keypoints
 NAMES = {"howling-monkey": "howling monkey", "raccon": "raccoon", "hourse": "horse"}
 """Spellings of APT-36K and what they mean."""
 
+UNLISTED = "animal of no listed category"
+"""The species where no annotation of an animal names a category that its file lists."""
+
 
 @dataclass(frozen=True)
 class Sighting:
@@ -133,6 +136,7 @@ def _add(path: Path, table: dict[str, Any], subjects: dict[str, Subject], seen: 
         seen.add((str(sighting.file), track))
         name = f"{sighting.file.parent}@{track}"
         subject = subjects.setdefault(name, Subject(name, track, species))
+        subject.species = species if subject.species == UNLISTED else subject.species
         subject.outside += outside
         subject.sightings.append(sighting)
     return left
@@ -145,7 +149,7 @@ def _sighting(images: dict[Any, Entry], kinds: dict[Any, Entry], entry: Entry) -
         Unusable: one that is not there or makes no sense.
     """
     image, kind = image_of(images, entry), look_up(kinds, entry, "category_id")
-    species = str(kind["name"]) if kind else "animal"
+    species = str(kind["name"]) if kind else UNLISTED
     file = clean_path(image["file_name"])
     try:
         size = _size(image)

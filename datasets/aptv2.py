@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from rewild4d.contracts import Finding, Selection
-from rewild4d.datasets.apt_files import Annotations, Sighting, Subject, image_places, read_annotations
+from rewild4d.datasets.apt_files import UNLISTED, Annotations, Sighting, Subject, image_places, read_annotations
 from rewild4d.datasets.frame_files import image_size, read_images, read_masks
 from rewild4d.datasets.mask_check import check_videos
 from rewild4d.datasets.mask_makers import Unmasked
@@ -123,6 +123,7 @@ class AptV2:
             f"the frame rate is not known: {FPS:g} frames a second assumed",
             f"{subject.outside} keypoints outside their image taken as not visible" if subject.outside else "",
             f"a {subject.species} is no quadruped: no four-legged template fits" if subject.species in PRIMATES else "",
+            "its category is not listed: taken for a quadruped" if subject.species == UNLISTED else "",
             *faults.get(str(subject.sightings[0].file.parent), ()),
             *faults.get("", ()),
             f"masks hold objects {', '.join(map(str, masks.ids))}, none of them track {subject.track}: taken together"

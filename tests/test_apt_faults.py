@@ -125,6 +125,18 @@ def test_keypoints_outside_the_frame_are_not_visible(tmp_path: Path) -> None:
     assert "12 keypoints outside their image taken as not visible" in clip.notes
 
 
+def test_an_animal_of_no_listed_category_is_told(tmp_path: Path) -> None:
+    told = "its category is not listed: taken for a quadruped"
+    clip, _ = AptV2(moving.apt(tmp_path / "all", category_id=99)).load("easy/29wolf/v1C1@3", SELECTION)
+    assert told in clip.notes and clip.species == "animal of no listed category"
+    (first, _), (one, _) = (
+        AptV2(moving.apt(tmp_path / "none")).load("easy/29wolf/v1C1@3", SELECTION),
+        one_entry_changed(tmp_path / "one", {"category_id": 99}).load("easy/29wolf/v1C1@3", SELECTION),
+    )
+    assert told not in first.notes and told not in one.notes, "its other annotations say what it is"
+    assert first.species == one.species
+
+
 def test_an_apt_clip_without_masks(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="expected masks of easy/29wolf/v1C1@3 .*`rewild4d-bench masks` makes some"):
         AptV2(moving.apt(tmp_path, with_masks=False)).load("easy/29wolf/v1C1@3", SELECTION)

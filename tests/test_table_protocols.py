@@ -37,8 +37,11 @@ def test_everything_of_one_protocol(tmp_path: Path, capsys: pytest.CaptureFixtur
     for index, name in enumerate(("artemis-sweep-256", "artemis-sweep-256-v1", "somebodys-v1")):
         shown = call(capsys, *words, name)
         assert [number for number in range(3) if f"**T{number}**" in shown] == [index]
-    assert call(capsys, *words, "davis-512") == "no records\n", "known, but not in this folder"
-    with pytest.raises(SystemExit) as stop:
-        cli.main([*words, "artemis-swep-256"])
-    assert stop.value.code == 2
-    assert "unknown protocol 'artemis-swep-256'. Did you mean 'artemis-sweep-256-v" in capsys.readouterr().err
+    there = f"artemis-sweep-256-v1, {newest}, somebodys-v1"
+    for name, told in (
+        ("davis-512", f"expected records of protocol {planning.newest_protocol('davis-512')}, got those of {there}."),
+        ("artemis-swep-256", "unknown protocol 'artemis-swep-256'. Did you mean 'artemis-sweep-256-v"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            cli.main([*words, name])
+        assert stop.value.code == 2 and told in capsys.readouterr().err

@@ -67,7 +67,10 @@ def main(arguments: list[str]) -> int:
 def _everything(options: Options) -> list[Table]:
     found = _found(options)
     if options.protocol:
-        name = planning.known_protocol(options.protocol, [record.protocol["name"] for _, record in found])
+        there = sorted({record.protocol["name"] for _, record in found})
+        name = planning.known_protocol(options.protocol, there)
+        if there and name not in there:
+            raise UserError(f"{options.runs}: expected records of protocol {name}, got those of {', '.join(there)}.")
         found = [pair for pair in found if pair[1].protocol["name"] == name]
     return pooled_tables(found) if options.pooled else protocol_tables([record for _, record in found])
 
