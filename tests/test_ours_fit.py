@@ -151,6 +151,7 @@ def test_the_mirrored_groups(toy: tuple[Clip, Prior]) -> None:
     views = [supervision.draw(generator, mirrored=1 / 4).view for _ in range(400)]
     assert views.count(-1) / 400 == pytest.approx(1 / 4, abs=0.07)
     assert {supervision.draw(generator, mirrored=0.0).view for _ in range(60)} == {1}
+    assert {supervision.draw(generator, cameras="own")[:2] for _ in range(60)} == {(1, 1), (-1, -1)}
 
 
 def test_zero_networks_give_the_skinned_canonical(toy: tuple[Clip, Prior]) -> None:
@@ -344,5 +345,6 @@ def test_a_film_is_a_clip_whose_cameras_are_guessed(toy: tuple[Clip, Prior]) -> 
         made = Ours().fit(clip, prior, config=config, seed=0, device=CPU, log=lambda *_: None, workdir=None)
         return made.config
 
-    assert fitted(clip).geometry == config.geometry
-    assert fitted(replace(clip, guessed_cameras=True)).geometry.temporal == config.footage.temporal
+    known, guessed = fitted(clip), fitted(replace(clip, guessed_cameras=True))
+    assert (known.geometry, known.cameras) == (config.geometry, "both")
+    assert (guessed.geometry.temporal, guessed.cameras) == (config.footage.temporal, "own")

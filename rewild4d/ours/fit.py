@@ -63,7 +63,7 @@ class Training:
         """One iteration; returns the figures for the log."""
         progress = index / self.config.iterations
         self._set_rates(progress)
-        key = self.supervision.draw(self.generator, self.config.mirrored)
+        key = self.supervision.draw(self.generator, self.config.mirrored, self.config.cameras)
         target = self.supervision.target(key)
         losses, info = self.losses(key, target, index)
         values = torch.stack(list(losses.values()))

@@ -49,6 +49,7 @@ def _for_footage(config: Config) -> Config:
         geometry=replace(config.geometry, temporal=own.temporal, rigid=own.rigid),
         prior=replace(config.prior, pull_until=own.pull_until),
         rates=replace(config.rates, pose=own.pose, deform=own.deform),
+        cameras=own.cameras,
         footage=replace(own, use=False),
     )
 

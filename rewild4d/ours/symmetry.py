@@ -102,11 +102,14 @@ class Supervision:
         """
         return self.pixel() * math.sqrt(EPS2D * (1 - 1 / self.reduction**2))
 
-    def draw(self, generator: torch.Generator, mirrored: float = 0.5) -> Key:
-        """One view: group and frame uniformly, then the frame's image or, in a share of the draws, its mirror image."""
+    def draw(self, generator: torch.Generator, mirrored: float = 0.5, cameras: str = "both") -> Key:
+        """One view: group and frame uniformly, then the frame's image or, in a share of the draws, its mirror image.
+
+        With "own" cameras the image decides the group: m = v.
+        """
         group, frame = (int(torch.randint(count, (), generator=generator)) for count in (2, self.frames))
         view = -1 if float(torch.rand((), generator=generator)) < mirrored else 1
-        return Key(1 - 2 * group, view, frame)
+        return Key(view if cameras == "own" else 1 - 2 * group, view, frame)
 
 
 def match_times(clip: Clip, prior: Prior) -> list[int]:

@@ -50,7 +50,8 @@ class WarmUp:
         progress = max(0.0, (index - stage.regress) / max(1, stage.iterations))
         self._set_rate(index)
         copied = index < stage.regress
-        keys = [self.supervision.draw(self.generator) for _ in range(stage.copies if copied else stage.views)]
+        count = stage.copies if copied else stage.views
+        keys = [self.supervision.draw(self.generator, cameras=self.config.cameras) for _ in range(count)]
         own = list(range(len(keys)))
         if not copied:
             keys, own = neighbour_keys(keys, self.supervision.frames, self.config.geometry)
