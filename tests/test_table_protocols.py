@@ -37,6 +37,9 @@ def test_everything_of_one_protocol(tmp_path: Path, capsys: pytest.CaptureFixtur
     for index, name in enumerate(("artemis-sweep-256", "artemis-sweep-256-v1", "somebodys-v1")):
         shown = call(capsys, *words, name)
         assert [number for number in range(3) if f"**T{number}**" in shown] == [index]
+    (tmp_path / "empty").mkdir()
+    nothing = call(capsys, "table", "--runs", str(tmp_path / "empty"), "--protocol", "davis-512")
+    assert nothing == "no records\n", "known, but nothing is in this folder"
     there = f"artemis-sweep-256-v1, {newest}, somebodys-v1"
     for name, told in (
         ("davis-512", f"expected records of protocol {planning.newest_protocol('davis-512')}, got those of {there}."),

@@ -331,7 +331,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     out PSNR): pinto horse 25.6 for 24.4, tiger 22.6 for 22.2; symmetric coats: cow 27.4 for 27.3, fox 20.5 for 20.7."""
     cameras: Literal["both", "own"] = "both"
     """Cameras that an image is seen from: those of both groups (paper), or those alone that were fitted to it: frames
-    from the first group's, mirror images from the second's (m = v). Without effect where cameras are known."""
+    from the first group's, mirror images from the second's (m = v). Where cameras are known both show the same views,
+    and only `pose.encoding` "group" tells them apart."""
     checkpoint_every: Count = 500
     """Steps between checkpoints, where a work folder is given."""
     canonical: Canonical = Canonical()
