@@ -10,8 +10,10 @@ with `vertices`, `faces`, `weights`, `joints`, `parents`; it then takes its firs
 A run's settings name the path, so the file should not change between runs.
 
 `gart-star` then fits the pose of each frame once more to that frame, everything else frozen: SGD, 160 steps, at a rate
-of 2e-2 halved every 50. The original does so with the image it is scored on. Here that is the training camera's image
-at each of the clip's moments, never a held-out view or moment; every table says that there was this second fit.
+of 2e-2 halved every 50. The original does so with the image it is scored on. Where views are held out that is, here as
+there, the training camera's image of each moment and never a held-out view. Where moments of a video are held out, the
+fit does not see them; the evaluation then fits their poses to them (`GartStarReconstruction.refined`), and every table
+says that the row has seen the images that it is scored on.
 
 What differs from the original: positions get no gradient through the skinning grid, a Gaussian turns with the blended
 quaternion of its joints instead of the blended matrix (which would shrink it), the grid is a cube, neighbours are
@@ -28,29 +30,27 @@ import torch
 from torch import Tensor, nn
 
 from rewild4d.baselines.gart_config import GartConfig, GartStarConfig
+from rewild4d.baselines.gart_reconstruction import GartReconstruction, GartStarReconstruction
+from rewild4d.baselines.gart_refine import refine_step
 from rewild4d.baselines.gart_skeleton import PoseTable, prior_poses
-from rewild4d.baselines.gart_skinning import ResidualField
+from rewild4d.baselines.gart_skinning import ResidualField, posed
 from rewild4d.baselines.gart_smal import template_prior
-from rewild4d.baselines.saved import Root, gaussians_from_state, load_state, save_state, splats_of
+from rewild4d.baselines.saved import Root, gaussians_from_state, load_state
 from rewild4d.baselines.splatting import (
-    Shape,
     SplatTraining,
     run_steps,
     surface_gaussians,
 )
 from rewild4d.contracts import Log, MethodInfo
 from rewild4d.harmonics import C0
-from rewild4d.kernels.arrays import fits
 from rewild4d.kernels.threads import torch_on_one
 from rewild4d.ours.canonical import REST_GAIN, Gaussians
 from rewild4d.ours.checkpoint import fit_digest
-from rewild4d.ours.fused.skinning import skin_both
 from rewild4d.ours.geometry_losses import neighbours
 from rewild4d.ours.schedule import exponential, for_clip
 from rewild4d.ours.symmetry import Key, Supervision, Target, match_times
 from rewild4d.rasterizer import RasterInfo
-from rewild4d.transforms import skin_points, skin_quats
-from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Prior, Splats
+from rewild4d.types import OBJECT_DIAGONAL, Clip, Prior
 
 PAPER = "Lei et al., GART: Gaussian Articulated Template Models, CVPR 2024"
 
@@ -61,22 +61,6 @@ class GartModel(nn.Module):
     def __init__(self, gaussians: Gaussians, field: ResidualField, poses: PoseTable) -> None:
         super().__init__()
         self.gaussians, self.field, self.poses = gaussians, field, poses
-
-
-def posed(own: Gaussians, weights: Tensor, quats: Tensor, transforms: Tensor) -> Shape:
-    """Skinned Gaussians.
-
-    Args:
-        own: canonical.
-        weights: [n, J].
-        quats: rotation of each joint, [J, 4].
-        transforms: rest -> posed, [J, 4, 4].
-    """
-    scales = own.scales(own.scales_log())
-    if fits(own.means):
-        return Shape(*skin_both(own.means, own.quats, weights, transforms, quats)[:2], scales)
-    rest = nn.functional.normalize(own.quats, dim=-1)
-    return Shape(skin_points(own.means, weights, transforms), skin_quats(rest, weights, quats), scales)
 
 
 class GartTraining(SplatTraining):
@@ -90,8 +74,7 @@ class GartTraining(SplatTraining):
         groups = {"turns": [model.poses.turns], "shifts": [model.poses.shifts], "skinning": [model.field.residual]}
         super().__init__(model, groups, config, supervision, generator)
         self.config = config
-        self.refine = config.refine if isinstance(config, GartStarConfig) else None
-        self.total += self.refine.steps * supervision.frames if self.refine else 0
+        self.total += config.refine.steps * supervision.frames if isinstance(config, GartStarConfig) else 0
         self.near: Tensor | None = None
         self.weights: Tensor | None = None
 
@@ -157,24 +140,14 @@ class GartTraining(SplatTraining):
 
     def _refine_step(self, done: int) -> dict[str, float]:
         """One step of SGD on the pose of one frame; white background, as the original's."""
-        assert self.refine is not None
-        frame, step = divmod(done, self.refine.steps)
+        assert isinstance(self.config, GartStarConfig)
+        frame, step = divmod(done, self.config.refine.steps)
         model = self.model
         if self.weights is None:
             self.weights = model.field.still(model.gaussians.means)
         target = self.supervision.target(Key(1, 1, frame))
-        learned = (model.poses.turns, model.poses.shifts)
-        shape = posed(model.gaussians, self.weights, *model.poses(frame))
-        rgb, alpha, _ = self.render(shape, target, 1.0)
-        loss = torch.stack(list(self.image_losses(rgb, alpha, target, plain=True).values())).sum()
-        rate = self.refine.rate * 0.5 ** (step // self.refine.halve_every)
-        for parameter, slope in zip(learned, torch.autograd.grad(loss, learned), strict=True):
-            if not torch.isfinite(slope).all():
-                raise FloatingPointError(
-                    f"frame {frame}, refinement step {step}: the gradient of its pose is not finite"
-                )
-            parameter.data -= rate * slope
-        return {"loss": float(loss.detach()), "frame": frame}
+        loss = refine_step(model.gaussians, self.weights, model.poses, frame, target, step, self.config)
+        return {"loss": loss, "frame": frame}
 
 
 def spread(values: Tensor, near: Tensor) -> Tensor:
@@ -182,52 +155,6 @@ def spread(values: Tensor, near: Tensor) -> Tensor:
     groups = values[near]
     apart = groups - groups.mean(dim=1, keepdim=True)
     return (apart.square().sum(dim=1) / max(1, near.shape[1] - 1) + 1e-12).sqrt().mean()
-
-
-class GartReconstruction:
-    """A fitted model with its frame of reference (contracts.Reconstruction).
-
-    Attributes:
-        gaussians: canonical, in the object frame.
-        weights: their skinning weights, [n, J].
-        poses: of the frames.
-    """
-
-    def __init__(self, gaussians: Gaussians, weights: Tensor, poses: PoseTable, config: GartConfig, root: Root) -> None:
-        self.gaussians, self.poses = gaussians.requires_grad_(False), poses.requires_grad_(False)
-        self.weights, self.config, self.root = weights, config, root
-
-    @torch.no_grad()
-    def at(self, time: float) -> Splats:
-        """The Gaussians at a time in seconds in the world; between frames the joints' rotations slerp."""
-        position = self.root.position(time)
-        shape = posed(self.gaussians, self.weights, *self.poses.between(position))
-        return self.root.in_world(splats_of(self.gaussians, *shape), position)
-
-    def camera(self, time: float) -> Camera | None:
-        """The input camera of the frame nearest to a time."""
-        return self.root.camera(time)
-
-    def canonical(self) -> Splats:
-        """The Gaussians at rest, in the object frame; `weights` belong to the same rows."""
-        return self.gaussians.splats()
-
-    def diagnostics(self) -> dict[str, float]:
-        """How many Gaussians there are, how opaque, and how far poses went from the prior's."""
-        return {
-            "gaussians": float(len(self.gaussians)),
-            "opacity_mean": float(self.gaussians.opacities().mean()),
-            "turn_mean_degrees": float(torch.rad2deg(self.poses.turns.norm(dim=-1)).mean()),
-        }
-
-    def save(self, folder: Path) -> None:
-        """Write the state and the settings into an existing, empty folder."""
-        model = {f"gaussians.{name}": value for name, value in self.gaussians.state_dict().items()}
-        state = {
-            "model": model, "weights": self.weights, "poses": self.poses.state_dict(),
-            "parents": self.poses.parents, "root": self.root.state(),
-        }  # fmt: skip
-        save_state(folder, state, self.config)
 
 
 class Gart:
@@ -238,6 +165,7 @@ class Gart:
         title="GART (20 bones)", paper=PAPER, licence="MIT (written anew from the paper)"
     )
     Config: ClassVar[type[GartConfig]] = GartConfig
+    Result: ClassVar[type[GartReconstruction]] = GartReconstruction
 
     def fit(
         self,
@@ -263,7 +191,7 @@ class Gart:
         with torch_on_one():
             run_steps(training, f"{self.name} {fit_digest(config, clip, template, seed)}", log, workdir)
         weights = model.field.still(model.gaussians.means)
-        return GartReconstruction(model.gaussians, weights, model.poses, config, Root.of(clip, prior))
+        return self.Result(model.gaussians, weights, model.poses, config, Root.of(clip, prior))
 
     def load(self, folder: Path, device: torch.device) -> GartReconstruction:
         """Read back what `GartReconstruction.save` wrote."""
@@ -274,11 +202,11 @@ class Gart:
         poses = PoseTable(saved["quats"], saved["offsets"], saved["pivots"], state["parents"])
         poses.load_state_dict(saved)
         root = Root.from_state(state["root"])
-        return GartReconstruction(gaussians.to(device), state["weights"].to(device), poses.to(device), config, root)
+        return self.Result(gaussians.to(device), state["weights"].to(device), poses.to(device), config, root)
 
 
 class GartStar(Gart):
-    """The method with poses refined on the scored moments (contracts.Method)."""
+    """The method with the poses of all scored moments fitted once more to the input view (contracts.Method)."""
 
     name: ClassVar[str] = "gart-star"
     info: ClassVar[MethodInfo] = MethodInfo(
@@ -288,3 +216,4 @@ class GartStar(Gart):
         mark="poses fitted once more to each input image",
     )
     Config: ClassVar[type[GartConfig]] = GartStarConfig
+    Result: ClassVar[type[GartReconstruction]] = GartStarReconstruction

@@ -40,11 +40,28 @@ class PoseTable(nn.Module):
 
     def between(self, position: float) -> tuple[Tensor, Tensor]:
         """The pose at a place between frames (1.5: half-way from the second to the third): joints slerp."""
+        return self._chained(*self._at(position))
+
+    @torch.no_grad()
+    def with_frame(self, row: int, position: float) -> "PoseTable":
+        """The table with one frame more, which is row ``row`` then and starts as the pose at a place between frames."""
+        local, offsets, shift = self._at(position)
+
+        def put(rows: Tensor, added: Tensor) -> Tensor:
+            return torch.cat((rows[:row], added[None], rows[row:]))
+
+        table = PoseTable(put(self.quats, local), put(self.offsets, offsets), self.pivots, self.parents)
+        table.turns.copy_(put(self.turns, torch.zeros_like(offsets)))
+        table.shifts.copy_(put(self.shifts, shift))
+        return table.to(local.device)
+
+    def _at(self, position: float) -> tuple[Tensor, Tensor, Tensor]:
+        """What `_chained` takes, at a place between frames."""
         low = int(position)
         part = position - low
         if part == 0:
-            return self(low)
-        return self._chained(
+            return self._local(low), self.offsets[low], self.shifts[low]
+        return (
             slerp(self._local(low), self._local(low + 1), part),
             torch.lerp(self.offsets[low], self.offsets[low + 1], part),
             torch.lerp(self.shifts[low], self.shifts[low + 1], part),

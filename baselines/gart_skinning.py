@@ -1,12 +1,16 @@
-"""Skinning weights of GART: a voxel grid spread from the template's weights, and a learned residual on top of it."""
+"""Skinning of GART: a voxel grid of the template's weights, a learned residual on it, and Gaussians posed by both."""
 
 import torch
 from torch import Tensor, nn
 
+from rewild4d.baselines.splatting import Shape
 from rewild4d.kernels.arrays import fits
+from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.config import Skinning
 from rewild4d.ours.fused.field import sample_grid
+from rewild4d.ours.fused.skinning import skin_both
 from rewild4d.ours.skinning import build_field
+from rewild4d.transforms import skin_points, skin_quats
 from rewild4d.types import Prior
 
 BEND = 1e-4
@@ -60,3 +64,19 @@ class ResidualField(nn.Module):
         grid = self.residual.view(size, size, size, -1)
         axes = [(grid.narrow(axis, 1, size - 1) - grid.narrow(axis, 0, size - 1)).abs().mean() for axis in range(3)]
         return torch.stack(axes).mean() * BEND
+
+
+def posed(own: Gaussians, weights: Tensor, quats: Tensor, transforms: Tensor) -> Shape:
+    """Skinned Gaussians.
+
+    Args:
+        own: canonical.
+        weights: [n, J].
+        quats: rotation of each joint, [J, 4].
+        transforms: rest -> posed, [J, 4, 4].
+    """
+    scales = own.scales(own.scales_log())
+    if fits(own.means):
+        return Shape(*skin_both(own.means, own.quats, weights, transforms, quats)[:2], scales)
+    rest = nn.functional.normalize(own.quats, dim=-1)
+    return Shape(skin_points(own.means, weights, transforms), skin_quats(rest, weights, quats), scales)

@@ -54,6 +54,15 @@ class Root:
         """The input camera at a time, in the world; between frames it interpolates."""
         return camera_between(self.cameras, self.position(time))
 
+    def with_frame(self, row: int, time: float) -> "Root":
+        """The same motion with one frame more, which is row ``row`` then."""
+        between = interpolate_similarity(self.object_to_world, self.position(time))
+        return Root(
+            torch.cat((self.times[:row], self.times.new_tensor((time,)), self.times[row:])),
+            torch.cat((self.object_to_world[:row], between[None], self.object_to_world[row:])),
+            (*self.cameras[:row], self.camera(time), *self.cameras[row:]),
+        )
+
     def state(self) -> dict[str, Any]:
         """As plain tensors and numbers."""
         cameras = [

@@ -25,7 +25,7 @@ from rewild4d.ours.schedule import exponential
 from rewild4d.ours.symmetry import Supervision, Target
 from rewild4d.priors.motion import colors_from_frames, pose_gaussians, quats_from_normals, sample_surface
 from rewild4d.rasterizer import RasterInfo, rasterize
-from rewild4d.types import Clip, Prior
+from rewild4d.types import Camera, Clip, Prior
 
 logger = logging.getLogger(__name__)
 LOG_EVERY = 20
@@ -94,6 +94,45 @@ class Shape(NamedTuple):
     means: Tensor
     quats: Tensor
     scales: Tensor
+
+
+def render(own: Gaussians, shape: Shape, camera: Camera, degree: int) -> tuple[Tensor, Tensor, RasterInfo]:
+    """One view of posed Gaussians.
+
+    Args:
+        own: opacities and colours.
+        shape: where they are.
+        camera: in the same frame of reference.
+        degree: of the harmonics that count.
+
+    Returns:
+        Colour premultiplied [3, h, w], matte [1, h, w], the rasterizer's info.
+    """
+    image, alpha, info = rasterize(
+        *shape, own.opacities(), own.seen_rgb(shape.means, shape.quats, camera.center, degree),
+        camera.world_to_camera[None], camera.intrinsics[None], camera.width, camera.height,
+    )  # fmt: skip
+    return image[0], alpha[0], info
+
+
+def image_losses(
+    rgb: Tensor, alpha: Tensor, target: Target, background: Tensor, weights: ImageLoss
+) -> dict[str, Tensor]:
+    """Weighted losses of a render.
+
+    Args:
+        rgb: colour premultiplied, [3, h, w].
+        alpha: matte, [1, h, w].
+        target: what it is compared with.
+        background: colour behind both, [3].
+        weights: of the losses.
+    """
+    window = union_window([alpha, target.mask], WINDOW - 1)
+    l1, dissimilarity = colour_losses(rgb, alpha, target, background, window)
+    losses = {"l1": weights.l1 * l1, "ssim": weights.ssim * dissimilarity}
+    if weights.silhouette:
+        losses["silhouette"] = weights.silhouette * silhouette_loss(alpha, target, window)
+    return losses
 
 
 class SplatTraining(ABC):
@@ -168,26 +207,15 @@ class SplatTraining(ABC):
 
     def render(self, shape: Shape, target: Target, progress: float) -> tuple[Tensor, Tensor, RasterInfo]:
         """Colour premultiplied [3, h, w], matte [1, h, w] and the info of one view."""
-        own, camera, canonical = self.gaussians, target.camera, self.settings.canonical
+        canonical = self.settings.canonical
         degree = min(canonical.sh_degree, int(progress / canonical.sh_every))
-        colors = own.seen_rgb(shape.means, shape.quats, camera.center, degree)
-        image, alpha, info = rasterize(
-            *shape, own.opacities(), colors,
-            camera.world_to_camera[None], camera.intrinsics[None], camera.width, camera.height,
-        )  # fmt: skip
-        return image[0], alpha[0], info
+        return render(self.gaussians, shape, target.camera, degree)
 
     def image_losses(self, rgb: Tensor, alpha: Tensor, target: Target, plain: bool = False) -> dict[str, Tensor]:
         """Weighted losses of a render; ``plain`` for a white background whatever the settings say."""
-        weights = self.settings.loss
-        window = union_window([alpha, target.mask], WINDOW - 1)
-        draw = weights.random_background and not plain
+        draw = self.settings.loss.random_background and not plain
         background = torch.rand(3, generator=self.generator).to(rgb) if draw else rgb.new_ones(3)
-        l1, dissimilarity = colour_losses(rgb, alpha, target, background, window)
-        losses = {"l1": weights.l1 * l1, "ssim": weights.ssim * dissimilarity}
-        if weights.silhouette:
-            losses["silhouette"] = weights.silhouette * silhouette_loss(alpha, target, window)
-        return losses
+        return image_losses(rgb, alpha, target, background, self.settings.loss)
 
     def changed(self) -> None:  # noqa: B027  (a method without per-Gaussian state has nothing to do)
         """Called after the set of Gaussians changed."""

@@ -20,6 +20,9 @@ class Reconstruction(Protocol):
 
     It may have more: ``diagnostics()``, figures for the record; ``marks``, sentences that every table prints below its
     row, such as "upper bound: ...", and such a row is not ranked; ``canonical()`` and ``weights``, for pictures.
+
+    ``refined(frames, log)``, itself after a fit to the held-out frames of a video that it is scored on: for competitors
+    whose paper scores them so. The evaluation asks for it, never the fit, and what it gives must have ``marks``.
     """
 
     def at(self, time: float) -> Splats:

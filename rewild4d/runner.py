@@ -31,7 +31,7 @@ from rewild4d.priors.placing import known_frames, with_cameras
 from rewild4d.progress import Progress
 from rewild4d.protocol import Protocol, evaluate, may_be_scored_now
 from rewild4d.rasterizer import pick_rasterizer
-from rewild4d.recropping import seen_by
+from rewild4d.refining import ready_to_score
 from rewild4d.registry import load_method
 from rewild4d.types import Case, Clip, Prior, Truth
 from rewild4d.view import save_pictures
@@ -236,7 +236,7 @@ class Job:
             begin = time.perf_counter()
             progress = Progress(f"{self.title}: evaluate")
             whole = with_cameras(self.clip, case.prior)  # also the frames that the fit was not shown
-            clip, truth = seen_by(reconstruction, whole, case.truth, case.clip)
+            reconstruction, clip, truth = ready_to_score(reconstruction, whole, case.truth, case.clip, progress)
             found = evaluate(reconstruction, clip, truth, self.plan.protocol, progress, self.plan.device)
             progress.close()
             seconds = time.perf_counter() - begin

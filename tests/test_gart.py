@@ -13,10 +13,10 @@ import torch
 from scipy import sparse
 from scipy.spatial.transform import Rotation, Slerp
 
-from rewild4d.baselines.gart import Gart, GartModel, GartTraining, posed, spread
+from rewild4d.baselines.gart import Gart, GartModel, GartTraining, spread
 from rewild4d.baselines.gart_config import GartConfig, GartSkinning, GartStarConfig
 from rewild4d.baselines.gart_skeleton import exponential_quats, pose_table, prior_poses, slerp
-from rewild4d.baselines.gart_skinning import ResidualField
+from rewild4d.baselines.gart_skinning import ResidualField, posed
 from rewild4d.baselines.gart_smal import follow, template_prior
 from rewild4d.baselines.splatting import surface_gaussians
 from rewild4d.conformance import tiny_case

@@ -20,7 +20,7 @@ from rewild4d.original_view import original_frames
 from rewild4d.progress import Progress
 from rewild4d.protocol import evaluate, find_protocol
 from rewild4d.rasterizer import pick_rasterizer
-from rewild4d.recropping import seen_by
+from rewild4d.refining import ready_to_score
 from rewild4d.registry import load_dataset, load_method
 from rewild4d.runner import STAMP, fit_seconds
 from rewild4d.view import save_pictures
@@ -86,8 +86,8 @@ def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: s
     reconstruction = load_method(record.method).load(saved, device)
     begin = time.perf_counter()
     shown = describing.shown_of(clip, record.prior)
-    clip, truth = seen_by(reconstruction, clip, truth, shown)
     progress = Progress(f"{record.case}: evaluate")
+    reconstruction, clip, truth = ready_to_score(reconstruction, clip, truth, shown, progress)
     found = evaluate(reconstruction, clip, truth, protocol, progress, device)
     progress.close()
     seconds = time.perf_counter() - begin

@@ -1,0 +1,93 @@
+"""The second fit of GART*: the pose of one frame by SGD on that frame's image, everything else frozen."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from rewild4d.baselines.gart_config import GartStarConfig
+from rewild4d.baselines.gart_skeleton import PoseTable
+from rewild4d.baselines.gart_skinning import posed
+from rewild4d.baselines.saved import Root
+from rewild4d.baselines.splatting import image_losses, render
+from rewild4d.contracts import Log
+from rewild4d.kernels.threads import torch_on_one
+from rewild4d.ours.canonical import Gaussians
+from rewild4d.ours.symmetry import Target, animal_side
+from rewild4d.transforms import camera_in_object
+from rewild4d.types import Frame
+
+FOREGROUND = 0.5
+
+
+def refine_step(
+    own: Gaussians, weights: Tensor, poses: PoseTable, frame: int, target: Target, step: int, config: GartStarConfig
+) -> float:
+    """One step; white background, as the original's.
+
+    Args:
+        own: canonical Gaussians.
+        weights: their skinning weights, [n, J].
+        poses: changed in place.
+        frame: whose pose.
+        target: its image, and its camera in the object frame.
+        step: of this frame's steps, from 0.
+        config: the fit's.
+
+    Returns:
+        The loss before the step.
+
+    Raises:
+        FloatingPointError: the gradient is not finite.
+    """
+    rgb, alpha, _ = render(own, posed(own, weights, *poses(frame)), target.camera, config.canonical.sh_degree)
+    losses = image_losses(rgb, alpha, target, rgb.new_ones(3), config.loss)
+    loss = torch.stack(list(losses.values())).sum()
+    rate = config.refine.rate * 0.5 ** (step // config.refine.halve_every)
+    learned = (poses.turns, poses.shifts)
+    for parameter, slope in zip(learned, torch.autograd.grad(loss, learned), strict=True):
+        if not torch.isfinite(slope).all():
+            raise FloatingPointError(f"frame {frame}, refinement step {step}: the gradient of its pose is not finite")
+        parameter.data -= rate * slope
+    return float(loss.detach())
+
+
+def refine_moments(
+    own: Gaussians, weights: Tensor, poses: PoseTable, root: Root, frames: Sequence[Frame], config: GartStarConfig,
+    log: Log,
+) -> tuple[PoseTable, Root]:  # fmt: skip
+    """Poses for further moments of the input view, each begun between those of its neighbours and fitted to its image.
+
+    Args:
+        own: canonical Gaussians.
+        weights: their skinning weights, [n, J].
+        poses: of the frames that were fitted; stays as it is.
+        root: where they stand.
+        frames: with cameras in the world; those without an animal, and moments that are known already, are passed over.
+        config: the fit's.
+        log: progress.
+
+    Returns:
+        Poses and roots of all moments, in the order of time.
+    """
+    known = set(root.times.tolist())
+    held = [frame for frame in frames if frame.time not in known and (frame.mask > FOREGROUND).any()]
+    for frame in held:
+        row = int((root.times < frame.time).sum())
+        poses, root = poses.with_frame(row, root.position(frame.time)), root.with_frame(row, frame.time)
+    with torch.enable_grad(), torch_on_one():
+        for done, frame in enumerate(held):
+            row = int((root.times < frame.time).sum())
+            target = _target(frame, root.object_to_world[row], weights.device)
+            loss = 0.0
+            for step in range(config.refine.steps):
+                loss = refine_step(own, weights, poses, row, target, step, config)
+            log(done + 1, len(held), {"loss": loss})
+    return poses, root
+
+
+def _target(frame: Frame, object_to_world: Tensor, device: torch.device) -> Target:
+    assert frame.camera is not None
+    camera = camera_in_object(frame.camera, object_to_world).resized(frame.mask.shape[2], frame.mask.shape[1])
+    side = animal_side(frame.mask, f"the frame at {frame.time:.4f} s", 0)
+    return Target(frame.rgb.float().to(device), frame.mask.float().to(device), camera, side)
