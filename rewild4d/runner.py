@@ -234,9 +234,11 @@ class Job:
         try:
             reconstruction, fit_seconds = self._fit(case)
             begin = time.perf_counter()
-            progress = Progress(f"{self.title}: evaluate")
             whole = with_cameras(self.clip, case.prior)  # also the frames that the fit was not shown
+            progress = Progress(f"{self.title}: refine on held-out frames")
             reconstruction, clip, truth = ready_to_score(reconstruction, whole, case.truth, case.clip, progress)
+            progress.close()
+            progress = Progress(f"{self.title}: evaluate")
             found = evaluate(reconstruction, clip, truth, self.plan.protocol, progress, self.plan.device)
             progress.close()
             seconds = time.perf_counter() - begin

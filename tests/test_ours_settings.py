@@ -28,7 +28,7 @@ def test_settings_follow_whether_the_cameras_are_known() -> None:
     made = for_clip_of_ours(standard, 24, filmed=True)
     assert (made.geometry.temporal, made.geometry.rigid) == (5.0, 0.2)
     assert (made.rates.pose, made.rates.deform, made.prior.pull_until) == ((7e-4, 1e-5), (2e-3, 1e-5), 0.35)
-    assert made.iterations == 24 * 200
+    assert made.iterations == 24 * 250
     assert made.geometry.still == standard.geometry.still
     assert for_clip_of_ours(made, 24, filmed=True) == made
     for preset in (quick, paper):

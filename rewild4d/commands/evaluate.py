@@ -86,8 +86,10 @@ def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: s
     reconstruction = load_method(record.method).load(saved, device)
     begin = time.perf_counter()
     shown = describing.shown_of(clip, record.prior)
-    progress = Progress(f"{record.case}: evaluate")
+    progress = Progress(f"{record.case}: refine on held-out frames")
     reconstruction, clip, truth = ready_to_score(reconstruction, clip, truth, shown, progress)
+    progress.close()
+    progress = Progress(f"{record.case}: evaluate")
     found = evaluate(reconstruction, clip, truth, protocol, progress, device)
     progress.close()
     seconds = time.perf_counter() - begin

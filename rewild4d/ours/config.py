@@ -294,7 +294,7 @@ class Footage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
     use: bool = True
     """False: the values below are not used (the paper has none of them)."""
-    steps_per_frame: Whole = 200
+    steps_per_frame: Whole = 250
     """Instead of `steps_per_frame`."""
     temporal: Weight = 5.0
     """Instead of `geometry.temporal`."""
