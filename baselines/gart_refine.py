@@ -17,8 +17,6 @@ from rewild4d.ours.symmetry import Target, animal_side
 from rewild4d.transforms import camera_in_object
 from rewild4d.types import Frame
 
-FOREGROUND = 0.5
-
 
 def refine_step(
     own: Gaussians, weights: Tensor, poses: PoseTable, frame: int, target: Target, step: int, config: GartStarConfig
@@ -71,7 +69,7 @@ def refine_moments(
         Poses and roots of all moments, in the order of time.
     """
     known = set(root.times.tolist())
-    held = [frame for frame in frames if frame.time not in known and (frame.mask > FOREGROUND).any()]
+    held = [frame for frame in frames if frame.time not in known and (frame.mask > 0.5).any()]
     for frame in held:
         row = int((root.times < frame.time).sum())
         poses, root = poses.with_frame(row, root.position(frame.time)), root.with_frame(row, frame.time)

@@ -211,10 +211,10 @@ class SplatTraining(ABC):
         degree = min(canonical.sh_degree, int(progress / canonical.sh_every))
         return render(self.gaussians, shape, target.camera, degree)
 
-    def image_losses(self, rgb: Tensor, alpha: Tensor, target: Target, plain: bool = False) -> dict[str, Tensor]:
-        """Weighted losses of a render; ``plain`` for a white background whatever the settings say."""
-        draw = self.settings.loss.random_background and not plain
-        background = torch.rand(3, generator=self.generator).to(rgb) if draw else rgb.new_ones(3)
+    def image_losses(self, rgb: Tensor, alpha: Tensor, target: Target) -> dict[str, Tensor]:
+        """Weighted losses of a render."""
+        drawn = self.settings.loss.random_background
+        background = torch.rand(3, generator=self.generator).to(rgb) if drawn else rgb.new_ones(3)
         return image_losses(rgb, alpha, target, background, self.settings.loss)
 
     def changed(self) -> None:  # noqa: B027  (a method without per-Gaussian state has nothing to do)

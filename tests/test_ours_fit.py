@@ -348,15 +348,3 @@ def test_a_film_is_a_clip_whose_cameras_are_guessed(toy: tuple[Clip, Prior]) -> 
     known, guessed = fitted(clip), fitted(replace(clip, guessed_cameras=True))
     assert (known.geometry, known.cameras) == (config.geometry, "both")
     assert (guessed.geometry.temporal, guessed.cameras) == (config.footage.temporal, "own")
-
-
-def test_own_cameras_change_nothing_where_cameras_are_known(toy: tuple[Clip, Prior]) -> None:
-    """A prior of known cameras has exact mirror images for its flip cameras, so both groups show the same views."""
-    clip, prior = toy
-    pose = msgspec.structs.replace(TINY.pose, encoding="view")
-    drawn = []
-    for cameras in ("both", "own"):
-        config = msgspec.structs.replace(TINY, pose=pose, cameras=cameras)
-        made = Ours().fit(clip, prior, config=config, seed=0, device=CPU, log=lambda *_: None, workdir=None)
-        drawn.append(made.at(clip.times[1]).means)
-    assert torch.equal(*drawn)

@@ -1,10 +1,16 @@
 """The settings that a preset gives: by the length of the clip, and by whether its cameras are known."""
 
 import msgspec
+import test_ours_fit
+import torch
 
 from rewild4d.config import load_preset
 from rewild4d.ours.config import Config
+from rewild4d.ours.method import Ours
 from rewild4d.ours.schedule import for_clip_of_ours
+from rewild4d.types import Clip, Prior
+
+CPU, TINY, toy = torch.device("cpu"), test_ours_fit.TINY, test_ours_fit.toy
 
 
 def test_settings_follow_the_length_of_the_clip() -> None:
@@ -33,3 +39,15 @@ def test_settings_follow_whether_the_cameras_are_known() -> None:
     assert for_clip_of_ours(made, 24, filmed=True) == made
     for preset in (quick, paper):
         assert for_clip_of_ours(preset, 24, filmed=True) == for_clip_of_ours(preset, 24)
+
+
+def test_own_cameras_change_nothing_where_cameras_are_known(toy: tuple[Clip, Prior]) -> None:
+    """A prior of known cameras has exact mirror images for its flip cameras, so both groups show the same views."""
+    clip, prior = toy
+    pose = msgspec.structs.replace(TINY.pose, encoding="view")
+    drawn = []
+    for cameras in ("both", "own"):
+        config = msgspec.structs.replace(TINY, pose=pose, cameras=cameras)
+        made = Ours().fit(clip, prior, config=config, seed=0, device=CPU, log=lambda *_: None, workdir=None)
+        drawn.append(made.at(clip.times[1]).means)
+    assert torch.equal(*drawn)

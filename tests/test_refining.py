@@ -48,9 +48,7 @@ def case() -> Case:
 def star(case: Case) -> GartStarReconstruction:
     config = msgspec.convert(TINY | {"iterations": 0, "refine": {"steps": 0}}, GartStarConfig)
     clip = case.clip.only([0, 1, 3])
-    made = load_method("gart-star").fit(
-        clip, case.prior, config=config, seed=0, device=CPU, log=quiet, workdir=None
-    )  # fmt: skip
+    made = load_method("gart-star").fit(clip, case.prior, config=config, seed=0, device=CPU, log=quiet, workdir=None)
     assert isinstance(made, GartStarReconstruction)
     made.config = msgspec.structs.replace(config, refine=msgspec.convert(REFINE["refine"], type(config.refine)))
     return made
