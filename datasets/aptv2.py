@@ -47,7 +47,7 @@ class AptV2:
     options = ("masks", "parts")
     keypoint_mapping, keypoint_use = "aptv2", "all"
 
-    def __init__(self, root: Path, masks: Path | None = None, parts: str = "all") -> None:
+    def __init__(self, root: Path, masks: Path | None = None, parts: str = "auto") -> None:
         self.root, self.parts = root, parts
         self.masks = Path(masks) if masks else root / "masks"
         for folder in (root, *([self.masks] if masks else [])):
@@ -62,7 +62,7 @@ class AptV2:
     def settings(self) -> dict[str, str]:
         """The options that differ from their defaults, for the record."""
         masks = {} if self.masks == self.root / "masks" else {"masks": str(self.masks.resolve())}
-        return masks | ({"parts": self.parts} if self.parts != "all" else {})
+        return masks | ({"parts": self.parts} if self.parts != "auto" else {})
 
     def cases(self, selection: Selection) -> list[str]:
         """Every animal that is annotated in enough frames of a clip.
@@ -141,7 +141,8 @@ class AptV2:
             masks=partial(read_masks, masks, track, range(len(files)), size),
             notes=tuple(note for note in notes if note),
         )  # fmt: skip
-        return with_parts(video, self.parts)
+        is_union = track is None and len(masks.ids) > 1
+        return with_parts(video, "all" if self.parts == "auto" and is_union else self.parts)
 
     def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
         """Verify the annotations and some animals that have masks; contact sheets go to ``sheets``."""

@@ -64,7 +64,7 @@ class Davis:
     keypoint_mapping, keypoint_use = "badja", "none"
 
     def __init__(
-        self, root: Path, masks: Path | None = None, keypoints: Path | None = None, parts: str = "all"
+        self, root: Path, masks: Path | None = None, keypoints: Path | None = None, parts: str = "auto"
     ) -> None:
         self.root = root / "DAVIS" if (root / "DAVIS" / "JPEGImages").is_dir() else root
         self.masks, self.keypoints = (Path(path) if path else None for path in (masks, keypoints))
@@ -85,7 +85,7 @@ class Davis:
         """The options that differ from their defaults, for the record."""
         given = {"masks": self.masks, "keypoints": self.keypoints}
         paths = {name: str(path.resolve()) for name, path in given.items() if path is not None}
-        return paths | ({"parts": self.parts} if self.parts != "all" else {})
+        return paths | ({"parts": self.parts} if self.parts != "auto" else {})
 
     def cases(self, selection: Selection) -> list[str]:
         """Every sequence with masks; where it has several objects, "<sequence>@<id>" for each of them too."""
@@ -146,10 +146,12 @@ class Davis:
             moments=tuple(Moment(file.name, i / FPS, joints.get(file.stem)) for i, file in enumerate(files)),
             images=partial(read_images, files, size),
             masks=partial(read_masks, used, object_id, every, size),
-            true_masks=partial(read_masks, own, object_id, every, size) if given or self.parts != "all" else None,
+            true_masks=partial(read_masks, own, object_id, every, size) if given or self.parts == "main" else None,
             notes=tuple(text for text in notes if text),
         )  # fmt: skip
-        return with_parts(video, self.parts)
+        # what DAVIS itself names one object is one, and a case of all objects is of all
+        is_whole = given is None or (object_id is None and len(given.ids) > 1)
+        return with_parts(video, "all" if self.parts == "auto" and is_whole else self.parts)
 
     def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
         """Verify some sequences, each file decoded; contact sheets go to ``sheets``."""

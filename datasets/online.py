@@ -81,7 +81,7 @@ class Online:
         end: float | str | None = None,
         fps: float | str | None = None,
         keypoints: Path | str | None = None,
-        parts: str = "all",
+        parts: str = "auto",
     ) -> None:
         self.root, self.parts = root, parts
         self.masks, self.keypoints = (Path(path) if path else None for path in (masks, keypoints))
@@ -101,7 +101,7 @@ class Online:
         given = {
             "masks": self.masks and self.masks.resolve(), "start": self.start, "end": self.end, "fps": self.fps,
             "keypoints": self.keypoints and self.keypoints.resolve(),
-            "parts": None if self.parts == "all" else self.parts,
+            "parts": None if self.parts == "auto" else self.parts,
         }  # fmt: skip
         return {name: str(value) for name, value in given.items() if value is not None}
 
@@ -152,7 +152,8 @@ class Online:
             images=self._images, masks=masks,
             notes=(*material.notes, *(text for text in (thinned, note, outside) if text)),
         )  # fmt: skip
-        return with_parts(video, self.parts)
+        is_union = self._table[case] is None and len(self._table) > 1
+        return with_parts(video, "all" if self.parts == "auto" and is_union else self.parts)
 
     def unmasked(self, case: str) -> Unmasked:
         """The chosen frames without their masks, for programs that make some; masks are named by frame number.

@@ -182,7 +182,7 @@ def test_two_animals_by_id_are_two_cases(walk: Path) -> None:
 def test_two_animals_in_one_mask_are_taken_as_one_and_told(walk: Path) -> None:
     for i in (3, 4):
         moving.save(walk / "masks" / f"{i:05d}.png", moving.mask(i, left=20) | moving.mask(i, left=60))
-    clip, truth = load(walk)
+    clip, truth = load(walk, parts="all")
     assert len(whole(clip, truth)) == 12
     told = "with two parts of like size (two animals?) taken as one animal (--parts main takes one)"
     assert f"2 of 12 frames {told}: 00003.png to 00004.png" in clip.notes
@@ -209,7 +209,7 @@ def test_check_tells_what_a_person_should_look_at(walk: Path, tmp_path: Path) ->
     masks[8][50:60, 80:84] = 255
     for i, values in enumerate(masks):
         moving.save(walk / "masks" / f"{i:05d}.png", values)
-    findings = check_videos(Online(walk), sheets=tmp_path / "sheets")
+    findings = check_videos(Online(walk, parts="all"), sheets=tmp_path / "sheets")
     said = "\n".join(finding.message for finding in findings)
     assert "holes (or gaps between legs) above 1% of the animal in 1 of 12 frames: 00002.png" in said
     assert "two parts of like size (two animals?) in 1 of 12 frames: 00004.png" in said

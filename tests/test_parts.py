@@ -11,7 +11,7 @@ from rewild4d import cli
 from rewild4d.datasets.davis import Davis
 from rewild4d.datasets.mask_check import check_videos
 from rewild4d.datasets.online import Online
-from rewild4d.datasets.parts import NOTE, main_parts
+from rewild4d.datasets.parts import NOTE, main_parts, standing_apart
 from rewild4d.errors import UserError
 
 
@@ -40,9 +40,19 @@ def test_the_largest_part_starts_and_takes_over() -> None:
     assert (kept[1] == blobs((50, 60))).all(), "nothing goes on from the frame before"
 
 
-def two_animals(folder: Path) -> None:
+def test_what_stands_apart_is_counted_by_the_animals_length() -> None:
+    lone, pole, other = blobs((10, 20)), blobs((10, 14), (15, 20)), blobs((10, 20), (25, 35))
+    speck = blobs((10, 20), (40, 41))  # 1 pixel of 100, and 4 of them count
+    assert standing_apart(lambda: iter([lone, pole, other, speck, None, np.zeros_like(lone)])) == (1, 4)
+    # Cut in two by a trunk: the 3 pixels between are more than a fifth of a half, 8, but not of the animal, 16.
+    whole, trunk = blobs((10, 26)), blobs((10, 16), (18, 26))
+    assert standing_apart(lambda: iter([whole, trunk, whole])) == (0, 3)
+    assert standing_apart(lambda: iter([])) == (0, 0)
+
+
+def two_animals(folder: Path, count: int = 12) -> None:
     """Overwrite masks so that another animal, two thirds as high, stands to the right of it."""
-    for i in range(12):
+    for i in range(count):
         second = moving.mask(i, left=60)
         second[: second.shape[0] // 2] = 0
         moving.save(folder / f"{i:05d}.png", moving.mask(i, left=20) | second)
@@ -57,11 +67,40 @@ def test_a_video_of_two_animals_is_that_of_one(tmp_path: Path) -> None:
     for frame in (*clip.frames, *truth.held_out):
         index = round(frame.time * 25)
         assert iou(restored(frame, moving.SIZE), moving.mask(index, left=20) > 0) > 0.93
-    assert NOTE in clip.notes and reader.settings["parts"] == "main"
-    both = Online(tmp_path / "clip")
-    assert both.load("clip", SELECTION)[0].digest != clip.digest and both.settings == {}
+    assert f"{NOTE} (--parts main)" in clip.notes and reader.settings["parts"] == "main"
+    both = Online(tmp_path / "clip", parts="all")
+    assert both.load("clip", SELECTION)[0].digest != clip.digest and both.settings == {"parts": "all"}
     advice = "--parts main keeps to its own"
     assert [advice in "".join(f.message for f in check_videos(each)) for each in (both, reader)] == [True, False]
+
+
+@pytest.mark.parametrize(("count", "parts"), [(12, "main"), (2, "main"), (1, "all")])
+def test_nobody_has_to_ask_where_another_animal_stands_apart(tmp_path: Path, count: int, parts: str) -> None:
+    """From a tenth of the masks on."""
+    moving.frames(tmp_path / "clip" / "frames")
+    moving.masks(tmp_path / "clip" / "masks")
+    two_animals(tmp_path / "clip" / "masks", count)
+    auto, asked = Online(tmp_path / "clip"), Online(tmp_path / "clip", parts=parts)
+    clip = auto.load("clip", SELECTION)[0]
+    assert clip.digest == asked.load("clip", SELECTION)[0].digest and auto.settings == {}
+    told = f"{count} of 12 masks have a part far from the rest (a second animal?): {NOTE} (--parts all: all)"
+    assert (told in clip.notes) == (parts == "main")
+
+
+def test_what_davis_calls_one_object_is_one_and_so_are_all_objects_together(tmp_path: Path) -> None:
+    root = moving.davis(tmp_path)
+    annotations = next((root / "Annotations").rglob("camel"))
+    two_animals(annotations)
+    assert Davis(root).load("camel", SELECTION)[0].digest == Davis(root, parts="all").load("camel", SELECTION)[0].digest
+    two_animals(tmp_path / "other" / "camel")
+    given = {"masks": tmp_path / "other"}
+    one, both = (Davis(root, **given, **more).load("camel", SELECTION)[0] for more in ({}, {"parts": "all"}))
+    assert one.digest != both.digest
+    for i in range(12):
+        ids = moving.mask(i, left=20) // 255 + 2 * (moving.mask(i, left=60) // 255)
+        moving.save(tmp_path / "other" / "camel" / f"{i:05d}.png", ids.astype(np.uint8), "P")
+    one, both = (Davis(root, **given, **more).load("camel", SELECTION)[0] for more in ({}, {"parts": "all"}))
+    assert one.digest == both.digest
 
 
 def test_held_out_frames_of_davis_are_judged_by_its_own_masks(tmp_path: Path) -> None:
@@ -70,7 +109,7 @@ def test_held_out_frames_of_davis_are_judged_by_its_own_masks(tmp_path: Path) ->
     two_animals(tmp_path / "other" / "camel")
     for options in ({}, {"masks": tmp_path / "other"}):
         clip, truth = Davis(root, parts="main", **options).load("camel", SELECTION)
-        assert NOTE in clip.notes
+        assert f"{NOTE} (--parts main)" in clip.notes
         for mine, theirs in zip(truth.held_out, own.held_out, strict=True):
             assert iou(restored(mine, moving.SIZE), restored(theirs, moving.SIZE)) > 0.93
 
@@ -78,7 +117,7 @@ def test_held_out_frames_of_davis_are_judged_by_its_own_masks(tmp_path: Path) ->
 def test_another_word_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     moving.frames(tmp_path / "clip" / "frames")
     moving.masks(tmp_path / "clip" / "masks")
-    with pytest.raises(UserError, match="unknown choice of --parts 'largest'.* all, main"):
+    with pytest.raises(UserError, match="unknown choice of --parts 'largest'.* all, auto, main"):
         Online(tmp_path / "clip", parts="largest").load("clip", SELECTION)
     with pytest.raises(SystemExit) as stop:
         cli.main(["check", "--dataset", "artemis", "--parts", "main"])

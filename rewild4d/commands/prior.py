@@ -53,7 +53,7 @@ class FitOptions:
     frames: Path
     out: Path
     masks: Path | None = None
-    parts: Parts = "all"
+    parts: Parts = "auto"
     keypoints: Path | None = None
     mapping: str | None = None
     use: Use = "all"

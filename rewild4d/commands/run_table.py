@@ -46,8 +46,8 @@ class Options:
         data: one animal's folder or a folder of animals; the built-in animals where it is left out.
         video: the same as --data, for a video file or a folder of frames (a protocol of online).
         masks: of the animal: a folder or, for online, a video; in place of the data set's own where it has some.
-        parts: of masks in several parts: all, or main, the one that goes on from the frame before (a second animal was
-            taken in); all where it is left out.
+        parts: of masks in several parts: all, or main, the one that goes on from the frame before; where left out,
+            main if many masks took in a second animal that stands apart (auto).
         start: seconds from where on frames of the video are used.
         end: seconds up to which they are used.
         fps: how many of them a second; of a folder of frames the rate at which it was taken.
