@@ -141,8 +141,7 @@ class AptV2:
             masks=partial(read_masks, masks, track, range(len(files)), size),
             notes=tuple(note for note in notes if note),
         )  # fmt: skip
-        is_union = track is None and len(masks.ids) > 1
-        return with_parts(video, "all" if self.parts == "auto" and is_union else self.parts)
+        return with_parts(video, self.parts, is_named=track is None and len(masks.ids) > 1)
 
     def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
         """Verify the annotations and some animals that have masks; contact sheets go to ``sheets``."""

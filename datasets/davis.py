@@ -149,9 +149,9 @@ class Davis:
             true_masks=partial(read_masks, own, object_id, every, size) if given or self.parts == "main" else None,
             notes=tuple(text for text in notes if text),
         )  # fmt: skip
-        # what DAVIS itself names one object is one, and a case of all objects is of all
-        is_whole = given is None or (object_id is None and len(given.ids) > 1)
-        return with_parts(video, "all" if self.parts == "auto" and is_whole else self.parts)
+        # what DAVIS itself calls one object is one
+        is_named = given is None or (object_id is None and len(given.ids) > 1)
+        return with_parts(video, self.parts, is_named)
 
     def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
         """Verify some sequences, each file decoded; contact sheets go to ``sheets``."""

@@ -152,8 +152,7 @@ class Online:
             images=self._images, masks=masks,
             notes=(*material.notes, *(text for text in (thinned, note, outside) if text)),
         )  # fmt: skip
-        is_union = self._table[case] is None and len(self._table) > 1
-        return with_parts(video, "all" if self.parts == "auto" and is_union else self.parts)
+        return with_parts(video, self.parts, is_named=self._table[case] is None and len(self._table) > 1)
 
     def unmasked(self, case: str) -> Unmasked:
         """The chosen frames without their masks, for programs that make some; masks are named by frame number.

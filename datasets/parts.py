@@ -26,19 +26,20 @@ OFTEN = 0.1
 """Share of the masks that have such a part, from which on it is taken for another animal."""
 
 
-def with_parts(video: Video, parts: str) -> Video:
+def with_parts(video: Video, parts: str, is_named: bool) -> Video:
     """The video with its masks cut down to the parts that are wanted.
 
     Args:
         video: its ``true_masks`` stay as they are.
         parts: `Parts`.
+        is_named: whether somebody named all that the masks show as what is wanted; "auto" is "all" then.
 
     Raises:
         UserError: another word, or masks that cannot be read.
     """
     if parts not in get_args(Parts):
         raise unknown_name("choice of --parts", parts, get_args(Parts))
-    if parts == "all":
+    if parts == "all" or (parts == "auto" and is_named):
         return video
     note = f"{NOTE} (--parts main)"
     if parts == "auto":
@@ -52,7 +53,7 @@ def with_parts(video: Video, parts: str) -> Video:
 
 def _counted(video: Video) -> tuple[int, int]:
     """`standing_apart` of a video's masks; kept on disk, because masks may be a long film."""
-    file = cache_folder() / "wild" / f"parts-{digest(video.identity)[:32]}.json"
+    file = cache_folder() / "wild" / f"parts-{digest(video.identity, repr((NOISE, APART)))[:32]}.json"
     if not file.is_file():
         found = standing_apart(video.masks)
         with atomic(file) as path:
