@@ -104,10 +104,12 @@ def blend(
     background: np.ndarray,
     image: np.ndarray,
     alpha: np.ndarray,
+    through: np.ndarray,
 ) -> None:
-    """Blend tiles until no ticket is left: fill image [V, C, h, w] and alpha [V, 1, h, w].
+    """Blend tiles until no ticket is left: fill image [V, C, h, w], alpha [V, 1, h, w] and ``through``, 1 - alpha.
 
     ``records`` and ``features`` are flat. ``pair_bits`` shrinks to the blocks where a pair really contributed.
+    ``through`` is flat and keeps the digits that alpha has lost near 1; empty where nobody needs them.
     """
     views, channels, height, width = image.shape
     count = len(records) // (RECORD * views)
@@ -133,7 +135,7 @@ def blend(
                 live &= ~closed
             else:
                 pair_bits[slot] = 0
-        _write_tile(view, tile_left, tile_top, left, colors, background, image, alpha)
+        _write_tile(view, tile_left, tile_top, left, colors, background, image, alpha, through)
 
 
 @inlined
@@ -202,16 +204,19 @@ def _write_tile(
     background: np.ndarray,
     image: np.ndarray,
     alpha: np.ndarray,
+    through: np.ndarray,
 ) -> None:
     _, channels, height, width = image.shape
     pixels, mattes = image.reshape(-1), alpha.reshape(-1)
     for block in range(BLOCKS):
         x, y = tile_left + BLOCK * (block % 4), tile_top + BLOCK * (block // 4)
-        through = absolute(load(left, block * LANES))
-        _write_block(mattes, view * height, x, y, width, height, splat(np.float32(1)) - through)
+        passed = absolute(load(left, block * LANES))
+        _write_block(mattes, view * height, x, y, width, height, splat(np.float32(1)) - passed)
+        if len(through) > 0:
+            _write_block(through, view * height, x, y, width, height, passed)
         for channel in range(channels):
             color = load(colors, (block * channels + channel) * LANES)
-            color = fma(through, splat(background[view, channel]), color)
+            color = fma(passed, splat(background[view, channel]), color)
             _write_block(pixels, (view * channels + channel) * height, x, y, width, height, color)
 
 

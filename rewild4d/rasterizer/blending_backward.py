@@ -39,6 +39,7 @@ from rewild4d.rasterizer.blending import (
     tile_place,
 )
 from rewild4d.rasterizer.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
+from rewild4d.rasterizer.crowds import crowd_backward
 from rewild4d.rasterizer.projection import ALONG_X, ALONG_Y, DOWN, LOG2_MIN_ALPHA, LOG_OPACITY, RECORD
 from rewild4d.rasterizer.projection_backward import TT, TU, UU
 
@@ -91,16 +92,19 @@ def blend_backward(
     pair_bits: np.ndarray,
     records: np.ndarray,
     features: np.ndarray,
+    background: np.ndarray,
     image: np.ndarray,
     alpha: np.ndarray,
     g_image: np.ndarray,
     g_alpha: np.ndarray,
     geometry: bool,
+    crowd: int,
     sums: np.ndarray,
 ) -> None:
     """Fill the slots' rows of ``sums`` (`slot_width` numbers each) for tiles until no ticket is left.
 
-    Without ``geometry`` only the channels' sums are made; the moments are zero.
+    Without ``geometry`` only the channels' sums are made; the moments are zero. Tiles of more than ``crowd`` Gaussians
+    are walked in double precision.
     """
     views, channels, height, width = image.shape
     count = len(records) // (RECORD * views)
@@ -116,9 +120,16 @@ def blend_backward(
         if starts[tile] == starts[tile + 1]:
             continue
         view, tile_top, tile_left = tile_place(tile, tiles_x, tiles_y)
+        first, last = starts[tile], starts[tile + 1]
+        if geometry and last - first > crowd:
+            crowd_backward(
+                view, tile_left, tile_top, entry_slot[first:last], entry_gaussian[first:last], pair_bits, records,
+                features, background, g_image, g_alpha, _first_channel(channels), row_length, sums,
+            )  # fmt: skip
+            continue
         open_tile(tile_left, tile_top, width, height, left)
         _read_tile(view, tile_left, tile_top, image, alpha, g_image, g_alpha, behind, gradients)
-        for entry in range(starts[tile], starts[tile + 1]):
+        for entry in range(first, last):
             slot = entry_slot[entry]
             bits = np.int64(pair_bits[slot])
             if bits != 0:

@@ -21,6 +21,7 @@ from rewild4d.rasterizer.binning import BLOCK_LEFT, BLOCK_TOP
 from rewild4d.rasterizer.blending import CONSTANTS
 from rewild4d.rasterizer.blending_backward import slot_width
 from rewild4d.rasterizer.conventions import RasterInfo
+from rewild4d.rasterizer.crowds import CROWD, NOWHERE
 from rewild4d.rasterizer.projection import RECORD, TILE
 from rewild4d.rasterizer.projection_backward import CAMERA, CHUNK, project_backward
 from rewild4d.rasterizer.stages import bin_and_blend, blend_back, project_and_sort
@@ -55,7 +56,8 @@ def rasterize(
         means2d.retain_grad()
     if background is None:
         background = features.new_zeros(world_to_camera.shape[0], features.shape[1])
-    image, alpha = _Blend.apply(means2d, records, features, background, *binning, width, height)
+    crowd = CROWD if world_to_camera.requires_grad or intrinsics.requires_grad else NOWHERE
+    image, alpha = _Blend.apply(means2d, records, features, background, *binning, width, height, crowd)
     return image, alpha, RasterInfo(radii, means2d)
 
 
@@ -187,6 +189,7 @@ class _Blend(torch.autograd.Function):
         counts: Tensor,
         width: int,
         height: int,
+        crowd: int,
     ) -> tuple[Tensor, Tensor]:
         views, channels = records.shape[0], features.shape[1]
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
@@ -199,16 +202,17 @@ class _Blend(torch.autograd.Function):
             np.empty(pairs, np.int32), np.empty(pairs, np.int32),
         )  # fmt: skip
         image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
+        through = np.empty(alpha.numel() if ctx.needs_input_grad[3] else 0, np.float32)
         call = (
             phase_counters(3), np.zeros(1, np.int64), _table(pieces, 3), order.numpy(),
             tiles.numpy(), numbers, tiles_x, tiles_y, BLOCK_LEFT, BLOCK_TOP, np.empty(pairs, np.int32),
             lists.pair_bits, np.zeros((len(pieces), views * tiles_x * tiles_y), np.int32), lists.starts,
             lists.entry_gaussian, lists.entry_slot, CONSTANTS, records.numpy(), array(features).ravel(),
-            array(background), image.numpy(), alpha.numpy(),
+            array(background), image.numpy(), alpha.numpy(), through,
         )  # fmt: skip
         run(bin_and_blend, [call] * threads)
         ctx.save_for_backward(records, features, background, image, alpha)
-        ctx.lists = lists
+        ctx.lists, ctx.crowd, ctx.through = lists, crowd, torch.from_numpy(through)
         return image, alpha
 
     @staticmethod
@@ -225,15 +229,15 @@ class _Blend(torch.autograd.Function):
         call = (
             phase_counters(2), np.zeros(1, np.int64), _table(spans(records.shape[1], threads), 2),
             *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.pair_bits, records.numpy(),
-            array(features).ravel(), image.numpy(), alpha.numpy(), array(g_image), array(g_alpha),
-            any(ctx.needs_input_grad[:2]), sums, lists.slots,
+            array(features).ravel(), array(background), image.numpy(), alpha.numpy(), array(g_image), array(g_alpha),
+            any(ctx.needs_input_grad[:2]), ctx.crowd, sums, lists.slots,
             width, v_means2d.numpy(), v_records.numpy(), v_features.numpy(),
         )  # fmt: skip
         run(blend_back, [call] * threads)
         v_background = None
         if ctx.needs_input_grad[3]:
-            v_background = (g_image * (1 - alpha)).sum(dim=(2, 3))
-        return v_means2d, v_records, v_features, v_background, None, None, None, None, None, None
+            v_background = (g_image * ctx.through.view_as(alpha)).sum(dim=(2, 3))
+        return v_means2d, v_records, v_features, v_background, *[None] * 7
 
 
 def _blend_threads(lists: _Lists) -> int:

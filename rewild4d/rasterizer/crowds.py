@@ -1,0 +1,161 @@
+"""The gradient of one tile in double precision, for tiles where hundreds of Gaussians meet.
+
+A camera's gradient is a sum over all Gaussians. Where thousands share a pixel their shares cancel to a thousandth, and
+an error that they have in common, as single precision makes in the transmittance, is left standing.
+"""
+
+import math
+
+import numpy as np
+
+from rewild4d.kernels.compiling import inlined, kernel
+from rewild4d.rasterizer.binning import BLOCK, BLOCKS, TILE
+from rewild4d.rasterizer.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
+from rewild4d.rasterizer.projection import (
+    ALONG_X,
+    ALONG_Y,
+    CENTER_X,
+    CENTER_Y,
+    DOWN,
+    LOG2_MIN_ALPHA,
+    LOG_OPACITY,
+    RECORD,
+)
+
+CROWD = 256
+"""Gaussians in a tile's list above which it is walked in double precision, if the cameras' gradients are wanted."""
+
+NOWHERE = np.iinfo(np.int64).max
+"""Stands for `CROWD` where nobody wants them."""
+
+_PIXELS = BLOCK * BLOCK
+
+
+@inlined
+def _alpha_at(records: np.ndarray, record: int, x: float, y: float) -> tuple:
+    """Alpha of a Gaussian at a point, its log2 before the upper cut, and the point's coordinates t and u in it."""
+    dx, dy = x - records[record + CENTER_X], y - records[record + CENTER_Y]
+    t, u = records[record + ALONG_X] * dx + records[record + ALONG_Y] * dy, records[record + DOWN] * dy
+    exponent = records[record + LOG_OPACITY] - t * t - u * u
+    alpha = min(math.exp(exponent * math.log(2.0)), MAX_ALPHA) if exponent >= LOG2_MIN_ALPHA else 0.0
+    return alpha, exponent, t, u
+
+
+@inlined
+def _take(left: np.ndarray, pixel: int, alpha: float) -> float:
+    """The weight of the next Gaussian at a pixel; what is left of the light is negative once the pixel has closed."""
+    before = left[pixel]
+    if before <= 0 or alpha == 0:
+        return 0.0
+    if before * (1 - alpha) <= MIN_TRANSMITTANCE:
+        left[pixel] = -before
+        return 0.0
+    left[pixel] = before * (1 - alpha)
+    return alpha * before
+
+
+@inlined
+def _along(gradients: np.ndarray, pixel: int, features: np.ndarray, feature: int, channels: int) -> float:
+    total = 0.0
+    for channel in range(channels):
+        total += gradients[channel, pixel] * features[feature + channel]
+    return total
+
+
+@kernel
+def _open(
+    view: int, tile_left: int, tile_top: int, g_image: np.ndarray, left: np.ndarray, gradients: np.ndarray
+) -> None:
+    """Set the light left to 1 inside the image and 0 outside; read the gradients of the tile's pixels."""
+    _, channels, height, width = g_image.shape
+    for row in range(TILE):
+        for column in range(TILE):
+            x, y = tile_left + column, tile_top + row
+            block = row // BLOCK * (TILE // BLOCK) + column // BLOCK
+            pixel = block * _PIXELS + row % BLOCK * BLOCK + column % BLOCK
+            left[pixel] = 1 if x < width and y < height else 0
+            for channel in range(channels):
+                gradients[channel, pixel] = g_image[view, channel, y, x] if left[pixel] > 0 else 0
+
+
+@kernel
+def crowd_backward(
+    view: int, tile_left: int, tile_top: int, slots: np.ndarray, gaussians: np.ndarray, pair_bits: np.ndarray,
+    records: np.ndarray, features: np.ndarray, background: np.ndarray, g_image: np.ndarray, g_alpha: np.ndarray,
+    first_channel: int, row_length: int, sums: np.ndarray,
+) -> None:  # fmt: skip
+    """Fill the rows of ``sums`` of one tile, as `blend_backward` of blending_backward.py does.
+
+    Args:
+        view: the tile's view.
+        tile_left: its first column.
+        tile_top: its first row.
+        slots: of its list, front to back.
+        gaussians: of its list.
+        pair_bits: the blocks of the tile where a pair contributes, by slot.
+        records: flat.
+        features: flat.
+        background: [V, C].
+        g_image: [V, C, h, w].
+        g_alpha: [V, 1, h, w].
+        first_channel: place in a row where the channels' sums begin.
+        row_length: numbers in a row.
+        sums: flat, set.
+    """
+    views, channels, height, width = g_image.shape
+    count = len(records) // (RECORD * views)
+    left, gradients = np.empty(BLOCKS * _PIXELS), np.empty((channels, BLOCKS * _PIXELS))
+    behind, row = np.zeros(BLOCKS * _PIXELS), np.empty(row_length)
+    for again in range(2):  # the pixels' totals come first
+        _open(view, tile_left, tile_top, g_image, left, gradients)
+        for entry in range(len(slots)):
+            bits, n = np.int64(pair_bits[slots[entry]]), gaussians[entry]
+            record = (view * count + n) * RECORD
+            row[:] = 0
+            for block in range(BLOCKS):
+                if not bits >> block & 1:
+                    continue
+                for lane in range(_PIXELS):
+                    x = tile_left + block % (TILE // BLOCK) * BLOCK + lane % BLOCK + 0.5
+                    y = tile_top + block // (TILE // BLOCK) * BLOCK + lane // BLOCK + 0.5
+                    pixel = block * _PIXELS + lane
+                    alpha, exponent, t, u = _alpha_at(records, record, x, y)
+                    weight = _take(left, pixel, alpha)
+                    if weight == 0:
+                        continue
+                    along = weight * _along(gradients, pixel, features, n * channels, channels)
+                    if again == 0:
+                        behind[pixel] += along
+                        continue
+                    behind[pixel] -= along
+                    for channel in range(channels):
+                        row[first_channel + channel] += weight * gradients[channel, pixel]
+                    if exponent <= math.log2(MAX_ALPHA):  # the cap holds the others
+                        pull = along - behind[pixel] * alpha / (1 - alpha)
+                        row[0] += pull
+                        row[1] += pull * t
+                        row[2] += pull * u
+                        row[3] += pull * t * t
+                        row[4] += pull * t * u
+                        row[5] += pull * u * u
+            if again == 1:
+                sums[slots[entry] * row_length : (slots[entry] + 1) * row_length] = row
+        if again == 0:
+            _add_background(view, tile_left, tile_top, width, height, background, gradients, g_alpha, left, behind)
+
+
+@kernel
+def _add_background(
+    view: int, tile_left: int, tile_top: int, width: int, height: int, background: np.ndarray, gradients: np.ndarray,
+    g_alpha: np.ndarray, left: np.ndarray, behind: np.ndarray,
+) -> None:  # fmt: skip
+    """Add to the pixels' totals what the loss sees through all Gaussians."""
+    for pixel in range(len(left)):
+        block, lane = pixel // _PIXELS, pixel % _PIXELS
+        x = tile_left + block % (TILE // BLOCK) * BLOCK + lane % BLOCK
+        y = tile_top + block // (TILE // BLOCK) * BLOCK + lane // BLOCK
+        if x < width and y < height:
+            slope = -np.float64(g_alpha[view, 0, y, x])
+            for channel in range(len(gradients)):
+                slope += gradients[channel, pixel] * background[view, channel]
+            behind[pixel] += abs(left[pixel]) * slope
