@@ -7,7 +7,7 @@ plays at 30 frames a second unless its name says otherwise; no world axis is ass
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import overload
 
@@ -25,6 +25,7 @@ from rewild4d.datasets.artemis_files import (
     read_intrinsics,
     read_licence,
 )
+from rewild4d.datasets.artemis_rig import read_rig
 from rewild4d.datasets.artemis_volume import SURFACE_POINTS, MovingSurface, Surface, read_pose, read_surface
 from rewild4d.datasets.artemis_writer import ArtemisWriter
 from rewild4d.datasets.images import Decoded, decode
@@ -145,7 +146,8 @@ class _Motion:
         moving = MovingSurface(surface, poses, self.fps)
         key = digest(hidden.digest(), *map(moving.at, clip.times))
         up = torch.from_numpy(up_direction(self.camera_to_world))
-        return clip, Truth(hidden, moving.at, key, moving.sample, surface.diagonal, up)
+        rig = partial(read_rig, self.folder, poses)
+        return clip, Truth(hidden, moving.at, key, moving.sample, surface.diagonal, up, rig)
 
     def _geometry(self) -> tuple[Surface | None, list[np.ndarray]]:
         """Surface points at rest and the bones of each kept frame."""

@@ -17,6 +17,27 @@ FILES = ("coords_init.pth", "volume_indices.pth", "volume_weights.pth")
 
 
 @dataclass(frozen=True)
+class Voxels:
+    """The rest-pose volume.
+
+    Attributes:
+        points: centres, world units, float64, [V, 3].
+        cells: their places on the lattice, from zero, int64, [V, 3].
+        indices: bones that move each voxel, 0 where the weight is, int64, [V, K].
+        weights: as the files have them, nothing below zero, float64, [V, K].
+        bones_rest: global bone-to-world matrices at rest, float64, [J, 4, 4].
+        pitch: size of a voxel along each axis, world units, zero along an axis with one layer, [3].
+    """
+
+    points: np.ndarray
+    cells: np.ndarray
+    indices: np.ndarray
+    weights: np.ndarray
+    bones_rest: np.ndarray
+    pitch: np.ndarray
+
+
+@dataclass(frozen=True)
 class Surface:
     """Rest-pose surface points with skinning weights.
 
@@ -98,6 +119,21 @@ def read_surface(animal: Path) -> Surface | None:
     """The voxels of an animal that miss one of their six neighbours, or None where it has no folder of volumes.
 
     Raises:
+        UserError: as `read_voxels`.
+    """
+    voxels = read_voxels(animal)
+    if voxels is None:
+        return None
+    rows = np.flatnonzero(is_surface(voxels.cells))
+    diagonal = float(np.linalg.norm(np.ptp(voxels.points, axis=0)))
+    points, indices, weights = voxels.points[rows], voxels.indices[rows], voxels.weights[rows]
+    return Surface(points, indices, weights, voxels.bones_rest, voxels.pitch, diagonal)
+
+
+def read_voxels(animal: Path) -> Voxels | None:
+    """The voxels of an animal, or None where it has no folder of volumes.
+
+    Raises:
         UserError: a file is missing or damaged, shapes that do not fit, a bone index out of range, no lattice.
     """
     folder = animal / "volumes"
@@ -121,16 +157,13 @@ def read_surface(animal: Path) -> Surface | None:
     cells, error = lattice(points)
     if error > 0.1:
         raise UserError(f"{folder / FILES[0]}: expected voxel centres on a lattice, got one {error:.2g} cells off.")
-    rows = np.flatnonzero(is_surface(cells))
-    used = used[rows]
-    extent = np.ptp(points, axis=0)
-    return Surface(
-        points[rows],
-        np.where(used, indices[rows], 0).astype(np.int64),
-        np.where(used, weights[rows], 0).astype(np.float64),
+    return Voxels(
+        points,
+        cells,
+        np.where(used, indices, 0).astype(np.int64),
+        np.where(used, weights, 0).astype(np.float64),
         bones_rest,
-        extent / np.maximum(cells.max(axis=0), 1),
-        float(np.linalg.norm(extent)),
+        np.ptp(points, axis=0) / np.maximum(cells.max(axis=0), 1),
     )
 
 

@@ -7,6 +7,7 @@ import msgspec
 
 from rewild4d.contracts import DatasetReader, Reconstruction
 from rewild4d.priors.choose import PriorChoice
+from rewild4d.priors.config import STANDARD
 from rewild4d.protocol import input_psnr
 from rewild4d.registry import load_method
 from rewild4d.types import Clip, Prior
@@ -82,6 +83,6 @@ def marks(method: str, prior: str, reconstruction: Reconstruction) -> list[str]:
     """
     info = load_method(method).info
     found = [info.mark] if info.mark else []
-    if info.uses_prior and prior.partition(":")[0] == "coarse":
+    if info.uses_prior and PriorChoice(prior, STANDARD).is_from_truth:
         found.append(FROM_TRUTH)
     return found + list(getattr(reconstruction, "marks", ()))

@@ -186,6 +186,27 @@ class Clip:
 
 
 @dataclass(frozen=True)
+class Rig:
+    """The true shape and skeleton of an animal, world units, all float64 but the indices.
+
+    Attributes:
+        vertices: rest surface, [n, 3].
+        faces: outward-facing triangles, int64, [f, 3].
+        weights: skinning weights, rows sum to one, [n, J].
+        bones_rest: global bone-to-world matrices at rest, [J, 4, 4].
+        bones: the same at each of the clip's frames, [T, J, 4, 4].
+        parents: parent of each bone, -1 for a root, int64, [J].
+    """
+
+    vertices: Tensor
+    faces: Tensor
+    weights: Tensor
+    bones_rest: Tensor
+    bones: Tensor
+    parents: Tensor
+
+
+@dataclass(frozen=True)
 class Truth:
     """What only the evaluation sees.
 
@@ -198,6 +219,7 @@ class Truth:
             an independent sampling, float64, [n, 3]; None where the data set has no geometry.
         diagonal: of the animal's bounding box in its rest pose, world units; None where unknown.
         up: direction that points up in the world, unit, float64, [3]; None where unknown.
+        rig: makes the true shape and skeleton, for a bound (`--prior rig`); None where the data set has none.
     """
 
     held_out: Sequence[Frame]
@@ -206,6 +228,7 @@ class Truth:
     sample: Callable[[float, int, int], Tensor] | None = None
     diagonal: float | None = None
     up: Tensor | None = None
+    rig: Callable[[], Rig] | None = None
 
 
 @dataclass(frozen=True)
@@ -213,7 +236,7 @@ class Prior:
     """A posed template: a start, never a constraint. Everything is in the object frame but `object_to_world`.
 
     Attributes:
-        name: how it was made ("template", "coarse", a file's name).
+        name: how it was made ("template", "coarse-<noise>", "rig", a file's name).
         provenance: one sentence for the record (what it saw, noise, version).
         vertices: rest shape, float32, [n, 3].
         faces: int64, [f, 3].

@@ -225,6 +225,7 @@ def test_a_prior_from_the_truth_is_a_mark_of_those_that_use_it() -> None:
     assert marks("ours", "coarse:0.5", reconstruction) == marks("prior-only", "coarse", reconstruction) == [FROM_TRUTH]
     assert marks("gart-star", "coarse:0", reconstruction) == ["poses fitted once more to each input image", FROM_TRUTH]
     assert marks("empty", "coarse:0", reconstruction) == marks("ours", "template", reconstruction) == []
+    assert marks("ours", "rig", reconstruction) == [FROM_TRUTH]
     assert marks("ours", "priors/coarse.npz", reconstruction) == []
 
 

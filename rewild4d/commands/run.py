@@ -53,8 +53,9 @@ class Options:
         protocol: what is held out and measured (see `list`); the data set's default where it is left out.
         preset: size of the effort: quick, standard or paper.
         seeds: one run for each.
-        prior: "template" (fitted to the clip), "coarse:<noise>" (from the truth plus noise: for studies) or a file (of
-            real videos: what `prior fit` or `prior import` wrote).
+        prior: "template" (fitted to the clip), "coarse:<noise>" (from the truth plus noise: for studies), "rig" (the
+            data set's own shape and skeleton: a bound) or a file (of real videos: what `prior fit` or `prior import`
+            wrote).
         keypoints: of a real video (davis, online): BADJA or COCO-like .json, DeepLabCut or SLEAP .csv.
         mapping: which keypoint is which point of the template: aptv2, badja, superanimal-quadruped or a .toml file.
         use_keypoints: frames whose keypoints the prior's fit sees: all; half (the rest is scored); none (all are

@@ -20,6 +20,7 @@ from rewild4d.priors.io import load_prior, save_prior, seal
 from rewild4d.priors.judge import doubts, joint_scores, measured
 from rewild4d.priors.landmarks import Marks, load_mapping, marks
 from rewild4d.priors.placing import in_world, placed
+from rewild4d.priors.rig import rig_prior
 from rewild4d.priors.steady import without_hops
 from rewild4d.types import Clip, Prior, Truth
 
@@ -38,7 +39,8 @@ class PriorChoice:
 
     Attributes:
         name: "template" (fitted to the clip alone, with its cameras where it has any), "coarse" or "coarse:<noise>"
-            (from the truth, plus noise; for studies of prior quality only) or the path of an npz file.
+            (from the truth, plus noise; for studies of prior quality only), "rig" (the data set's own shape and
+            skeleton: a bound) or the path of an npz file.
         config: settings of the template fit under known cameras.
         mapping: which of the frames' keypoints is which point of the template (`landmarks.load_mapping`); None: they
             are not looked at.
@@ -64,13 +66,25 @@ class PriorChoice:
             raise UserError(f"--prior {self.name}: expected a finite noise of 0 or more, got '{level}'.")
         return noise
 
+    @property
+    def is_from_truth(self) -> bool:
+        """Whether the prior has seen what is held out, and a row that starts from it is a bound."""
+        return self.name == "rig" or self.noise is not None
+
     def identity(self, clip: Clip, truth: Truth) -> str:
-        """Digest of all that decides the prior, before it is made: sixteen hex digits."""
+        """Digest of all that decides the prior, before it is made: sixteen hex digits.
+
+        Raises:
+            UserError: "rig", and the data set has none.
+        """
+        if self.name == "rig" and truth.rig is None:
+            raise UserError(f"--prior rig: expected a data set with bones and a volume, but {clip.name} has none.")
         parts: list[str | bytes] = [clip.digest, str(code_version())]
         if self.name == "template":
             parts += ["template", msgspec.json.encode(self.settings(clip)), repr(self._pairs), self.use]
-        elif self.noise is not None:
-            parts += [f"coarse {self.noise}", truth.digest, msgspec.json.encode(self.config)]
+        elif self.is_from_truth:
+            named = "rig" if self.noise is None else f"coarse {self.noise}"
+            parts += [named, truth.digest, msgspec.json.encode(self.config)]
         else:
             parts += ["file", load_prior(Path(self.name)).digest, repr(self._pairs)]
         return digest(*parts)[:16]
@@ -110,7 +124,7 @@ def make_prior(choice: PriorChoice, clip: Clip, truth: Truth, path: Path, log: L
         UserError: a file that cannot be used or is for another clip, or masks that show nothing.
     """
     footage = not _has_cameras(clip)
-    if choice.name != "template" and choice.noise is None:
+    if choice.name != "template" and not choice.is_from_truth:
         prior = load_prior(Path(choice.name))
         prior = placed(prior, clip) if footage else in_world(prior, clip, choice.name)
         figures = measured(prior, clip.frames)
@@ -131,6 +145,8 @@ def make_prior(choice: PriorChoice, clip: Clip, truth: Truth, path: Path, log: L
 def _fitted(choice: PriorChoice, clip: Clip, truth: Truth, log: Log) -> Prior:
     if choice.noise is not None:
         return coarse_prior(clip, truth.held_out, noise=choice.noise, seed=PRIOR_SEED, config=choice.config, log=log)
+    if choice.name == "rig" and truth.rig:
+        return rig_prior(clip, truth.rig(), fit_template(clip, config=choice.config, seed=PRIOR_SEED, log=log))
     if _has_cameras(clip):
         return fit_template(clip, config=choice.config, seed=PRIOR_SEED, log=log)
     given, scored = choice.keypoints(clip)
