@@ -247,8 +247,10 @@ def test_a_first_image_tells_time_and_compiled_kernels(
     first_image.main(str(tmp_path / "scene.pt"))
     found = json.loads(capsys.readouterr().out)
     assert found["compiled"] >= before + 1
-    seconds, image, compiled = probes._start_rows("cold start", found | {"seconds": 7.0})
+    seconds, alone, after, image, compiled = probes._start_rows("cold start", found | {"seconds": 7.0})
     assert (seconds.value, seconds.unit) == (7.0, "s")
+    assert (alone.quantity, after.quantity) == ("cold start: torch", "cold start: after torch")
+    assert after.value is not None and image.value is not None and after.value >= image.value
     assert (image.quantity, image.value) == ("cold start: first image", found["first_image"])
     assert (compiled.quantity, compiled.value) == ("cold start: kernels compiled", found["compiled"])
 

@@ -62,7 +62,9 @@ def _start_rows(title: str, found: Mapping[str, float]) -> list[Row]:
         )  # fmt: skip
 
     return [
-        row(title, "seconds", "s", "interpreter, imports, first image with gradients"),
+        row(title, "seconds", "s", "interpreter, imports, first image with gradients, and the process's end"),
+        row(f"{title}: torch", "torch", "s", "its own import, whatever comes after"),
+        row(f"{title}: after torch", "after_torch", "s", "imports of the rasterizer, first image with gradients"),
         row(f"{title}: first image", "first_image", "s"),
         row(f"{title}: kernels compiled", "compiled", "1"),
     ]

@@ -1,7 +1,7 @@
 """A prior that is the truth: the data set's own shape, skinning weights and skeleton, posed as it was.
 
-With it `prior-only` is the bound that no reconstruction with this skeleton should hope to pass, and a method shows what
-it makes of one camera when shape and motion need no guessing. For studies: never the default, and named in the record.
+With it a method shows what it makes of one camera when shape and motion need no guessing: a bound on what a better
+prior could give. For studies: never the default, and named in the record.
 """
 
 from dataclasses import replace
