@@ -67,10 +67,11 @@ def _sources(package: str) -> str:
 
 def machine(device: torch.device, rasterizer: str) -> dict[str, str]:
     """Processor, system, threads, what renders, and the versions that decide the last digit."""
-    packages = ["torch", "numpy", "numba"]
+    packages = ["numpy", "numba"]
     if rasterizer in ("triton", "gsplat"):
         packages.append(rasterizer)
-    versions = {name: metadata.version(name) for name in packages}
+    # Not the metadata's: those of PyPI's wheel do not say that it is the CUDA build.
+    versions = {"torch": str(torch.__version__), **{name: metadata.version(name) for name in packages}}
     return {
         "processor": _processor(),
         **({"gpu": torch.cuda.get_device_name(device)} if device.type == "cuda" else {}),
