@@ -32,7 +32,7 @@ from torch import Tensor
 from rewild4d.errors import UserError
 from rewild4d.priors.io import seal
 from rewild4d.priors.kinematics import depth_levels
-from rewild4d.transforms import mirror_points, mirror_transforms, rigid, skin_points
+from rewild4d.transforms import mirror_points, mirror_transforms, nearest_rotation, rigid, skin_points
 from rewild4d.types import OBJECT_DIAGONAL, Prior
 
 NEEDED = ("vertices", "faces", "weights", "joints", "parents")
@@ -115,10 +115,7 @@ def _turn(start: Tensor, end: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Te
     part = share / share.sum().clamp_min(1e-12)
     center, place = part @ start, torch.einsum("n,tna->ta", part, end)
     cross = torch.einsum("n,tna,nb->tab", part, end - place[:, None], start - center)
-    u, _, vh = torch.linalg.svd(cross)
-    sign = torch.ones(len(end), 3, dtype=start.dtype)
-    sign[:, 2] = torch.linalg.det(u @ vh).sign()
-    return (u * sign[:, None]) @ vh, center, place
+    return nearest_rotation(cross), center, place
 
 
 def _laid_on(prior: Prior, vertices: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:

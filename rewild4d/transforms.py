@@ -90,6 +90,14 @@ def split_similarity(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return scale, linear / scale[..., None, None], matrix[..., :3, 3]
 
 
+def nearest_rotation(matrix: Tensor) -> Tensor:
+    """The rotation closest to a matrix in the sum of squares (Kabsch), a reflection never, [..., 3, 3]."""
+    u, _, vh = torch.linalg.svd(matrix)
+    sign = torch.ones_like(matrix[..., 0, :])
+    sign[..., 2] = torch.linalg.det(u @ vh).sign()
+    return (u * sign[..., None, :]) @ vh
+
+
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """World-to-camera matrix (OpenCV axes) of a camera at ``eye`` that looks at ``target``; all [3] -> [4, 4]."""
     forward = torch.nn.functional.normalize(target - eye, dim=0)

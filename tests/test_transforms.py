@@ -37,6 +37,14 @@ def test_quaternions_form_a_group(generator: torch.Generator) -> None:
     torch.testing.assert_close(tf.quat_multiply(a, b).norm(dim=-1), torch.ones(64, dtype=torch.float64))
 
 
+def test_the_nearest_rotation_is_one_and_the_closest(generator: torch.Generator) -> None:
+    turns = tf.quat_to_matrix(random_quats(64, generator))
+    stretch = torch.tensor((3.0, 2.0, 1.0), dtype=torch.float64).diag()
+    torch.testing.assert_close(tf.nearest_rotation(turns @ stretch), turns)  # the polar factor
+    mirrored = turns @ torch.diag(torch.tensor((3.0, 2.0, -1.0), dtype=torch.float64))
+    torch.testing.assert_close(tf.nearest_rotation(mirrored), turns)  # of a reflection the weakest axis turns over
+
+
 def test_matrices_are_a_homomorphism(generator: torch.Generator) -> None:
     a, b = random_quats(64, generator), random_quats(64, generator)
     product = tf.quat_to_matrix(tf.quat_multiply(a, b))

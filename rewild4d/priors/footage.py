@@ -24,7 +24,7 @@ from rewild4d.priors.race import Race
 from rewild4d.priors.search import facings
 from rewild4d.priors.template import MIRROR, PARENTS, diagonal, quadruped
 from rewild4d.priors.views import FIELD_OF_VIEW, Views, fauna_camera, windows
-from rewild4d.transforms import rigid
+from rewild4d.transforms import nearest_rotation, rigid
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Prior
 
 
@@ -223,12 +223,7 @@ def object_cameras(race: StandingCamera) -> tuple[Camera, ...]:
     for frame, root in zip(race.frames, guesses.roots()[0].double(), strict=True):
         assert frame.camera is not None
         moved = frame.camera.world_to_camera @ root
-        moved = rigid(_orthonormal(moved[:3, :3]), moved[:3, 3] * (OBJECT_DIAGONAL / float(size)))
+        # Single precision leaves errors of 1e-7.
+        moved = rigid(nearest_rotation(moved[:3, :3]), moved[:3, 3] * (OBJECT_DIAGONAL / float(size)))
         cameras.append(replace(frame.camera, world_to_camera=moved))
     return tuple(cameras)
-
-
-def _orthonormal(matrix: Tensor) -> Tensor:
-    """The nearest rotation: single precision leaves errors of 1e-7."""
-    u, _, v = torch.linalg.svd(matrix)
-    return u @ v

@@ -19,6 +19,7 @@ from rewild4d.transforms import (
     camera_in_object,
     mirror_camera,
     mirror_transforms,
+    nearest_rotation,
     rigid,
     similarity,
     skin_points,
@@ -82,10 +83,7 @@ def rig_prior(clip: Clip, rig: Rig, template: Prior) -> Prior:
 def rigid_motion(points: Tensor, moved: Tensor) -> Tensor:
     """The rotation and translation that bring points closest to where they moved (Kabsch), [n, 3] each -> [4, 4]."""
     before, after = points.mean(0), moved.mean(0)
-    u, _, vh = torch.linalg.svd((moved - after).T @ (points - before))
-    sign = torch.ones(3, dtype=points.dtype)
-    sign[2] = torch.linalg.det(u @ vh).sign()
-    turn = u @ torch.diag(sign) @ vh
+    turn = nearest_rotation((moved - after).T @ (points - before))
     return rigid(turn, after - turn @ before)
 
 
@@ -153,9 +151,6 @@ def _moved(points: Tensor, matrix: Tensor) -> Tensor:
 
 def _rigid_about(transforms: Tensor, pivots: Tensor) -> Tensor:
     """The nearest rigid transforms that move the pivots [J, 3] as these [T, J, 4, 4] do: bones may be scaled."""
-    u, _, vh = torch.linalg.svd(transforms[..., :3, :3])
-    flip = torch.ones_like(transforms[..., 0, :3])
-    flip[..., 2] = torch.linalg.det(u @ vh).sign()
-    turn = u * flip[..., None, :] @ vh
+    turn = nearest_rotation(transforms[..., :3, :3])
     there = (transforms[..., :3, :3] @ pivots[..., None])[..., 0] + transforms[..., :3, 3]
     return rigid(turn, there - (turn @ pivots[..., None])[..., 0])

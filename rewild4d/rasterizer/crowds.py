@@ -62,20 +62,25 @@ def _along(gradients: np.ndarray, pixel: int, features: np.ndarray, feature: int
     return total
 
 
+@inlined
+def _place(pixel: int, tile_left: int, tile_top: int) -> tuple:
+    """Column and row in the image of a tile's pixel, counted block by block."""
+    block, lane = pixel // _PIXELS, pixel % _PIXELS
+    x = tile_left + block % (TILE // BLOCK) * BLOCK + lane % BLOCK
+    return x, tile_top + block // (TILE // BLOCK) * BLOCK + lane // BLOCK
+
+
 @kernel
 def _open(
     view: int, tile_left: int, tile_top: int, g_image: np.ndarray, left: np.ndarray, gradients: np.ndarray
 ) -> None:
     """Set the light left to 1 inside the image and 0 outside; read the gradients of the tile's pixels."""
     _, channels, height, width = g_image.shape
-    for row in range(TILE):
-        for column in range(TILE):
-            x, y = tile_left + column, tile_top + row
-            block = row // BLOCK * (TILE // BLOCK) + column // BLOCK
-            pixel = block * _PIXELS + row % BLOCK * BLOCK + column % BLOCK
-            left[pixel] = 1 if x < width and y < height else 0
-            for channel in range(channels):
-                gradients[channel, pixel] = g_image[view, channel, y, x] if left[pixel] > 0 else 0
+    for pixel in range(len(left)):
+        x, y = _place(pixel, tile_left, tile_top)
+        left[pixel] = 1 if x < width and y < height else 0
+        for channel in range(channels):
+            gradients[channel, pixel] = g_image[view, channel, y, x] if left[pixel] > 0 else 0
 
 
 @kernel
@@ -102,7 +107,7 @@ def crowd_backward(
         row_length: numbers in a row.
         sums: flat, set.
     """
-    views, channels, height, width = g_image.shape
+    views, channels = g_image.shape[:2]
     count = len(records) // (RECORD * views)
     left, gradients = np.empty(BLOCKS * _PIXELS), np.empty((channels, BLOCKS * _PIXELS))
     behind, row = np.zeros(BLOCKS * _PIXELS), np.empty(row_length)
@@ -115,11 +120,9 @@ def crowd_backward(
             for block in range(BLOCKS):
                 if not bits >> block & 1:
                     continue
-                for lane in range(_PIXELS):
-                    x = tile_left + block % (TILE // BLOCK) * BLOCK + lane % BLOCK + 0.5
-                    y = tile_top + block // (TILE // BLOCK) * BLOCK + lane // BLOCK + 0.5
-                    pixel = block * _PIXELS + lane
-                    alpha, exponent, t, u = _alpha_at(records, record, x, y)
+                for pixel in range(block * _PIXELS, (block + 1) * _PIXELS):
+                    x, y = _place(pixel, tile_left, tile_top)
+                    alpha, exponent, t, u = _alpha_at(records, record, x + 0.5, y + 0.5)
                     weight = _take(left, pixel, alpha)
                     if weight == 0:
                         continue
@@ -141,19 +144,18 @@ def crowd_backward(
             if again == 1:
                 sums[slots[entry] * row_length : (slots[entry] + 1) * row_length] = row
         if again == 0:
-            _add_background(view, tile_left, tile_top, width, height, background, gradients, g_alpha, left, behind)
+            _add_background(view, tile_left, tile_top, background, gradients, g_alpha, left, behind)
 
 
 @kernel
 def _add_background(
-    view: int, tile_left: int, tile_top: int, width: int, height: int, background: np.ndarray, gradients: np.ndarray,
-    g_alpha: np.ndarray, left: np.ndarray, behind: np.ndarray,
+    view: int, tile_left: int, tile_top: int, background: np.ndarray, gradients: np.ndarray, g_alpha: np.ndarray,
+    left: np.ndarray, behind: np.ndarray,
 ) -> None:  # fmt: skip
     """Add to the pixels' totals what the loss sees through all Gaussians."""
+    height, width = g_alpha.shape[2:]
     for pixel in range(len(left)):
-        block, lane = pixel // _PIXELS, pixel % _PIXELS
-        x = tile_left + block % (TILE // BLOCK) * BLOCK + lane % BLOCK
-        y = tile_top + block // (TILE // BLOCK) * BLOCK + lane // BLOCK
+        x, y = _place(pixel, tile_left, tile_top)
         if x < width and y < height:
             slope = -np.float64(g_alpha[view, 0, y, x])
             for channel in range(len(gradients)):
