@@ -7,7 +7,7 @@ from twins import Make, check_twins, leaves, normal, unit
 
 from rewild4d.kernels.halves import AVAILABLE
 from rewild4d.ours.canonical import Gaussians
-from rewild4d.ours.config import Config, Deform, Skinning
+from rewild4d.ours.config import Config, Deform, Loss, Skinning
 from rewild4d.ours.deform import DeformNetwork, Posed
 from rewild4d.ours.fused.skinning import skin_both
 from rewild4d.ours.geometry_losses import compact_loss
@@ -132,7 +132,8 @@ def test_sampled_skinning_weights(field: SkinningField) -> None:
     check_twins(make)
 
 
-def test_skinning_of_both_branches() -> None:
+@pytest.mark.parametrize("isolated", [True, False])
+def test_skinning_of_both_branches(isolated: bool) -> None:
     template, count = quadruped(), 1300
     quats = unit(20, 4, seed=1)
     weights = normal(count, 20, seed=3).mul(2).softmax(dim=-1)
@@ -145,7 +146,7 @@ def test_skinning_of_both_branches() -> None:
             "logit_opacities": normal(count, seed=7),
             "colors": normal(count, 1, 3, seed=8),
         }
-        config = Config(deform=Deform(width=16))
+        config = Config(deform=Deform(width=16), loss=Loss(isolated=isolated))
         generator = torch.Generator().manual_seed(0)
         grid = SkinningField(torch.zeros(8, 20), torch.zeros(3), torch.ones(3), torch.tensor(MIRROR), False)
         skeleton = template.bones[:, 0].float(), torch.tensor(PARENTS), torch.tensor(MIRROR)

@@ -177,6 +177,8 @@ class WarmUp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 class Loss(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Image losses of the two branches (section 6)."""
 
+    isolated: bool = True
+    """No gradient of the appearance reaches the joints (paper)."""
     pose_silhouette: Weight = 0.2
     """BCE + Dice of the pose branch (paper)."""
     l1: Weight = 0.8

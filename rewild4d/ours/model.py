@@ -67,7 +67,7 @@ class Model(nn.Module):
     def skin(self, weights: Tensor, quats: Tensor, transforms: Tensor) -> tuple[Posed, Posed]:
         """Blended skinning of the canonical Gaussians, for the pose branch and for the appearance branch.
 
-        Both have the same values; gradients of the second do not reach the joints.
+        Both have the same values; gradients of the second do not reach the joints, unless `loss.isolated` is off.
 
         Args:
             weights: of each Gaussian, [n, J].
@@ -77,13 +77,14 @@ class Model(nn.Module):
         own, log_scales = self.gaussians, self.gaussians.scales_log()
         if fits(own.means):
             live_means, live_quats, means, turned = skin_both(own.means, own.quats, weights, transforms, quats)
-            return Posed(live_means, live_quats, log_scales), Posed(means, turned, log_scales)
+            live = Posed(live_means, live_quats, log_scales)
+            return live, Posed(means, turned, log_scales) if self.config.loss.isolated else live
         rest = nn.functional.normalize(own.quats, dim=-1)
         live, still = (
             Posed(skin_points(own.means, weights, matrices), skin_quats(rest, weights, turns), log_scales)
             for matrices, turns in ((transforms, quats), (transforms.detach(), quats.detach()))
         )
-        return live, still
+        return live, still if self.config.loss.isolated else live
 
     def deformed(self, pose: Pose, weights: Tensor, posed: Posed, strength: float) -> Posed:
         """Skinned Gaussians after the deformation network.
