@@ -5,7 +5,7 @@ import torch
 
 from rewild4d.conformance import tiny_case
 from rewild4d.ours.canonical import initial_gaussians
-from rewild4d.ours.config import Canonical, Config, Deform, Geometry, Pose, PriorUse, Skinning
+from rewild4d.ours.config import Canonical, Config, Deform, Geometry, Loss, Pose, PriorUse, Skinning
 from rewild4d.ours.fit import Training
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.symmetry import Key, Supervision
@@ -102,6 +102,18 @@ def test_without_deformation_the_branches_agree(case: Case) -> None:
     whole = model(case)
     posed, moved = whole.moved(whole.pose(torch.tensor([0.5]), [Key(1, 1, 0)]), weights, 1.0)
     assert (posed.means - moved.means).abs().max() > 1e-3
+
+
+def test_without_isolation_colours_move_the_joints(case: Case) -> None:
+    key, values, slopes = Key(1, 1, 0), [], []
+    for each in (training(case), training(case, loss=Loss(isolated=False))):
+        losses, _ = each.losses(key, each.supervision.target(key), index=19)
+        values.append({name: value.item() for name, value in losses.items()})
+        (losses["l1"] + losses["ssim"]).backward()
+        slopes.append(each.model.network.head.weight.grad)
+    assert values[0] == values[1]
+    assert slopes[0] is None or slopes[0].abs().max() == 0
+    assert slopes[1] is not None and slopes[1].abs().max() > 0
 
 
 def test_fixed_skinning_stays_as_the_prior_has_it(case: Case) -> None:

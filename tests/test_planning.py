@@ -49,12 +49,12 @@ def test_every_table_that_ships_can_be_planned() -> None:
             assert load_reported(found.paper).source.startswith("Progressive Pose-Guided 4D Animal Reconstruction")
 
 
-def test_the_ablations_are_the_papers() -> None:
+def test_the_ablations_are_the_papers_and_two_more() -> None:
     found = load_specs()["ablation"]
     labels = [row.label for row in found.rows]
     assert labels == [
         "w/o Deform", "w/o Shape Prior", "w/o Part Anchors", "w/ Symm. Enc.", "w/o Symm. Enc.", "Poses tied",
-        "Fixed Skinning", "w/o compact", "w/o smooth", "Ours",
+        "Fixed Skinning", "w/o compact", "w/o smooth", "w/o Isolation", "Ours",
     ]  # fmt: skip
     made = {row.label: planning.row_entry("ablation", row, found, ()).config for row in found.rows}
     whole: Any = made["Ours"]
