@@ -6,15 +6,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from rewild4d.kernels.arrays import fits
+from rewild4d.kernels.harmonics import C0 as C0
+from rewild4d.kernels.harmonics import C1, C2, C3, shade
 from rewild4d.types import Splats
-
-C0 = 0.28209479177387814
-C1 = 0.4886025119029199
-C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
-C3 = (
-    -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
-    -0.4570457994644658, 1.445305721320277, -0.5900435899266435,
-)  # fmt: skip
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
@@ -98,6 +93,8 @@ def seen_colors(splats: Splats, eye: Tensor) -> Tensor:
         return splats.colors[:, 0]
     if count not in (4, 9, 16):
         raise ValueError(f"expected 1, 4, 9 or 16 colour coefficients per Gaussian, got {count}")
+    if fits(splats.colors) and fits(splats.means) and not (splats.colors.requires_grad or splats.means.requires_grad):
+        return shade(splats.colors, splats.means, eye)
     directions = normalize(splats.means - eye.to(splats.means), dim=-1)
     values = basis(directions, round(count**0.5) - 1)
     return (torch.einsum("nk,nkc->nc", values, splats.colors) + 0.5).clamp_min(0)

@@ -1,8 +1,10 @@
 """The basis is orthonormal, and degree 0 is plain colour."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from rewild4d.harmonics import C0, basis, rotated, seen_colors
@@ -37,6 +39,25 @@ def test_constant_coefficient_is_a_colour_from_everywhere() -> None:
 def test_rgb_passes_through() -> None:
     colors = torch.rand(5, 1, 3)
     torch.testing.assert_close(seen_colors(splats(colors), torch.zeros(3)), colors[:, 0])
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_the_kernel_sees_what_plain_torch_sees(degree: int) -> None:
+    generator = torch.Generator().manual_seed(degree)
+    made = Splats(
+        torch.randn(2500, 3, generator=generator, dtype=torch.float64), torch.ones(2500, 4), torch.ones(2500, 3),
+        torch.ones(2500), torch.randn(2500, (degree + 1) ** 2, 3, generator=generator, dtype=torch.float64),
+    )  # fmt: skip
+    eye = torch.tensor((0.3, -0.2, 4.0), dtype=torch.float64)
+    wanted = seen_colors(made, eye)
+    single = replace(made, means=made.means.float(), colors=made.colors.float())
+    torch.testing.assert_close(seen_colors(single, eye), wanted.float(), atol=1e-5, rtol=0)
+    assert (wanted == 0).any(), "some colours are cut off at black"
+    single.colors.requires_grad_()
+    seen_colors(single, eye).sum().backward()
+    assert single.colors.grad is not None and single.colors.grad.abs().max() > 0
+    single.colors.detach_()[7, 1, 2] = math.nan
+    assert seen_colors(single, eye).isnan().nonzero().tolist() == [[7, 2]], "what is not a number stays visible"
 
 
 def test_a_turned_animal_keeps_its_colours() -> None:

@@ -11,14 +11,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rewild4d.harmonics import C1, C2, C3
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
+from rewild4d.kernels.harmonics import CHUNK, set_basis
 from rewild4d.kernels.simd import take_ticket
 from rewild4d.kernels.threads import run, thread_count
-
-CHUNK = 1024
-"""Gaussians a unit of work holds."""
 
 
 @inlined
@@ -49,23 +46,6 @@ def _direction(means: np.ndarray, quats: np.ndarray, rest: np.ndarray, n: int, e
     )
 
 
-@inlined
-def _basis(direction: tuple, degree: int, values: np.ndarray) -> None:
-    """Values of the basis functions above degree 0."""
-    x, y, z = direction
-    values[0], values[1], values[2] = -C1 * y, C1 * z, -C1 * x
-    if degree > 1:
-        xx, yy, zz = x * x, y * y, z * z
-        values[3], values[4] = C2[0] * x * y, C2[1] * y * z
-        values[5], values[6] = C2[2] * (2 * zz - xx - yy), C2[3] * x * z
-        values[7] = C2[4] * (xx - yy)
-        if degree > 2:
-            values[8], values[9] = C3[0] * y * (3 * xx - yy), C3[1] * x * y * z
-            values[10], values[11] = C3[2] * y * (4 * zz - xx - yy), C3[3] * z * (2 * zz - 3 * xx - 3 * yy)
-            values[12], values[13] = C3[4] * x * (4 * zz - xx - yy), C3[5] * z * (xx - yy)
-            values[14] = C3[6] * x * (xx - 3 * yy)
-
-
 @kernel
 def _forward(
     tickets: np.ndarray, colors: np.ndarray, means: np.ndarray, quats: np.ndarray, rest: np.ndarray, eye: np.ndarray,
@@ -78,7 +58,7 @@ def _forward(
         if begin >= len(means):
             return
         for n in range(begin, min(begin + CHUNK, len(means))):
-            _basis(_direction(means, quats, rest, n, eye), degree, values)
+            set_basis(_direction(means, quats, rest, n, eye), degree, values)
             for channel in range(3):
                 total = np.float32(0)
                 for k in range(count):
@@ -99,7 +79,7 @@ def _backward(
         if begin >= len(means):
             return
         for n in range(begin, min(begin + CHUNK, len(means))):
-            _basis(_direction(means, quats, rest, n, eye), degree, values)
+            set_basis(_direction(means, quats, rest, n, eye), degree, values)
             on_colors[n] = 0
             red, green, blue = (
                 slope[n, 0] if seen[n, 0] > 0 else zero,
