@@ -178,7 +178,8 @@ class Loss(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """Image losses of the two branches (section 6)."""
 
     isolated: bool = True
-    """No gradient of the appearance reaches the joints (paper)."""
+    """No gradient of the appearance reaches the joints (paper). Off: +.18 dB in the mean of eight animals under known
+    cameras, three seeds, standard (cow +.6, wolf 0); no gain on DAVIS cows."""
     pose_silhouette: Weight = 0.2
     """BCE + Dice of the pose branch (paper)."""
     l1: Weight = 0.8
