@@ -1,14 +1,16 @@
 """View-dependent colour: real spherical harmonics up to degree 3, in the order and sign of 3D Gaussian Splatting."""
 
 import math
+from functools import cache
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from rewild4d.kernels.arrays import fits
 from rewild4d.kernels.harmonics import C0 as C0
-from rewild4d.kernels.harmonics import C1, C2, C3, shade
+from rewild4d.kernels.harmonics import C1, C2, C3, shade, turn
 from rewild4d.types import Splats
 
 
@@ -57,14 +59,32 @@ def rotated(coefficients: Tensor, rotations: Tensor) -> Tensor:
     Returns:
         [n, k, 3].
     """
+    if _for_kernels(coefficients, rotations):
+        return turn(coefficients, rotations, _tables())
     made = [coefficients[:, :1]]
     for level in range(1, round(coefficients.shape[1] ** 0.5)):
-        directions = _spiral(2 * (2 * level + 1)).to(rotations)
+        directions, inverse = (table.to(rotations) for table in _matching(level))
         before = torch.einsum("da,nab->ndb", directions, rotations)
-        inverse = torch.linalg.pinv(_band(directions, level))
-        turns = torch.einsum("kd,ndl->nkl", inverse, _band(before, level))
+        turns = torch.einsum("dk,ndl->nkl", inverse, _band(before, level))
         made.append(turns @ coefficients[:, level**2 : (level + 1) ** 2])
     return torch.cat(made, dim=1)
+
+
+def _for_kernels(*tensors: Tensor) -> bool:
+    """Whether the kernels take them: they give no gradients."""
+    wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    return not wanted and all(map(fits, tensors))
+
+
+@cache
+def _tables() -> tuple[np.ndarray, ...]:
+    return tuple(table.float().numpy() for level in (1, 2, 3) for table in _matching(level))
+
+
+def _matching(level: int) -> tuple[Tensor, Tensor]:
+    """Directions [D, 3] and the transposed pseudoinverse of the values of a degree's functions there, float64."""
+    directions = _spiral(2 * (2 * level + 1))
+    return directions, torch.linalg.pinv(_band(directions, level)).T.contiguous()
 
 
 def _spiral(count: int) -> Tensor:
@@ -93,7 +113,7 @@ def seen_colors(splats: Splats, eye: Tensor) -> Tensor:
         return splats.colors[:, 0]
     if count not in (4, 9, 16):
         raise ValueError(f"expected 1, 4, 9 or 16 colour coefficients per Gaussian, got {count}")
-    if fits(splats.colors) and fits(splats.means) and not (splats.colors.requires_grad or splats.means.requires_grad):
+    if _for_kernels(splats.colors, splats.means):
         return shade(splats.colors, splats.means, eye)
     directions = normalize(splats.means - eye.to(splats.means), dim=-1)
     values = basis(directions, round(count**0.5) - 1)

@@ -70,3 +70,19 @@ def test_a_turned_animal_keeps_its_colours() -> None:
         before = torch.einsum("nk,nkc->nc", basis(directions, degree), colours)
         after = torch.einsum("nk,nkc->nc", basis(moved, degree), rotated(colours, turns))
         torch.testing.assert_close(after, before)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize("count", [1, 1100])
+def test_the_kernel_turns_as_plain_torch_does(degree: int, count: int) -> None:
+    generator = torch.Generator().manual_seed(degree)
+    turns = axis_angle_to_matrix(3 * torch.randn(count, 3, generator=generator, dtype=torch.float64))
+    colours = torch.randn(count, (degree + 1) ** 2, 3, generator=generator, dtype=torch.float64)
+    wanted = rotated(colours, turns)
+    torch.testing.assert_close(rotated(colours.float(), turns.float()), wanted.float(), atol=1e-5, rtol=0)
+    assert (wanted - colours)[:, 1:].abs().max() > 0.5, "something turned"
+    assert torch.equal(wanted[:, 0], colours[:, 0])
+    single = colours.float().requires_grad_()
+    rotated(single, turns.float()).square().sum().backward()
+    assert single.grad is not None
+    torch.testing.assert_close(single.grad, 2 * single.detach(), atol=1e-4, rtol=0)  # turning keeps lengths

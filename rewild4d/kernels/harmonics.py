@@ -1,9 +1,10 @@
-"""Real spherical harmonics up to degree 3 for kernels, and the colours of many Gaussians from one point.
+"""Real spherical harmonics up to degree 3 for kernels: colours of many Gaussians from one point, and turned ones.
 
 The twin in plain torch is `rewild4d.harmonics`.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
-from rewild4d.kernels.simd import take_ticket
+from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
 from rewild4d.kernels.threads import run, thread_count
 
 C0 = 0.28209479177387814
@@ -82,3 +83,101 @@ def shade(colors: Tensor, means: Tensor, eye: Tensor) -> Tensor:
     call = np.zeros(1, np.int64), array(colors), array(means), array(eye.float()), degree, seen.numpy()
     run(_shade, [call] * thread_count())
     return seen
+
+
+@kernel
+def _set_band(x: Any, y: Any, z: Any, level: int, values: np.ndarray) -> None:
+    """Rows of values of the functions of one degree, 1 to 3, for sixteen directions."""
+    if level == 1:
+        store(values, 0, y * splat(np.float32(-C1)))
+        store(values, LANES, z * splat(np.float32(C1)))
+        store(values, 2 * LANES, x * splat(np.float32(-C1)))
+        return
+    xx, yy, zz = x * x, y * y, z * z
+    two, three, four = splat(np.float32(2)), splat(np.float32(3)), splat(np.float32(4))
+    if level == 2:
+        store(values, 0, x * y * splat(np.float32(C2[0])))
+        store(values, LANES, y * z * splat(np.float32(C2[1])))
+        store(values, 2 * LANES, (two * zz - xx - yy) * splat(np.float32(C2[2])))
+        store(values, 3 * LANES, x * z * splat(np.float32(C2[3])))
+        store(values, 4 * LANES, (xx - yy) * splat(np.float32(C2[4])))
+        return
+    across = four * zz - xx - yy
+    store(values, 0, y * (three * xx - yy) * splat(np.float32(C3[0])))
+    store(values, LANES, x * y * z * splat(np.float32(C3[1])))
+    store(values, 2 * LANES, y * across * splat(np.float32(C3[2])))
+    store(values, 3 * LANES, z * (two * zz - three * (xx + yy)) * splat(np.float32(C3[3])))
+    store(values, 4 * LANES, x * across * splat(np.float32(C3[4])))
+    store(values, 5 * LANES, z * (xx - yy) * splat(np.float32(C3[5])))
+    store(values, 6 * LANES, x * (xx - three * yy) * splat(np.float32(C3[6])))
+
+
+@kernel
+def _turn_band(
+    level: int, directions: np.ndarray, inverses: np.ndarray, rotation: np.ndarray, rows: np.ndarray,
+    values: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Add the turned coefficients of one degree: colours along turned directions, matched by those along the others."""
+    size, begin = 2 * level + 1, 3 * level * level
+    for d in range(len(directions)):
+        a, b, c = splat(directions[d, 0]), splat(directions[d, 1]), splat(directions[d, 2])
+        x = fma(a, load(rotation, 0), fma(b, load(rotation, 3 * LANES), c * load(rotation, 6 * LANES)))
+        y = fma(a, load(rotation, LANES), fma(b, load(rotation, 4 * LANES), c * load(rotation, 7 * LANES)))
+        z = fma(a, load(rotation, 2 * LANES), fma(b, load(rotation, 5 * LANES), c * load(rotation, 8 * LANES)))
+        _set_band(x, y, z, level, values)
+        for channel in range(begin, begin + 3):
+            seen = splat(np.float32(0))
+            for k in range(size):
+                seen = fma(load(values, k * LANES), load(rows, (channel + 3 * k) * LANES), seen)
+            for k in range(size):
+                place = (channel + 3 * k) * LANES
+                store(out, place, fma(splat(inverses[d, k]), seen, load(out, place)))
+
+
+@kernel
+def _turn(
+    tickets: np.ndarray, coefficients: np.ndarray, rotations: np.ndarray, tables: tuple, made: np.ndarray
+) -> None:
+    count, wide = coefficients.shape
+    rotation, rows = np.zeros(9 * LANES, np.float32), np.zeros(wide * LANES, np.float32)
+    values, out = np.empty(7 * LANES, np.float32), np.empty(wide * LANES, np.float32)
+    while True:
+        begin = take_ticket(tickets) * CHUNK
+        if begin >= count:
+            return
+        for first in range(begin, min(begin + CHUNK, count), LANES):
+            lanes = min(LANES, count - first)
+            for lane in range(lanes):
+                for i in range(9):
+                    rotation[i * LANES + lane] = rotations[first + lane, i]
+                for i in range(wide):
+                    rows[i * LANES + lane] = coefficients[first + lane, i]
+            out[: 3 * LANES] = rows[: 3 * LANES]
+            out[3 * LANES :] = 0
+            for level in range(1, len(tables) // 2 + 1):
+                if 3 * level * level < wide:
+                    _turn_band(level, tables[2 * level - 2], tables[2 * level - 1], rotation, rows, values, out)
+            for lane in range(lanes):
+                for i in range(wide):
+                    made[first + lane, i] = out[i * LANES + lane]
+
+
+def turn(coefficients: Tensor, rotations: Tensor, tables: tuple[np.ndarray, ...]) -> Tensor:
+    """Coefficients of the same colours on spheres that turn; float32, CPU, without gradients.
+
+    Args:
+        coefficients: [n, 4 or 9 or 16, 3].
+        rotations: [n, 3, 3].
+        tables: for the degrees 1, 2 and 3 directions [D, 3], enough to tell the functions apart, and the transposed
+            pseudoinverse of the functions' values there, [D, 2 degree + 1].
+
+    Returns:
+        Like ``coefficients``.
+    """
+    made = torch.empty(coefficients.shape)
+    call = (
+        np.zeros(1, np.int64), array(coefficients).reshape(len(made), -1), array(rotations).reshape(-1, 9), tables,
+        made.numpy().reshape(len(made), -1),
+    )  # fmt: skip
+    run(_turn, [call] * thread_count())
+    return made

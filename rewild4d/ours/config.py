@@ -135,8 +135,7 @@ class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """What the prior's shape gives to the start, and its poses to what follows (sections 3 and 4)."""
 
     shape: bool = True
-    """Start on the prior's rest surface; False: anywhere in its bounding box (the paper's "w/o Shape Prior"; skinning
-    and poses still start from the prior)."""
+    """Start on the prior's rest surface; False: anywhere in its box (the paper's "w/o Shape Prior")."""
     blend: bool = False
     """Blend the prior's poses into the network's (paper; off on Artemis: after a warm-up it only undoes that)."""
     blend_until: Weight = 0.35
@@ -178,8 +177,7 @@ class Loss(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """Image losses of the two branches (section 6)."""
 
     isolated: bool = True
-    """No gradient of the appearance reaches the joints (paper). Off: +.18 dB in the mean of eight animals under known
-    cameras, three seeds, standard (cow +.6, wolf 0); no gain on DAVIS cows."""
+    """No gradient of the appearance reaches the joints (paper). Off: +.18 dB over eight animals of known cameras."""
     pose_silhouette: Weight = 0.2
     """BCE + Dice of the pose branch (paper)."""
     l1: Weight = 0.8
