@@ -58,11 +58,18 @@ def rotated(coefficients: Tensor, rotations: Tensor) -> Tensor:
 
     Returns:
         [n, k, 3].
+
+    Raises:
+        ValueError: other shapes.
     """
+    count, k = coefficients.shape[:2]
+    if k not in (4, 9, 16) or coefficients.shape[2:] != (3,) or rotations.shape != (count, 3, 3):
+        found = f"{list(coefficients.shape)} and {list(rotations.shape)}"
+        raise ValueError(f"expected coefficients [n, 4 or 9 or 16, 3] and rotations [n, 3, 3], got {found}")
     if _for_kernels(coefficients, rotations):
         return turn(coefficients, rotations, _tables())
     made = [coefficients[:, :1]]
-    for level in range(1, round(coefficients.shape[1] ** 0.5)):
+    for level in range(1, math.isqrt(k)):
         directions, inverse = (table.to(rotations) for table in _matching(level))
         before = torch.einsum("da,nab->ndb", directions, rotations)
         turns = torch.einsum("dk,ndl->nkl", inverse, _band(before, level))
@@ -106,15 +113,19 @@ def seen_colors(splats: Splats, eye: Tensor) -> Tensor:
         [n, 3], not below 0.
 
     Raises:
-        ValueError: another k.
+        ValueError: another k, or other shapes.
     """
     count = splats.colors.shape[1]
     if count == 1:
         return splats.colors[:, 0]
     if count not in (4, 9, 16):
         raise ValueError(f"expected 1, 4, 9 or 16 colour coefficients per Gaussian, got {count}")
+    if splats.colors.shape != (len(splats), count, 3) or splats.means.shape[1:] != (3,):
+        found = f"{list(splats.means.shape)} and {list(splats.colors.shape)}"
+        raise ValueError(f"expected means [n, 3] and colours [n, k, 3] of as many Gaussians, got {found}")
+    eye = eye.to(splats.means)
     if _for_kernels(splats.colors, splats.means):
         return shade(splats.colors, splats.means, eye)
-    directions = normalize(splats.means - eye.to(splats.means), dim=-1)
+    directions = normalize(splats.means - eye, dim=-1)
     values = basis(directions, round(count**0.5) - 1)
     return (torch.einsum("nk,nkc->nc", values, splats.colors) + 0.5).clamp_min(0)

@@ -86,3 +86,14 @@ def test_the_kernel_turns_as_plain_torch_does(degree: int, count: int) -> None:
     rotated(single, turns.float()).square().sum().backward()
     assert single.grad is not None
     torch.testing.assert_close(single.grad, 2 * single.detach(), atol=1e-4, rtol=0)  # turning keeps lengths
+
+
+def test_other_shapes_are_errors_before_a_kernel_reads_them() -> None:
+    made = splats(torch.rand(5, 4, 3))
+    with pytest.raises(ValueError, match=r"of as many Gaussians, got \[5, 3\] and \[4, 4, 3\]"):
+        seen_colors(replace(made, colors=made.colors[:4]), torch.zeros(3))
+    with pytest.raises(ValueError, match="expected 1, 4, 9 or 16 colour coefficients per Gaussian, got 6"):
+        seen_colors(replace(made, colors=torch.rand(5, 6, 3)), torch.zeros(3))
+    for coefficients, rotations in (((5, 6, 3), (5, 3, 3)), ((5, 4, 3), (4, 3, 3)), ((5, 4, 4), (5, 3, 3))):
+        with pytest.raises(ValueError, match=r"and rotations \[n, 3, 3\], got"):
+            rotated(torch.rand(coefficients), torch.rand(rotations))

@@ -1,6 +1,6 @@
 """Real spherical harmonics up to degree 3 for kernels: colours of many Gaussians from one point, and turned ones.
 
-The twin in plain torch is `rewild4d.harmonics`.
+The twin in plain torch is `rewild4d.harmonics`, which also checks the shapes: kernels do not look where an array ends.
 """
 
 import math
@@ -80,7 +80,7 @@ def shade(colors: Tensor, means: Tensor, eye: Tensor) -> Tensor:
     """
     seen = torch.empty(len(means), 3)
     degree = math.isqrt(colors.shape[1]) - 1
-    call = np.zeros(1, np.int64), array(colors), array(means), array(eye.float()), degree, seen.numpy()
+    call = np.zeros(1, np.int64), array(colors), array(means), array(eye), degree, seen.numpy()
     run(_shade, [call] * thread_count())
     return seen
 

@@ -135,7 +135,7 @@ class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """What the prior's shape gives to the start, and its poses to what follows (sections 3 and 4)."""
 
     shape: bool = True
-    """Start on the prior's rest surface; False: anywhere in its box (the paper's "w/o Shape Prior")."""
+    """Start on the prior's rest surface; False: anywhere in its box ("w/o Shape Prior"; skinning and poses keep it)."""
     blend: bool = False
     """Blend the prior's poses into the network's (paper; off on Artemis: after a warm-up it only undoes that)."""
     blend_until: Weight = 0.35
