@@ -23,7 +23,7 @@ from torch import Tensor
 from rewild4d.baselines.external_alignment import UPS, Placement, place_by_search, place_fauna
 from rewild4d.baselines.external_folder import crop_box, find_outputs, program_digest, run_program, write_clip
 from rewild4d.baselines.external_profiles import PROFILES, Profile
-from rewild4d.baselines.external_reading import Moment, moved, moved_discs, painted, read_moments
+from rewild4d.baselines.external_reading import Moment, moved_discs, painted, read_moments
 from rewild4d.contracts import Log, MethodInfo
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import digest, load_tensors, save_tensors, write_text
@@ -31,7 +31,7 @@ from rewild4d.meshes import Discs
 from rewild4d.ours.config import Count, Positive
 from rewild4d.ours.motion import camera_between, frame_position
 from rewild4d.priors.motion import pose_at
-from rewild4d.transforms import skin_points, split_similarity
+from rewild4d.transforms import skin_points, split_similarity, transform_splats
 from rewild4d.types import Camera, Clip, Frame, Prior, Splats
 
 STATE = "external.pt"
@@ -240,7 +240,7 @@ def _placed_by_fauna(path: Path, moment: Moment, shot: tuple[Frame, Camera], pri
 
 
 def _moved(moment: Moment, matrix: Tensor) -> Moment:
-    return moved_discs(moment, matrix) if isinstance(moment, Discs) else moved(moment, matrix)
+    return moved_discs(moment, matrix) if isinstance(moment, Discs) else transform_splats(moment, matrix)
 
 
 def _colored(moments: Sequence[Moment], shots: Shots) -> list[Splats]:

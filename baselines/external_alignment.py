@@ -11,12 +11,11 @@ from scipy.optimize import minimize
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
-from rewild4d.baselines.external_reading import moved
 from rewild4d.contracts import Log
 from rewild4d.errors import UserError
 from rewild4d.harmonics import seen_colors
 from rewild4d.rasterizer import rasterize
-from rewild4d.transforms import look_at, similarity
+from rewild4d.transforms import look_at, similarity, transform_splats
 from rewild4d.types import Camera, Frame, Splats
 
 UPS: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
@@ -179,7 +178,7 @@ class _Search:
         )
 
     def _render(self, index: int, matrix: Tensor) -> tuple[Tensor, Tensor]:
-        return _render(moved(self.moments[index], matrix), self.shots[index].camera)
+        return _render(transform_splats(self.moments[index], matrix), self.shots[index].camera)
 
 
 def place_fauna(pose: Path, box: tuple[float, float, float], camera: Camera, depth: float) -> Tensor:

@@ -1,6 +1,7 @@
 """An animated glTF file as meshes: skinned, with morph targets, or rigid parts that move."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from rewild4d.datasets.animal import Surface
 from rewild4d.datasets.gltf import Document, Floats, consistent, sample
-from rewild4d.datasets.rig import clips, load_rig, read_surface
+from rewild4d.datasets.rig import clips, influences, inverse_binds, read_surface
 from rewild4d.errors import UserError
 from rewild4d.meshes import Mesh
 
@@ -37,41 +38,43 @@ def read_animation(path: Path, times: Sequence[float]) -> list[list[Mesh]]:
 
 
 def _moments(document: Document, path: Path, clip: str, shares: Floats) -> list[list[Mesh]]:
-    nodes = [document.tree.nodes[i] for i in document.scene_nodes()]
-    if any(node.mesh is not None and node.skin is not None for node in nodes):
-        animal = load_rig(path, clip, shares=shares)
-        posed = [animal.posed(frame) for frame in range(len(shares))]
-        return [[_mesh(s, v) for s, v in zip(animal.surfaces, each, strict=True)] for each in posed]
     start, end = document.clip_range(0)
     moments = start + (end - start) * shares
     world = document.global_matrices(document.local_matrices(0, moments))
-    parts = [part for index in document.scene_nodes() for part in _parts(document, index, moments, world[:, index])]
+    parts = [part for index in document.scene_nodes() for part in _parts(document, index, moments, world)]
     if not parts:
         raise UserError(f"{path}: expected a mesh, but the file's scene has none.")
+    if not all(bool(torch.isfinite(mesh.vertices).all()) for part in parts for mesh in part):
+        raise UserError(f"{path}: expected a mesh of some size in every pose, but scales or turns of it are zero.")
     return [[part[frame] for part in parts] for frame in range(len(shares))]
 
 
 def _parts(document: Document, index: int, times: Floats, world: Floats) -> list[list[Mesh]]:
-    """The triangle primitives of one node, each as its meshes over time."""
+    """The triangle primitives of one node, each as its meshes over time; world holds all nodes' matrices."""
     node = document.tree.nodes[index]
     if node.mesh is None:
         return []
     found = document.tree.meshes[node.mesh]
+    bones = world[:, index, None] if node.skin is None else _bones(document, node.skin, world)
     parts = []
     for primitive in found.primitives:
         if primitive.mode not in (None, 4, 5, 6):
             continue
         count = document.tree.accessors[primitive.attributes.POSITION].count
-        surface = read_surface(document, primitive, np.eye(4), np.zeros((count, 1), np.int64), np.ones((count, 1)))
+        rigid = np.zeros((count, 1), np.int64), np.ones((count, 1))
+        bound = rigid if node.skin is None else influences(document, primitive, bones.shape[1])
+        surface = read_surface(document, primitive, np.eye(4), *bound)
         targets = [_offsets(document, target, count) for target in primitive.targets or []]
         weights = _weights(document, index, len(targets), found.weights, times)
-        shapes = surface.vertices + np.einsum("tk,knd->tnd", weights, np.stack(targets)) if targets else None
-        meshes = []
-        for frame, matrix in enumerate(world):
-            points = surface.vertices if shapes is None else shapes[frame]
-            meshes.append(_mesh(surface, points @ matrix[:3, :3].T + matrix[:3, 3]))
-        parts.append(meshes)
+        offsets = np.einsum("tk,knd->tnd", weights, np.stack(targets)) if targets else np.zeros((len(times), 1, 3))
+        shapes = (replace(surface, vertices=surface.vertices + each) for each in offsets)
+        parts.append([_mesh(surface, shape.posed(each)) for shape, each in zip(shapes, bones, strict=True)])
     return parts
+
+
+def _bones(document: Document, skin: int, world: Floats) -> Floats:
+    """Skinning matrices of a skin, mesh space -> world, [T, joints, 4, 4]."""
+    return world[:, document.tree.skins[skin].joints] @ inverse_binds(document, skin)
 
 
 def _offsets(document: Document, target: object, count: int) -> Floats:
@@ -89,7 +92,8 @@ def _weights(document: Document, node: int, targets: int, still: list[float] | N
             keys = document.floats(sampler.input)[:, 0]
             values = document.floats(sampler.output).reshape(-1, targets)
             return sample(keys, values, sampler.interpolation, times, False)
-    return np.tile(np.array(still or [0.0] * targets)[:targets], (len(times), 1))
+    own = document.node_weights(node) if targets else None
+    return np.tile(np.array(own or still or [0.0] * targets)[:targets], (len(times), 1))
 
 
 def _mesh(surface: Surface, points: Floats) -> Mesh:

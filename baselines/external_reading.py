@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -12,10 +11,9 @@ from torch.nn.functional import grid_sample, normalize
 
 from rewild4d.baselines.external_gltf import read_animation
 from rewild4d.errors import UserError
-from rewild4d.harmonics import rotated
 from rewild4d.meshes import Discs, Mesh, discs, read_mesh
 from rewild4d.ply import read_splats
-from rewild4d.transforms import split_similarity, transform_splats
+from rewild4d.transforms import split_similarity
 from rewild4d.types import Camera, Frame, Splats
 
 Moment = Splats | Discs
@@ -43,15 +41,6 @@ def read_moments(paths: Sequence[Path], times: Sequence[float], count: int, seed
         return list(discs(meshes, count, seed))
     except ValueError as error:
         raise UserError(f"{paths[0].parent}: {error}.") from error
-
-
-def moved(splats: Splats, matrix: Tensor) -> Splats:
-    """Gaussians under a proper similarity [4, 4], harmonics and all."""
-    found = transform_splats(splats, matrix)
-    if splats.colors.shape[1] == 1:
-        return found
-    turn = split_similarity(matrix.double())[1].float().expand(len(splats), 3, 3)
-    return replace(found, colors=rotated(splats.colors, turn))
 
 
 def moved_discs(found: Discs, matrix: Tensor) -> Discs:

@@ -105,7 +105,7 @@ class GartTraining(SplatTraining):
         progress = index / config.iterations
         frame = int(torch.randint(self.supervision.frames, (), generator=self.generator))
         target = self.supervision.target(Key(1, 1, frame))
-        learns = progress >= config.poses.skinning_start
+        learns = config.skinning.learn and progress >= config.poses.skinning_start
         counts = learns and index % config.regularisers.every == 0
         if learns:
             weights, variation = model.field(model.gaussians.means.detach(), counts)

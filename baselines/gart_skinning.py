@@ -9,6 +9,7 @@ from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.config import Skinning
 from rewild4d.ours.fused.field import sample_grid
 from rewild4d.ours.fused.skinning import skin_both
+from rewild4d.ours.geometry_losses import tv_loss
 from rewild4d.ours.skinning import build_field
 from rewild4d.transforms import skin_points, skin_quats
 from rewild4d.types import Prior
@@ -60,10 +61,7 @@ class ResidualField(nn.Module):
         return (self.residual.square().sum(-1) + 1e-16).sqrt().mean()
 
     def _variation(self) -> Tensor:
-        size = self.field.resolution
-        grid = self.residual.view(size, size, size, -1)
-        axes = [(grid.narrow(axis, 1, size - 1) - grid.narrow(axis, 0, size - 1)).abs().mean() for axis in range(3)]
-        return torch.stack(axes).mean() * BEND
+        return tv_loss(self.residual, self.field.resolution, BEND) / BEND
 
 
 def posed(own: Gaussians, weights: Tensor, quats: Tensor, transforms: Tensor) -> Shape:

@@ -5,9 +5,11 @@ Follows the glTF 2.0 specification (Khronos): accessors 3.6.2, animations 3.11 a
 
 import base64
 import binascii
+import json
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -159,6 +161,20 @@ class Document:
         if pixels is None:
             raise self.error(f"expected a png, jpeg or webp texture, but image {index} cannot be decoded")
         return np.ascontiguousarray(pixels[..., ::-1])
+
+    @cached_property
+    def _written(self) -> dict[str, Any]:
+        """The file's JSON as it stands there: pygltflib leaves out what it has no field for."""
+        data = self.path.read_bytes()
+        if data[:4] == b"glTF":
+            data = data[20 : 20 + struct.unpack_from("<I", data, 12)[0]]
+        found: dict[str, Any] = json.loads(data)
+        return found
+
+    def node_weights(self, index: int) -> list[float] | None:
+        """Weights of the morph targets that a node gives instead of its mesh's; None where it gives none."""
+        weights: list[float] | None = self._written["nodes"][index].get("weights")
+        return weights
 
     def animated_nodes(self, animation: int) -> set[int]:
         """Nodes that an animation moves."""

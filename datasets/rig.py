@@ -170,25 +170,32 @@ class _Skeleton:
 
 
 def _skinned_surfaces(document: Document, skeleton: _Skeleton, node: int) -> list[Surface]:
-    skin = document.tree.skins[document.tree.nodes[node].skin]
-    joints: list[int] = skin.joints
-    if skin.inverseBindMatrices is None:
-        inverse_bind = np.tile(np.eye(4), (len(joints), 1, 1))
-    else:
-        inverse_bind = document.floats(skin.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1)
-    if len(inverse_bind) < len(joints) or (np.abs(np.linalg.det(inverse_bind)) == 0).any():
-        raise document.error(f"expected {len(joints)} invertible inverse bind matrices, but a skin has others")
+    joints: list[int] = document.tree.skins[document.tree.nodes[node].skin].joints
+    inverse_bind = inverse_binds(document, document.tree.nodes[node].skin)
     root = next(k for k, joint in enumerate(joints) if not set(skeleton.ancestors(joint)) & set(joints))
     to_world = skeleton.default[joints[root]] @ inverse_bind[root]  # mesh space -> the rest pose in the world
-    bones = np.array([skeleton.add(j, to_world @ np.linalg.inv(m)) for j, m in zip(joints, inverse_bind, strict=False)])
+    bones = np.array([skeleton.add(j, to_world @ np.linalg.inv(m)) for j, m in zip(joints, inverse_bind, strict=True)])
     surfaces = []
     for primitive in document.tree.meshes[document.tree.nodes[node].mesh].primitives:
         if primitive.mode in (None, TRIANGLES, STRIP, FAN):
-            indices, weights = _influences(document, primitive)
-            if indices.max(initial=0) >= len(bones):
-                raise document.error(f"expected joint indices below {len(bones)}, but one is {indices.max()}")
+            indices, weights = influences(document, primitive, len(bones))
             surfaces.append(read_surface(document, primitive, to_world, bones[indices], weights))
     return surfaces
+
+
+def inverse_binds(document: Document, skin: int) -> Floats:
+    """Mesh space -> joint space of each joint of a skin, [joints, 4, 4].
+
+    Raises:
+        UserError: too few, or one that cannot be inverted.
+    """
+    found = document.tree.skins[skin]
+    if found.inverseBindMatrices is None:
+        return np.tile(np.eye(4), (len(found.joints), 1, 1))
+    matrices = document.floats(found.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1)
+    if len(matrices) < len(found.joints) or (np.abs(np.linalg.det(matrices)) == 0).any():
+        raise document.error(f"expected {len(found.joints)} invertible inverse bind matrices, but a skin has others")
+    return matrices[: len(found.joints)]
 
 
 def _attached_surfaces(document: Document, skeleton: _Skeleton, node: int) -> list[Surface]:
@@ -213,8 +220,12 @@ def _attached_surfaces(document: Document, skeleton: _Skeleton, node: int) -> li
     return surfaces
 
 
-def _influences(document: Document, primitive: pygltflib.Primitive) -> tuple[NDArray[np.int64], Floats]:
-    """Joint numbers within the skin and weights that sum to one, both [n, 4 k]."""
+def influences(document: Document, primitive: pygltflib.Primitive, count: int) -> tuple[NDArray[np.int64], Floats]:
+    """Joint numbers within a skin of ``count`` joints and weights that sum to one, both [n, 4 k].
+
+    Raises:
+        UserError: a vertex without either, or a joint that the skin does not have.
+    """
     sets = range(8)
     indices = [getattr(primitive.attributes, f"JOINTS_{k}", None) for k in sets]
     weights = [getattr(primitive.attributes, f"WEIGHTS_{k}", None) for k in sets]
@@ -224,7 +235,10 @@ def _influences(document: Document, primitive: pygltflib.Primitive) -> tuple[NDA
     shares = np.concatenate([document.floats(i) for i in weights if i is not None], axis=1)
     total = shares.sum(1, keepdims=True)
     shares[:, :1] = np.where(total <= 0, 1.0, shares[:, :1])  # a vertex without weights follows its first joint
-    return np.where(shares > 0, joints, joints[:, :1]), shares / np.where(total <= 0, 1.0, total)
+    joints = np.where(shares > 0, joints, joints[:, :1])
+    if joints.max(initial=0) >= count:
+        raise document.error(f"expected joint indices below {count}, but one is {joints.max()}")
+    return joints, shares / np.where(total <= 0, 1.0, total)
 
 
 def read_surface(
@@ -233,13 +247,13 @@ def read_surface(
     """One primitive with its colours, vertices moved by ``to_world`` and bound as given."""
     positions = document.floats(primitive.attributes.POSITION)
     material = document.tree.materials[primitive.material] if primitive.material is not None else None
-    pbr = material.pbrMetallicRoughness if material else None
-    color = np.tile(np.array((pbr.baseColorFactor if pbr else None) or (1.0, 1.0, 1.0, 1.0))[:3], (len(positions), 1))
+    factor, picture = _base_color(material) if material else (None, None)
+    color = np.tile(np.array(factor or (1.0, 1.0, 1.0, 1.0))[:3], (len(positions), 1))
     if primitive.attributes.COLOR_0 is not None:
         color = color * document.floats(primitive.attributes.COLOR_0)[:, :3]
     uv, texture = None, None
-    if pbr and pbr.baseColorTexture is not None:
-        uv, texture = _texture(document, primitive, pbr.baseColorTexture)
+    if picture is not None:
+        uv, texture = _texture(document, primitive, picture)
     return Surface(
         vertices=positions @ to_world[:3, :3].T + to_world[:3, 3],
         faces=_faces(document, primitive, len(positions)),
@@ -249,6 +263,19 @@ def read_surface(
         uv=uv,
         texture=texture,
     )
+
+
+def _base_color(material: pygltflib.Material) -> tuple[list[float] | None, pygltflib.TextureInfo | None]:
+    """Factor and texture of a material's colour; older programs write its diffuse colour in an extension."""
+    older = (material.extensions or {}).get("KHR_materials_pbrSpecularGlossiness")
+    if older is not None:  # whoever writes both means the plain block for readers that do not know it
+        info = older.get("diffuseTexture")
+        texture = info and pygltflib.TextureInfo(
+            index=info["index"], texCoord=info.get("texCoord", 0), extensions=info.get("extensions", {})
+        )
+        return older.get("diffuseFactor"), texture
+    pbr = material.pbrMetallicRoughness
+    return (pbr.baseColorFactor, pbr.baseColorTexture) if pbr else (None, None)
 
 
 def _faces(document: Document, primitive: pygltflib.Primitive, count: int) -> NDArray[np.int64]:

@@ -17,7 +17,7 @@ from rewild4d.files import write_text
 from rewild4d.novel_views import input_camera
 from rewild4d.pictures import film_rate, over, save_mp4
 from rewild4d.ply import write_splats
-from rewild4d.skinned_glb import write_glb
+from rewild4d.skinned_glb import SEEN, shown, write_glb
 from rewild4d.turntable import find_stance, turn
 from rewild4d.types import Camera, Clip, Frame
 
@@ -47,6 +47,8 @@ def why_not(reconstruction: Reconstruction, kind: str, clip: Clip) -> str:
         return "neither the data set nor the method knows a camera"
     if kind in ("ply", "glb") and not len(reconstruction.at(clip.times[0])):
         return "there are no Gaussians"
+    if kind == "glb" and isinstance(reconstruction, Articulated) and not shown(reconstruction.canonical()).any():
+        return f"no Gaussian's opacity reaches {SEEN:g}"
     return ""
 
 

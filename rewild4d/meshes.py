@@ -30,7 +30,7 @@ class Mesh:
     Attributes:
         vertices: float32, [n, 3].
         faces: int64, [f, 3].
-        colors: RGB in [0, 1] of each vertex, [n, 3], or None.
+        colors: RGB in [0, 1] of each vertex, multiplied with the texture where there is one, [n, 3], or None.
         uv: texture coordinates of each face's corners, (0, 0) = lower left, [f, 3, 2], or None.
         texture: RGB in [0, 1], [h, w, 3], or None.
     """
@@ -126,16 +126,16 @@ def _draw(mesh: Mesh, count: int, seed: int) -> tuple[Tensor, Tensor]:
 
 
 def _colors(mesh: Mesh, face: Tensor, shares: Tensor) -> Tensor | None:
+    own = None if mesh.colors is None else (shares[..., None] * mesh.colors[mesh.faces[face]]).sum(1)
     if mesh.uv is not None and mesh.texture is not None:
         height, width = mesh.texture.shape[:2]
         place = (shares[..., None] * mesh.uv[face]).sum(1)
         place = torch.where((place < 0) | (place > 1), place % 1.0, place)  # repeated outside
         column = (place[:, 0] * width).long().clamp(max=width - 1)
         row = ((1 - place[:, 1]) * height).long().clamp(max=height - 1)
-        return mesh.texture[row, column]
-    if mesh.colors is not None:
-        return (shares[..., None] * mesh.colors[mesh.faces[face]]).sum(1)
-    return None
+        texels = mesh.texture[row, column]
+        return texels if own is None else texels * own
+    return own
 
 
 def _read_obj(path: Path) -> Mesh:
@@ -196,7 +196,7 @@ def _mesh(
         )
     uv = torch.tensor([row[:2] for row in rows["vt"]])
     _require_finite(path, "texture coordinates", uv, "vt")
-    return Mesh(values, indices, colors, uv[corners], texture)
+    return Mesh(values, indices, None, uv[corners], texture)  # programs that write both say one thing twice
 
 
 def _corners(path: Path, triples: list[tuple[int, int, int]], count: int, what: str) -> Tensor:

@@ -137,8 +137,13 @@ def influences(weights: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(shares > 0, numbers, 0), shares
 
 
+def shown(splats: Splats) -> Tensor:
+    """Which Gaussians are opaque enough to become squares, bool [n]."""
+    return splats.opacities >= SEEN
+
+
 def _seen(splats: Splats, weights: Tensor) -> tuple[Splats, Tensor]:
-    keep = splats.opacities >= SEEN
+    keep = shown(splats)
     parts = (splats.means, splats.quats, splats.scales, splats.opacities, splats.colors)
     return Splats(*(part[keep] for part in parts)), weights[keep]
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from rewild4d.harmonics import rotated
 from rewild4d.types import Camera, Splats
 
 
@@ -153,12 +154,16 @@ def camera_in_object(camera: Camera, object_to_world: Tensor) -> Camera:
 
 
 def transform_splats(splats: Splats, matrix: Tensor) -> Splats:
-    """Gaussians moved by a proper similarity, [4, 4]."""
+    """Gaussians moved by a proper similarity, [4, 4]; colours that depend on the view turn with them."""
     scale, rotation, translation = split_similarity(matrix.double())
     turn = matrix_to_quat(rotation).to(splats.quats)
     moved = splats.means.double() @ matrix.double()[:3, :3].T + translation
+    colors = splats.colors
+    if colors.shape[1] > 1:
+        colors = rotated(colors, rotation.to(colors).expand(len(splats), 3, 3))
     return replace(
         splats,
+        colors=colors,
         means=moved.to(splats.means),
         quats=quat_multiply(turn.expand_as(splats.quats), splats.quats),
         scales=splats.scales * scale.to(splats.scales),

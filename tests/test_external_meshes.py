@@ -12,6 +12,7 @@ import pytest
 import torch
 from external_program import coarse_grid, fit, posed
 from external_stub import png
+from test_rig import Builder
 
 from rewild4d.baselines.external import ExternalConfig
 from rewild4d.baselines.external_folder import find_outputs
@@ -220,3 +221,41 @@ def test_meshes_of_one_topology_keep_their_points(case: Case) -> None:
     moved = meshes[0].vertices + torch.tensor((1.0, 0.0, 0.0))
     first, second = discs([meshes[0], replace(meshes[0], vertices=moved)], 300, 0)
     torch.testing.assert_close(second.points - first.points, torch.tensor((1.0, 0, 0)).expand(300, 3))
+
+
+def skinned(path: Path, weights: list[float] | None) -> Path:
+    """A triangle that hangs on a sliding joint and has a morph target along y, and another that hangs on nothing."""
+    b = Builder()
+    corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    attributes = {
+        "POSITION": b.add(corners), "JOINTS_0": b.add([[0, 0, 0, 0]] * 3, np.uint8),
+        "WEIGHTS_0": b.add([[1, 0, 0, 0]] * 3), "TEXCOORD_0": b.add([[0, 0], [1, 0], [0, 1]]),
+    }  # fmt: skip
+    picture = b.view(np.frombuffer(png(2, 2, 2 * (b"\0" + 6 * b"\xff")), np.uint8))
+    primitive = {"attributes": attributes, "targets": [{"POSITION": b.add([[0, 2, 0]] * 3)}], "material": 0}
+    samplers = [{"input": b.add([0, 1]), "output": b.add([[0, 0, 0], [0, 0, 4]])}]
+    channels = [{"sampler": 0, "target": {"node": 0, "path": "translation"}}]
+    node = {"mesh": 0, "skin": 0, "translation": [50, 0, 0]} | ({} if weights is None else {"weights": weights})
+    pbr = {"baseColorFactor": [1.0, 0.0, 0.0, 1.0], "baseColorTexture": {"index": 0}}
+    tree = {
+        "scene": 0, "scenes": [{"nodes": [0, 1, 2]}], "nodes": [{"name": "joint"}, node, {"mesh": 1}],
+        "meshes": [{"primitives": [primitive], "weights": [0.25]}, {"primitives": [{"attributes": attributes}]}],
+        "skins": [{"joints": [0]}], "materials": [{"pbrMetallicRoughness": pbr}],
+        "textures": [{"source": 0}], "images": [{"bufferView": picture, "mimeType": "image/png"}],
+        "animations": [{"samplers": samplers, "channels": channels}],
+    }  # fmt: skip
+    return b.write(path, tree)
+
+
+@pytest.mark.parametrize(("weights", "share"), [(None, 0.25), ([0.5], 0.5)])
+def test_a_skinned_glb_keeps_its_morphs_and_what_stands_beside_it(
+    tmp_path: Path, weights: list[float] | None, share: float
+) -> None:
+    """A node's weights go before its mesh's; a skinned mesh ignores the transform of its node."""
+    first, last = read_animation(skinned(tmp_path / "a.glb", weights), [0.0, 3.0])
+    assert len(first) == len(last) == 2
+    assert first[0].vertices[0].tolist() == [0, 2 * share, 0] and last[0].vertices[0].tolist() == [0, 2 * share, 4]
+    assert torch.equal(first[1].vertices, last[1].vertices)
+    (found,) = discs([first[0]], 20, 0)
+    assert found.colors is not None
+    assert torch.equal(found.colors, torch.tensor((1.0, 0.0, 0.0)).expand(20, 3)), "a white texture times red"

@@ -1,5 +1,6 @@
 """The parts of GART: chains of joints, the skinning residual, likeness of neighbours, refinement, D-SMAL files."""
 
+import copy
 import math
 import pickle
 from dataclasses import replace
@@ -326,3 +327,27 @@ def test_a_fit_on_a_template_file(case: Case, tmp_path: Path) -> None:
     assert made.weights.shape[1] == 20
     assert float((made.at(0.1).means.mean(0) - plain.at(0.1).means.mean(0)).norm()) < 0.05
     assert matrix_to_quat(torch.eye(3))[0] == 1
+
+
+def test_the_variation_in_double_precision_is_the_kernels(case: Case) -> None:
+    """Where the kernel does not compute (double precision, a GPU), the same value and the same slopes."""
+    single = ResidualField(case.prior, GartSkinning(resolution=8, neighbours=4, sweeps=1))
+    with torch.no_grad():
+        single.residual.normal_(0, 1e-3, generator=torch.Generator().manual_seed(0))
+    double = copy.deepcopy(single).double()
+    points = case.prior.vertices[::40]
+    found = [field(points.to(field.residual), True)[1] for field in (single, double)]
+    for variation in found:
+        variation.backward()
+    torch.testing.assert_close(found[0].double(), found[1], atol=0, rtol=1e-5)
+    assert single.residual.grad is not None and double.residual.grad is not None
+    torch.testing.assert_close(single.residual.grad.double(), double.residual.grad, atol=1e-9, rtol=1e-4)
+
+
+def test_skinning_that_does_not_learn_stays(case: Case) -> None:
+    for learn in (True, False):
+        settings = SETTINGS | {"skinning": SETTINGS["skinning"] | {"learn": learn}, "poses": {"skinning_start": 0.0}}
+        made = training(case, msgspec.convert(settings, GartConfig))
+        for index in range(3):
+            made.step(index)
+        assert bool(made.model.field.residual.any()) == learn

@@ -97,3 +97,8 @@ def test_other_shapes_are_errors_before_a_kernel_reads_them() -> None:
     for coefficients, rotations in (((5, 6, 3), (5, 3, 3)), ((5, 4, 3), (4, 3, 3)), ((5, 4, 4), (5, 3, 3))):
         with pytest.raises(ValueError, match=r"and rotations \[n, 3, 3\], got"):
             rotated(torch.rand(coefficients), torch.rand(rotations))
+
+
+def test_no_gaussians_turn() -> None:
+    for dtype in (torch.float32, torch.float64):
+        assert rotated(torch.zeros(0, 4, 3, dtype=dtype), torch.zeros(0, 3, 3, dtype=dtype)).shape == (0, 4, 3)

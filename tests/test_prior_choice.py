@@ -8,10 +8,10 @@ import torch
 from test_prior_io import prior, two_frames  # noqa: F401
 
 from rewild4d.errors import UserError
-from rewild4d.priors.choose import ELSEWHERE, PriorChoice, make_prior
+from rewild4d.priors.choose import ELSEWHERE, OTHER_BONES, PriorChoice, make_prior
 from rewild4d.priors.config import STANDARD
 from rewild4d.priors.io import save_prior, seal
-from rewild4d.types import Clip, Prior, Truth
+from rewild4d.types import Clip, Keypoints, Prior, Truth
 
 NOTHING = Truth((), None, "")
 
@@ -75,3 +75,25 @@ def test_a_file_for_another_clip_and_masks_that_are_empty(prior: Prior, tmp_path
 def test_noise_that_is_none(level: str) -> None:
     with pytest.raises(UserError, match=f"--prior coarse:{level}: expected a finite noise of 0 or more, got '{level}'"):
         PriorChoice(f"coarse:{level}", STANDARD).identity(two_frames(), NOTHING)
+
+
+@pytest.mark.parametrize("bones", [5, 20, 30])
+def test_keypoints_say_nothing_of_another_skeleton(prior: Prior, tmp_path: Path, bones: int) -> None:  # noqa: F811
+    """A mapping names bones of the template; a skeleton of as many bones in pairs of its own is another one too."""
+    shape = {
+        "weights": torch.eye(bones)[torch.zeros(len(prior.vertices), dtype=torch.long)],
+        "bones": prior.bones[:1].expand(bones, 2, 3).contiguous(),
+        "parents": torch.full((bones,), -1),
+        "mirror": torch.arange(bones),
+        "transforms": torch.eye(4).expand(2, bones, 4, 4).contiguous(),
+        "transforms_flip": torch.eye(4).expand(2, bones, 4, 4).contiguous(),
+    }
+    points = Keypoints(("nose", "left_eye"), torch.tensor(((20.0, 20.0), (30.0, 30.0))), torch.ones(2).bool())
+    clip = two_frames()
+    clip = replace(clip, frames=tuple(replace(frame, keypoints=points) for frame in clip.frames))
+    for made, scored in ((prior, True), (replace(prior, **shape), False)):
+        save_prior(seal(made), tmp_path / "p.npz")
+        choice = PriorChoice(str(tmp_path / "p.npz"), STANDARD, mapping="aptv2", use="none")
+        found = make_prior(choice, clip, NOTHING, tmp_path / "no", lambda *_: None)
+        assert found.notes == ((ELSEWHERE,) if scored else (ELSEWHERE, OTHER_BONES))
+        assert ("pck" in found.quality) == scored

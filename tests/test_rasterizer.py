@@ -128,6 +128,20 @@ def test_the_same_bits_for_any_number_of_threads() -> None:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
+def test_more_threads_than_eights_of_gaussians() -> None:
+    """Pieces of fewer than eight would be read and written from before the arrays' first element."""
+    before, results = torch.get_num_threads(), []
+    inputs = {name: tensor.float() for name, tensor in scene(60, 3, 10, 24, 20, 5).items()}
+    try:
+        for threads in (1, 16):
+            torch.set_num_threads(threads)
+            image, found = gradients(inputs, 24, 20)
+            results.append([image, *found.values()])
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
 def test_threads_and_a_forked_child_give_the_same_bits() -> None:
     expected = single_run()
     with ThreadPoolExecutor(3) as pool:

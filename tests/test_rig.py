@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from external_stub import png
 
 from rewild4d.datasets.gltf import compose, sample
 from rewild4d.datasets.rig import clips, linear_to_srgb, load_rig
@@ -141,6 +142,30 @@ def test_moving_intermediate_node_becomes_a_bone(tmp_path: Path) -> None:
     assert animal.bone_names == ("root", "tip", "tag") and animal.parents.tolist() == [-1, 0, 0]
     # 0.5 s: scale 1.5, slid by 1: the tag's corner is at root + scale * slide
     np.testing.assert_allclose(animal.posed(1)[1][0], [2 * 1.5 * 1.0, 2, 0], atol=1e-5)
+
+
+def test_older_materials_have_their_colour(tmp_path: Path) -> None:
+    """Diffuse factor and texture of KHR_materials_pbrSpecularGlossiness, which many rigs of old have alone."""
+    b, corners = Builder(), [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    attributes = {
+        "POSITION": b.add(corners), "TEXCOORD_0": b.add([[0, 0], [1, 0], [0, 1]]),
+        "JOINTS_0": b.add([[0, 0, 0, 0]] * 3, np.uint8), "WEIGHTS_0": b.add([[1, 0, 0, 0]] * 3),
+    }  # fmt: skip
+    picture = b.view(np.frombuffer(png(2, 2, 2 * (b"\0" + 2 * bytes((255, 128, 0)))), np.uint8))
+    older = {"diffuseFactor": [0.5, 0.25, 1.0, 1.0], "diffuseTexture": {"index": 0}}
+    samplers = [{"input": b.add([0, 1]), "output": b.add([[0, 0, 0], [1, 0, 0]])}]
+    channels = [{"sampler": 0, "target": {"node": 0, "path": "translation"}}]
+    name = "KHR_materials_pbrSpecularGlossiness"
+    tree = {
+        "scene": 0, "scenes": [{"nodes": [0, 1]}], "nodes": [{"name": "root"}, {"mesh": 0, "skin": 0}],
+        "meshes": [{"primitives": [{"attributes": attributes, "material": 0}]}], "skins": [{"joints": [0]}],
+        "materials": [{"extensions": {name: older}}], "extensionsRequired": [name], "extensionsUsed": [name],
+        "textures": [{"source": 0}], "images": [{"bufferView": picture, "mimeType": "image/png"}],
+        "animations": [{"samplers": samplers, "channels": channels}],
+    }  # fmt: skip
+    (surface,) = load_rig(b.write(tmp_path / "a.glb", tree), "clip_0").surfaces
+    np.testing.assert_allclose(surface.colors, np.tile(linear_to_srgb(np.array([0.5, 0.25, 1.0])), (3, 1)))
+    assert surface.texture is not None and surface.texture[0, 0].tolist() == [255, 128, 0]
 
 
 def test_scenery_is_left_out(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from rewild4d import transforms as tf
+from rewild4d.harmonics import seen_colors
 from rewild4d.priors.template import MIRROR
 from rewild4d.types import Camera, Splats
 
@@ -161,3 +162,21 @@ def test_moved_gaussians_have_the_moved_covariance(generator: torch.Generator) -
 
     moved = tf.transform_splats(splats, matrix)
     torch.testing.assert_close(covariance(moved), matrix[:3, :3] @ covariance(splats) @ matrix[:3, :3].T)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_colours_that_depend_on_the_view_turn_with_their_gaussians(
+    generator: torch.Generator, dtype: torch.dtype
+) -> None:
+    """A camera that is moved with the Gaussians sees what it saw."""
+    splats = Splats(
+        torch.randn(30, 3, generator=generator, dtype=dtype), random_quats(30, generator).to(dtype),
+        torch.ones(30, 3, dtype=dtype), torch.ones(30, dtype=dtype),
+        torch.randn(30, 16, 3, generator=generator, dtype=dtype),
+    )  # fmt: skip
+    turn = tf.quat_to_matrix(random_quats(1, generator)[0])
+    matrix = tf.similarity(2.5, turn, torch.tensor((1.0, -2.0, 3.0), dtype=torch.float64))
+    eye = torch.tensor((4.0, 1.0, -3.0), dtype=torch.float64)
+    seen = seen_colors(tf.transform_splats(splats, matrix), matrix[:3, :3] @ eye + matrix[:3, 3])
+    torch.testing.assert_close(seen, seen_colors(splats, eye), atol=1e-5, rtol=0)
+    assert (seen - seen_colors(splats, matrix[:3, :3] @ eye + matrix[:3, 3])).abs().max() > 0.1

@@ -175,9 +175,10 @@ def turn(coefficients: Tensor, rotations: Tensor, tables: tuple[np.ndarray, ...]
         Like ``coefficients``.
     """
     made = torch.empty(coefficients.shape)
+    flat = len(made), 3 * coefficients.shape[1]
     call = (
-        np.zeros(1, np.int64), array(coefficients).reshape(len(made), -1), array(rotations).reshape(-1, 9), tables,
-        made.numpy().reshape(len(made), -1),
+        np.zeros(1, np.int64), array(coefficients).reshape(flat), array(rotations).reshape(-1, 9), tables,
+        made.numpy().reshape(flat),
     )  # fmt: skip
     run(_turn, [call] * thread_count())
     return made

@@ -138,7 +138,7 @@ class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """Start on the prior's rest surface; False: anywhere in its box ("w/o Shape Prior"; skinning and poses keep it)."""
     blend: bool = False
     """Blend the prior's poses into the network's (paper; off on Artemis: after a warm-up it only undoes that)."""
-    blend_until: Weight = 0.35
+    blend_until: Share = 0.35
     """Fraction at which the blend reaches zero (7k of 20k)."""
     pull: Weight = 0.3
     """Weight of the squared distance to the prior's poses, falling linearly to zero at `pull_until` (paper: open). 50

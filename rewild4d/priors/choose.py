@@ -22,12 +22,14 @@ from rewild4d.priors.landmarks import Marks, load_mapping, marks
 from rewild4d.priors.placing import in_world, placed
 from rewild4d.priors.rig import rig_prior
 from rewild4d.priors.steady import without_hops
+from rewild4d.priors.template import MIRROR
 from rewild4d.types import Clip, Prior, Truth
 
 PRIOR_SEED = 0
 """One seed for all: every method and every seed of a case starts from the same prior."""
 
 ELSEWHERE = "made elsewhere: it may have seen the frames that are held out here"
+OTHER_BONES = "keypoints are not scored: their mapping names bones of the template's skeleton, and this is another"
 
 Use = Literal["all", "half", "none"]
 """Frames whose keypoints a fit sees: all; every other one, and the rest is scored; none, and all are scored."""
@@ -155,9 +157,11 @@ def _fitted(choice: PriorChoice, clip: Clip, truth: Truth, log: Log) -> Prior:
 
 
 def _scored(prior: Prior, clip: Clip, found: Marks | None) -> Prior:
-    """With the figures of `joint_scores` on keypoints that the fit did not see."""
+    """With the figures of `joint_scores` on keypoints that the fit did not see; a note on a skeleton without names."""
     if found is None:
         return prior
+    if prior.mirror.tolist() != list(MIRROR):
+        return replace(prior, notes=(*prior.notes, OTHER_BONES))
     return seal(replace(prior, quality=prior.quality | joint_scores(prior, clip.frames, found)))
 
 

@@ -107,7 +107,7 @@ class _Project(torch.autograd.Function):
         gaussians = tuple(array(_padded(tensor, room)).ravel() for tensor in (means, quats, scales, opacities))
         cameras = array(world_to_camera).astype(np.float64), array(intrinsics).astype(np.float64)
         threads = thread_count() if count * views > SERIAL_BELOW else 1
-        bounds = _table(spans(room, threads), 2)
+        bounds = _table(spans(room, min(threads, room // WIDTH)), 2)  # `project` takes eight at a time
         call = (
             phase_counters(2), bounds, *gaussians, *cameras, *options, means2d.numpy().ravel(), records.numpy().ravel(),
             radii.numpy(), np.empty((views, room)), tiles.numpy().ravel(), slots.numpy(), order.numpy(), counts,
