@@ -141,11 +141,11 @@ class _Motion:
         shown = _Frames(decoded, self._cameras(decoded), list(enumerate(selected)), self.fps)
         hidden = _Frames(decoded, shown.cameras, held_out(selected, views), self.fps)
         clip = Clip(case, species, tuple(shown), self.fps, read_licence(self.folder), shown.digest())
+        up = torch.from_numpy(up_direction(self.camera_to_world))
         if surface is None:
-            return clip, Truth(hidden, None, hidden.digest())
+            return clip, Truth(hidden, None, hidden.digest(), up=up)
         moving = MovingSurface(surface, poses, self.fps)
         key = digest(hidden.digest(), *map(moving.at, clip.times))
-        up = torch.from_numpy(up_direction(self.camera_to_world))
         rig = partial(read_rig, self.folder, poses)
         return clip, Truth(hidden, moving.at, key, moving.sample, surface.diagonal, up, rig)
 

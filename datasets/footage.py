@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.datasets.images import read_picture
+from rewild4d.datasets.video_file import read_video, video_facts
 from rewild4d.errors import UserError
 from rewild4d.files import natural
 
@@ -98,7 +99,8 @@ class Reel:
     def _read(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Colour [h, w, 3] and alpha [h, w] or None, float32 in [0, 1]."""
         if not self.files:
-            return _video_frames(self.path)[index] / np.float32(255), None
+            frame = _video_frames(self.path)[index] / np.float32(255)
+            return frame[..., :3], frame[..., 3] if frame.shape[2] == 4 else None
         path = self.files[index]
         return _read_array(path) if path.suffix.lower() == ".npy" else read_picture(path)
 
@@ -245,13 +247,18 @@ def _video(path: Path) -> Reel:
 
 @lru_cache(maxsize=4)
 def _video_frames(path: Path) -> list[np.ndarray]:
-    """Every frame, uint8 [h, w, 3] each; four videos are kept: a prediction, its truth and their masks."""
+    """Every frame, each once at any frame rate, uint8 [h, w, 3], or [h, w, 4] where any is transparent anywhere.
+
+    Four videos are kept: a prediction, its truth and their masks.
+    """
+    facts = video_facts(path)
     with _reader(path) as reader:
-        frames = [np.asarray(frame) for frame in reader]
-        promised = reader.get_meta_data()["fps"] * reader.get_meta_data()["duration"]
-    if len(frames) < 0.9 * promised - 1:
-        raise UserError(f"{path}: expected {promised:.0f} frames as its header says, got {len(frames)}: it is cut off.")
-    return frames
+        seconds, step = reader.get_meta_data()["duration"], 1 / reader.get_meta_data()["fps"]
+    shown = facts.times[-1] + step
+    if facts.is_stamped and shown < 0.9 * seconds - step:
+        raise UserError(f"{path}: expected {seconds:.2f} s as its header says, got {shown:.2f} s: it is cut off.")
+    channels = 4 if facts.has_alpha else 3
+    return [frame[..., :channels] for frame in read_video(path)]
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 from tqdm import tqdm
 
 from rewild4d.contracts import Selection
@@ -28,6 +29,10 @@ CROP_MARGIN = 0.075
 """Free border on each side of a crop as a share of the animal's longer side: 15 % in all."""
 _THREADS = 2
 _CACHE_VERSION = "1"
+ORIENTATION = 0x0112
+"""EXIF tag of how a picture is turned."""
+_FLIPS = {2: (1, -1), 3: (-1, -1), 4: (-1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}
+"""Steps along rows and columns of an upright picture, by EXIF orientation."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -85,13 +90,15 @@ def read_alpha(path: Path) -> np.ndarray:
 def read_picture(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Colour and, where the file has one, straight alpha: PNG or JPEG, grey, palette or colour, 8 or 16 bits a channel.
 
+    The picture is turned as its EXIF tag says.
+
     Returns:
         Colour in [0, 1], float32 [h, w, 3], and alpha in [0, 1], float32 [h, w], or None.
 
     Raises:
         UserError: as `read_rgb`.
     """
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    image = _upright(path, _decode(path, cv2.IMREAD_UNCHANGED))
     scaled = image.astype(np.float32) / np.iinfo(image.dtype).max
     if scaled.ndim == 2:
         return np.repeat(scaled[..., None], 3, axis=2), None
@@ -253,6 +260,19 @@ def _decode(path: Path, mode: int, upright: bool = False) -> np.ndarray:
     return image
 
 
+def _upright(path: Path, image: np.ndarray) -> np.ndarray:
+    """What OpenCV leaves undone when it reads a file unchanged: its EXIF turn, and one grey that means transparent."""
+    with Image.open(path) as stored:
+        turn = stored.getexif().get(ORIENTATION, 1)
+        if image.ndim == 2 and stored.mode == "L" and isinstance(stored.info.get("transparency"), int):
+            alpha = np.where(image == stored.info["transparency"], 0, 255).astype(np.uint8)
+            image = np.dstack((image, image, image, alpha))
+    turned = image.swapaxes(0, 1) if turn >= 5 else image
+    # 1 to 8: as it is, mirrored, upside down, flipped; and the same after rows and columns were exchanged.
+    rows, columns = _FLIPS.get(turn, (1, 1))
+    return turned[::rows, ::columns]
+
+
 def _png_fault(data: bytes) -> str:
     """What is wrong with a PNG file, or "": OpenCV returns half an image where a file is cut off."""
     position = len(_PNG)
@@ -279,5 +299,8 @@ def _jpeg_scan(data: bytes) -> int:
     """Where the pixels of a JPEG begin: a thumbnail before them has an end of its own, and a trailer may follow."""
     position = 2
     while position + 4 <= len(data) and data[position : position + 2] != b"\xff\xda":
+        if data[position + 1] == 0xFF:  # a marker may stand behind any number of these
+            position += 1
+            continue
         position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
     return position

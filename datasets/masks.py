@@ -25,6 +25,8 @@ BLACK = 31
 """Colours without a channel above this are background: a JPEG's black is not quite black."""
 NOISE = 0.04
 """Parts smaller than this share of the largest one do not widen the animal's box."""
+FILE_TINT = 8
+"""The same of an image file: conversion between colour spaces tints it a little."""
 FILM_TINT = 40
 """Largest difference of two channels where a film of masks is grey: compression tints it."""
 CUT_SHARE = 0.1
@@ -64,10 +66,12 @@ class MaskFiles:
     Attributes:
         files: of each frame; None where it has no mask.
         ids: the objects that indexed files name, ascending; empty where a file holds a foreground or a soft matte.
+        is_indexed: whether files with a palette hold numbers of objects; otherwise the palette's greys count.
     """
 
     files: tuple[Path | None, ...]
     ids: tuple[int, ...]
+    is_indexed: bool = False
 
     def read(self, index: int, object_id: int | None, size: tuple[int, int]) -> np.ndarray | None:
         """The mask of a frame, uint8 [h, w], 255 inside; None where it has none.
@@ -83,7 +87,7 @@ class MaskFiles:
         file = self.files[index]
         if file is None:
             return None
-        values = read_values(file)
+        values = read_values(file, self.is_indexed)
         if self.ids:
             wanted = values == object_id if object_id is not None else np.isin(values, self.ids)
             values = np.where(wanted, 255, 0).astype(np.uint8)
@@ -96,22 +100,25 @@ def open_masks(files: Sequence[Path | None]) -> MaskFiles:
     Raises:
         UserError: a file that cannot be read.
     """
+    there = [file for file in files if file is not None]
+    indexed = any(map(_has_colored_palette, there))
     seen: set[int] = set()
-    indexed = False
-    for file in files:
-        if file is not None:
-            seen |= set(np.flatnonzero(np.bincount(read_values(file).ravel(), minlength=256)).tolist())
-            indexed |= _is_indexed(file)
+    for file in there:
+        seen |= set(np.flatnonzero(np.bincount(read_values(file, indexed).ravel(), minlength=256)).tolist())
     named = tuple(sorted(seen - {0, VOID}))
     is_named = indexed or (bool(named) and named[-1] < MOST_OBJECTS)
-    return MaskFiles(tuple(files), named if is_named else ())
+    return MaskFiles(tuple(files), named if is_named else (), indexed)
 
 
-def read_values(file: Path) -> np.ndarray:
-    """The values of a mask file as they are stored, uint8 [h, w]: indices, not colours, of an indexed image.
+def read_values(file: Path, indexed: bool = False) -> np.ndarray:
+    """The values of a mask file, uint8 [h, w]: as they are stored, of a palette its greys or its indices.
 
-    An alpha channel that varies is the mask; colours are taken as foreground unless nearly black; 16 bits become 8
-    where they are shades, and so do fractions up to 1.
+    An alpha channel that is not opaque everywhere is the mask; colours are taken as foreground unless nearly black; 16
+    bits become 8 where they are shades, and so do fractions up to 1.
+
+    Args:
+        file: an image.
+        indexed: whether the numbers of a palette's entries are wanted, not what the palette says of them.
 
     Raises:
         UserError: the file cannot be read, or holds numbers that are not finite.
@@ -121,6 +128,8 @@ def read_values(file: Path) -> np.ndarray:
         if image.mode in ("CMYK", "YCbCr", "LAB", "HSV"):
             image = image.convert("RGB")
         values, mode = np.asarray(image), image.mode
+        if mode == "P" and not indexed:
+            values = _greys(values, _palette(image))
     if values.dtype == bool:
         return values.astype(np.uint8) * 255
     if values.ndim == 3:
@@ -159,12 +168,12 @@ def _opened(file: Path, what: str = "a mask image") -> Iterator[Image.Image]:
 
 
 def _from_channels(values: np.ndarray, mode: str) -> np.ndarray:
-    if mode in ("LA", "RGBA", "PA") and values[..., -1].min() < values[..., -1].max():
+    if mode in ("LA", "RGBA", "PA") and values[..., -1].min() < 255:
         return values[..., -1]
     return shades(values[..., :3] if mode in ("RGB", "RGBA") else values[..., :1])
 
 
-def shades(colors: np.ndarray, tint: int = 0) -> np.ndarray:
+def shades(colors: np.ndarray, tint: int = FILE_TINT) -> np.ndarray:
     """The mask that colours mean: grey is a shade, any other colour the foreground unless nearly black.
 
     Args:
@@ -176,9 +185,27 @@ def shades(colors: np.ndarray, tint: int = 0) -> np.ndarray:
     return np.where(colors.max(axis=2) > BLACK, 255, 0).astype(np.uint8)
 
 
-def _is_indexed(file: Path) -> bool:
+def _has_colored_palette(file: Path) -> bool:
+    """Whether a file's palette gives what the file shows other colours than greys: numbers of objects, not shades."""
     with _opened(file) as image:
-        return image.mode == "P"
+        if image.mode != "P":
+            return False
+        palette = _palette(image)
+        used = np.flatnonzero(np.bincount(np.asarray(image).ravel(), minlength=256))
+    return bool((np.ptp(palette[used[used < len(palette)]], axis=1) > FILE_TINT).any())
+
+
+def _greys(values: np.ndarray, palette: np.ndarray) -> np.ndarray:
+    """What a palette of greys makes of its indices; the indices where it shows them all alike."""
+    greys = np.arange(256, dtype=np.uint8)
+    greys[: len(palette)] = palette.max(axis=1)
+    shown = greys[values]
+    return values if np.ptp(shown) == 0 < np.ptp(values) else shown
+
+
+def _palette(image: Image.Image) -> np.ndarray:
+    """The colours that a file gives to its indices, uint8 [entries, 3]; indices beyond them have none."""
+    return np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3)
 
 
 def fit_size(mask: np.ndarray, size: tuple[int, int], title: str) -> np.ndarray:

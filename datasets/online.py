@@ -256,6 +256,9 @@ class Online:
         stems = [file.stem for file in self._material.files] or [str(i) for i in range(len(self._material.times))]
         if len(found) == len(indices) < len(stems):  # made from the chosen frames alone
             matched, note = match_masks(found, [stems[i] for i in indices], self._mask_place)
+            if None in matched:  # as many masks as chosen frames, but numbered by themselves
+                matched = list(found)
+                note = f"one mask for each of the {len(found)} chosen frames: matched in order, {found[0].name} first"
         else:
             every, note = match_masks(found, stems, self._mask_place)
             matched = [every[i] for i in indices]

@@ -3,7 +3,7 @@
 An animal behind a pole is in parts too, so by itself nothing is left out but what stands well apart, time and again.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Literal, get_args
@@ -47,8 +47,11 @@ def with_parts(video: Video, parts: str, is_named: bool) -> Video:
         if not apart or apart < OFTEN * seen:
             return video
         note = f"{apart} of {seen} masks have a part far from the rest (a second animal?): {NOTE} (--parts all: all)"
-    masks, identity = partial(main_parts, video.masks), f"{video.identity} main part"
-    return replace(video, masks=masks, identity=identity, notes=(*video.notes, note))
+    whole, identity = video.masks, f"{video.identity} main part 2"
+    return replace(
+        video, masks=partial(main_parts, whole), identity=identity, notes=(*video.notes, note),
+        masks_without=lambda held: partial(main_parts, whole, held),
+    )  # fmt: skip
 
 
 def _counted(video: Video) -> tuple[int, int]:
@@ -86,22 +89,24 @@ def standing_apart(masks: Masks) -> tuple[int, int]:
     return sum(bool(gap > APART * np.median(lengths)) for gap in gaps), len(gaps)
 
 
-def main_parts(masks: Masks) -> Iterator[np.ndarray | None]:
+def main_parts(masks: Masks, held: Collection[int] = ()) -> Iterator[np.ndarray | None]:
     """Of every mask the part that shares most pixels with what was kept before it, or the largest where none does.
 
     Args:
         masks: uint8 [h, w], or None where a frame has none.
+        held: moments whose masks decide nothing for those after them.
 
     Yields:
         The same, with the other parts and their soft rims at 0.
     """
     before: np.ndarray | None = None
-    for mask in masks():
+    for moment, mask in enumerate(masks()):
         if mask is None or not (solid := mask > 127).any():
             yield mask
             continue
         part = _main(solid, before)
-        before = part & solid
+        if moment not in held:
+            before = part & solid
         yield np.where(part, mask, 0).astype(np.uint8)
 
 

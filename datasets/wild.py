@@ -5,7 +5,7 @@ animal, and those where the image's border cuts it, are kept out, and the clip s
 """
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -67,6 +67,7 @@ class Video:
         masks: every moment's mask, uint8 [h, w], or None where it has none.
         true_masks: by which held-out frames are judged where they are better known than ``masks``.
         notes: what was assumed, a sentence each.
+        masks_without: ``masks`` where those of the given moments decide nothing for others; None: they never do.
     """
 
     title: str
@@ -81,6 +82,7 @@ class Video:
     masks: Masks
     true_masks: Masks | None = None
     notes: tuple[str, ...] = ()
+    masks_without: Callable[[Collection[int]], Masks] | None = None
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,10 @@ def _laid_out(video: Video, selection: Selection) -> tuple[Layout, Path]:
     """The layout of a video and the folder of its cut frames, made where they are not there yet."""
     folder = cache_folder() / "wild" / _key(video, selection)
     if not (folder / "rgba.npy").is_file():
-        layout = lay_out(video, [mask_facts(mask) if mask is not None else None for mask in video.masks()], selection)
+        layout = lay_out(video, _facts(video.masks), selection)
+        if video.masks_without:  # which are held out is known now
+            video = replace(video, masks=video.masks_without(set(layout.used) - {layout.used[i] for i in layout.shown}))
+            layout = replace(layout, crops=_crops(video, _facts(video.masks), layout.used, layout.tested))
         _fill(video, layout, selection.size, folder)
     return _read_layout(folder / "layout.json"), folder
 
@@ -209,11 +214,22 @@ def lay_out(video: Video, facts: Sequence[MaskFacts | None], selection: Selectio
     """
     used, notes = usable(video, facts, selection.stride, LEAST_FRAMES)
     tested = split_frames(len(used), selection.split or len(used))
-    shown = [i for i, test in zip(used, tested, strict=True) if not test]
-    times = [video.moments[i].time for i in shown]
-    boxes = [fact.box for i in shown if (fact := facts[i]) is not None and fact.box is not None]
-    crops = follow(times, boxes, [video.moments[i].time for i in used], video.size)
-    return Layout(tuple(used), tuple(tested), tuple(crops), notes)
+    return Layout(tuple(used), tuple(tested), _crops(video, facts, used, tested), notes)
+
+
+def _facts(masks: Masks) -> list[MaskFacts | None]:
+    return [None if mask is None else mask_facts(mask) for mask in masks()]
+
+
+def _crops(
+    video: Video, facts: Sequence[MaskFacts | None], used: Sequence[int], tested: Sequence[bool]
+) -> tuple[Crop, ...]:
+    """The crops of the used frames, from what the masks of those say that are not held out."""
+    shown = [
+        (i, fact.box) for i, test in zip(used, tested, strict=True) if not test and (fact := facts[i]) and fact.box
+    ]
+    times = [video.moments[i].time for i, _ in shown]
+    return tuple(follow(times, [box for _, box in shown], [video.moments[i].time for i in used], video.size))
 
 
 def split_frames(count: int, split: int) -> list[bool]:

@@ -18,7 +18,7 @@ from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import PRESETS as PRIOR_PRESETS
 from rewild4d.priors.config import STANDARD
 from rewild4d.protocol import Protocol, load_protocols
-from rewild4d.registry import load_method, names
+from rewild4d.registry import load_dataset, load_method, names
 from rewild4d.runner import Entry
 
 
@@ -175,7 +175,8 @@ def _is_under(record: RunRecord, condition: Condition, spec: Spec) -> bool:
     known_cameras = record.protocol.get("selection", {}).get("cameras") != "unknown"
     asked = PriorChoice(condition.prior, PRIOR_PRESETS.get(spec.preset, STANDARD)).settings_under(known_cameras)
     same_effort = effort is None or _equals(effort, asked)
-    return (record.dataset, record.protocol["name"], choice) == wanted and fits and same_effort
+    same_points = record.prior.get("keypoints", "none") == getattr(load_dataset(spec.dataset), "keypoint_use", "none")
+    return (record.dataset, record.protocol["name"], choice) == wanted and fits and same_effort and same_points
 
 
 def _missing(spec: Spec, cases: Sequence[Collection[str]]) -> list[str]:

@@ -129,6 +129,14 @@ def mirror_transforms(transforms: Tensor, mirror: Tensor) -> Tensor:
     return mirror_matrix(transforms[..., mirror, :, :])
 
 
+def between_intrinsics(first: Tensor, second: Tensor, part: float) -> Tensor:
+    """Intrinsics of a crop on the straight line between two crops of one film, [3, 3] each.
+
+    A crop's centre and side move evenly; in pixels of the crop that is a line between the inverses, not the matrices.
+    """
+    return torch.linalg.inv(torch.lerp(torch.linalg.inv(first), torch.linalg.inv(second), part))
+
+
 def mirror_camera(camera: Camera) -> Camera:
     """The proper camera whose image of the reflected scene is the horizontally flipped image.
 

@@ -305,6 +305,9 @@ def test_without_volumes_there_is_no_surface(animal: Path) -> None:
     (animal / "sequences").unlink()
     _, truth = Artemis(animal).load("cat/walk", SWEEP)
     assert truth.surface is None
+    assert truth.up is not None and torch.equal(
+        truth.up, torch.from_numpy(up_direction(read_cameras(animal / "CamPose.inf")))
+    )
 
 
 def test_check_of_a_sound_folder(animal: Path) -> None:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import moving
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from PIL import Image
 from test_wild import SELECTION, cache  # noqa: F401
 
 from rewild4d.datasets.davis import Davis
-from rewild4d.datasets.masks import list_images, read_values
+from rewild4d.datasets.masks import list_images, open_masks, read_values
 from rewild4d.datasets.online import Online
 from rewild4d.errors import UserError
 
@@ -109,3 +110,40 @@ def test_files_are_in_natural_order_whatever_digits_they_hold(tmp_path: Path) ->
     for name in reversed(names):
         (tmp_path / name).touch()
     assert [file.name for file in list_images(tmp_path)] == names
+
+
+def test_a_palette_of_greys_holds_shades(tmp_path: Path) -> None:
+    """Whatever index a program gave to white; a palette of colours, as DAVIS has it, holds numbers of objects."""
+    soft = cv2.GaussianBlur(INSIDE, (0, 0), 2)
+    Image.fromarray(INSIDE).quantize(2).save(tmp_path / "two.png")
+    Image.fromarray(soft).convert("P").save(tmp_path / "soft.png")
+    white_first = Image.fromarray((INSIDE == 0).astype(np.uint8), mode="P")
+    white_first.putpalette([255, 255, 255, 0, 0, 0])
+    white_first.save(tmp_path / "white.png")
+    for name, wanted in (("two", INSIDE), ("soft", soft), ("white", INSIDE)):
+        masks = open_masks([tmp_path / f"{name}.png"])
+        found = masks.read(0, None, moving.SIZE)
+        assert masks.ids == () and found is not None and (found == wanted).all(), name
+    # the seventh colour of DAVIS's palette is a grey: in a folder with colours it is a number all the same
+    colors = [0, 0, 0, *(64 * (i % 4) for i in range(18)), 128, 128, 128]
+    for name, number in (("one", 1), ("seven", 7)):
+        picture = Image.fromarray((INSIDE > 0).astype(np.uint8) * np.uint8(number), mode="P")
+        picture.putpalette(colors)
+        picture.save(tmp_path / f"{name}.png")
+    masks = open_masks([tmp_path / "one.png", tmp_path / "seven.png"])
+    found = masks.read(1, 7, moving.SIZE)
+    assert masks.ids == (1, 7) and found is not None and (found == INSIDE).all()
+
+
+def test_a_mask_that_is_transparent_everywhere_is_empty(tmp_path: Path) -> None:
+    cut_out = np.dstack([np.full_like(INSIDE, 200)] * 3 + [np.zeros_like(INSIDE)])
+    assert not read_values(moving.save(tmp_path / "m.png", cut_out)).any()
+    cut_out[..., 3], cut_out[..., :3] = 255, INSIDE[..., None]
+    assert (read_values(moving.save(tmp_path / "n.png", cut_out)) == INSIDE).all()
+
+
+def test_a_tinted_pixel_leaves_the_shades(tmp_path: Path) -> None:
+    soft = np.repeat(cv2.GaussianBlur(INSIDE, (0, 0), 2)[..., None], 3, axis=2)
+    soft[0, 0] = 0, 0, 1
+    found = read_values(moving.save(tmp_path / "m.png", soft))
+    assert (found == soft.max(axis=2)).all() and len(np.unique(found)) > 50

@@ -68,6 +68,16 @@ def test_a_part_of_a_video_at_another_rate(walk: Path, tmp_path: Path) -> None:
     assert clip.times[0] == 0 and clip.fps == pytest.approx(5)
 
 
+def test_masks_of_the_chosen_frames_with_numbers_of_their_own(walk: Path, tmp_path: Path) -> None:
+    """Eight masks from 0 on for the frames 4 to 11 are not those of 0 to 7, of which four have such a name."""
+    for i in range(8):
+        moving.save(tmp_path / "masks" / f"{i:05d}.png", moving.mask(i + 4))
+    video = Online(walk / "frames", masks=tmp_path / "masks", start=4 / 25).video("frames")
+    assert [moment.label for moment in video.moments] == [f"{i:05d}.png" for i in range(4, 12)]
+    assert all((mask == moving.mask(i + 4)).all() for i, mask in enumerate(video.masks()))
+    assert "one mask for each of the 8 chosen frames: matched in order, 00000.png first" in video.notes
+
+
 def test_a_video_of_masks(walk: Path, tmp_path: Path) -> None:
     film = moving.film(tmp_path / "walk.mp4", walk / "frames", *H264)
     matte = moving.film(tmp_path / "matte.mp4", walk / "masks", *H264)

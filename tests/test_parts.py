@@ -123,3 +123,21 @@ def test_another_word_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[s
         cli.main(["check", "--dataset", "artemis", "--parts", "main"])
     assert stop.value.code == 2
     assert "--parts: the data set 'artemis' does not take it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("parts", ["main", "auto"])
+def test_a_held_out_mask_decides_nothing_for_others(tmp_path: Path, parts: str) -> None:
+    """The animal that is followed is missing in the mask of one held-out frame alone."""
+    digests = []
+    for name in ("whole", "without"):
+        moving.frames(tmp_path / name / "clip" / "frames")
+        moving.masks(tmp_path / name / "clip" / "masks")
+        two_animals(tmp_path / name / "clip" / "masks")
+        if name == "without":
+            other = moving.mask(7, left=60)
+            other[: other.shape[0] // 2] = 0
+            moving.save(tmp_path / name / "clip" / "masks" / "00007.png", other)
+        clip, truth = Online(tmp_path / name / "clip", parts=parts).load("clip", SELECTION)
+        assert 7 in [round(frame.time * 25) for frame in truth.held_out]
+        digests.append(clip.digest)
+    assert digests[0] == digests[1]

@@ -130,6 +130,20 @@ def test_rows_take_the_records_with_their_settings() -> None:
     assert cases == {"Ours": ["a"], "w/o": ["b"], "empty": ["a"]}
 
 
+def test_runs_whose_prior_saw_keypoints_are_other_runs() -> None:
+    """DAVIS's tables are those of masks alone, APTv2's those of its keypoints: what `run --table` makes."""
+    whole = msgspec.to_builtins(load_preset("ours", Config, "quick"))
+    for dataset, wanted in (("davis", ["a", "b"]), ("aptv2", ["c"])):
+        found = spec([Line(label="Ours", method="ours")], conditions=(Condition(protocol="p-v1"),))
+        found = msgspec.structs.replace(found, dataset=dataset)
+        records = [
+            record(config=whole, dataset=dataset, case=case, prior={"name": "template"} | said)
+            for case, said in (("a", {}), ("b", {"keypoints": "none"}), ("c", {"keypoints": "all"}))
+        ]
+        (entrant,), _ = planning.entrants("t", found, records)
+        assert [one.case for one in entrant.records[0]] == wanted
+
+
 def test_a_condition_with_a_prior_from_the_truth_ranks_its_rows() -> None:
     """All rows of a condition start from its prior, so that it was made from the truth sets none of them apart."""
     conditions = (Condition(protocol="p-v1", prior="coarse:0"), Condition(protocol="p-v1"))

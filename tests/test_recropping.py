@@ -115,3 +115,15 @@ def test_a_record_knows_what_its_method_was_not_shown() -> None:
     assert describing.left_out(clip, clip) == describing.left_out(clip, None) == {}
     assert describing.shown_of(clip, {}) is clip
     assert math.isclose(clip.only([0, 9]).times[1], 9 / 24)
+
+
+def test_a_camera_between_two_crops_is_that_of_the_square_between_them() -> None:
+    """A square that grows by a half and moves by its side, for one camera of the whole frame."""
+    whole = a_prior([0.4], [-0.4]).cameras[0]
+    first, last = Crop(2.0, 4.0, 40.0, 64, 64), Crop(42.0, 14.0, 60.0, 64, 64)
+    ends = [crop.cropped_camera(whole, SIZE) for crop in (first, last)]
+    for part in (0.25, 0.5):
+        square = Crop(2.0 + 40 * part, 4.0 + 10 * part, 40.0 + 20 * part, 64, 64)
+        found = camera_between(ends, part)
+        assert found is not None
+        torch.testing.assert_close(found.intrinsics, square.cropped_camera(whole, SIZE).intrinsics, atol=1e-9, rtol=0)

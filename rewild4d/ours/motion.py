@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.priors.motion import blend_similarities
+from rewild4d.transforms import between_intrinsics
 from rewild4d.types import Camera
 
 
@@ -62,5 +63,5 @@ def camera_between(cameras: Sequence[Camera | None], position: float) -> Camera 
     return replace(
         first,
         world_to_camera=interpolate_similarity(matrices, part),
-        intrinsics=torch.lerp(first.intrinsics, second.intrinsics, part),
+        intrinsics=between_intrinsics(first.intrinsics, second.intrinsics, part),
     )

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
 from rewild4d.transforms import (
+    between_intrinsics,
     camera_in_object,
     matrix_to_quat,
     mirror_points,
@@ -82,7 +83,7 @@ def camera_at(prior: Prior, time: float) -> Camera:
     if before == after:
         return first
     moved = blend_similarities(first.world_to_camera, second.world_to_camera, part)
-    intrinsics = (1 - part) * first.intrinsics + part * second.intrinsics
+    intrinsics = between_intrinsics(first.intrinsics, second.intrinsics, part)
     return replace(second, world_to_camera=moved, intrinsics=intrinsics)
 
 
