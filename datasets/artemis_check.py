@@ -131,7 +131,7 @@ class _Check:
 
     def _fault(self, error: UserError) -> None:
         """Add an error once: validators build on each other and so repeat themselves."""
-        path, separator, message = str(error).partition(": ")
+        path, separator, message = str(error).removesuffix(".").partition(": ")
         if not any(str(finding.path) == path and finding.message == message for finding in self.findings):
             self._add("error", Path(path) if separator else self.animal, message or str(error))
 

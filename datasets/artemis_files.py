@@ -125,8 +125,10 @@ def read_parents(folder: Path) -> np.ndarray:
         raise UserError(f"{folder}: expected {' or '.join(PARENTS_FILES)}, got neither.")
     try:
         parents = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # a damaged file fails in any way
         raise UserError(f"{path}: expected a NumPy file of integers, but: {error}.") from error
+    if not isinstance(parents, np.ndarray):
+        raise UserError(f"{path}: expected a NumPy file of integers, got an archive.")
     if parents.ndim != 1 or not np.issubdtype(parents.dtype, np.integer):
         raise UserError(f"{path}: expected a vector of integers, got {parents.dtype} of shape {parents.shape}.")
     return parents.astype(np.int64)

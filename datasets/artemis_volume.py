@@ -15,6 +15,9 @@ SURFACE_POINTS = 10_000
 """Voxels of `Truth.surface` at most; `Truth.sample` draws as many points as it is asked for."""
 FILES = ("coords_init.pth", "volume_indices.pth", "volume_weights.pth")
 
+OFF, RARE = 0.05, 0.01
+"""How far from 1 the weights of a voxel may sum, and the share of voxels that may be further off."""
+
 
 @dataclass(frozen=True)
 class Voxels:
@@ -153,6 +156,11 @@ def read_voxels(animal: Path) -> Voxels | None:
     outside = indices[used & ((indices < 0) | (indices >= len(bones_rest)))]
     if len(outside):
         raise UserError(f"{folder / FILES[1]}: expected bones 0 to {len(bones_rest) - 1}, got index {outside[0]}.")
+    sums = np.where(used, weights, 0).sum(axis=1, dtype=np.float64)
+    off = np.abs(sums - 1) > OFF
+    if off.mean() > RARE:
+        first = int(np.flatnonzero(off)[0])
+        raise UserError(f"{folder / FILES[2]}: expected weights that sum to 1, got {sums[first]:.3g} at voxel {first}.")
     points = points.astype(np.float64)
     cells, error = lattice(points)
     if error > 0.1:
@@ -242,4 +250,6 @@ def _tensor(path: Path) -> np.ndarray:
     value = load_tensors(path, "saved torch tensor")
     if not isinstance(value, torch.Tensor):
         raise UserError(f"{path}: expected a saved torch tensor, got {type(value).__name__}.")
-    return value.numpy()
+    if value.layout != torch.strided or value.dtype == torch.bfloat16:
+        raise UserError(f"{path}: expected a dense tensor of integers or floats, got {value.layout} of {value.dtype}.")
+    return value.detach().numpy()

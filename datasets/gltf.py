@@ -32,6 +32,8 @@ TYPES: dict[int, type[Any]] = {
     5125: np.uint32,
     5126: np.float32,
 }
+MOST_VALUES = 100_000_000
+"""Of an accessor: a file that says more is damaged."""
 READABLE_EXTENSIONS = {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"}
 
 
@@ -68,6 +70,8 @@ class Document:
         order = [index for index, parent in enumerate(self.parents) if parent < 0]
         for index in order:  # grows while it is walked: parents before children
             order.extend(self.tree.nodes[index].children or [])
+            if len(order) > len(self.parents):
+                break
         if len(order) != len(self.parents):
             raise self.error("expected a node hierarchy without cycles and with one parent per node")
         return order
@@ -114,6 +118,8 @@ class Document:
         stride = view.byteStride or item
         start = (view.byteOffset or 0) + (offset or 0)
         raw = np.frombuffer(self.buffer(view.buffer), np.uint8)
+        if min(start, view.byteOffset or 0, offset or 0, count) < 0 or stride < item:
+            raise self.error(f"expected data that lies in its buffer, but view {index} has a negative offset or stride")
         if count and start + (count - 1) * stride + item > len(raw):
             raise self.error(f"expected {start + (count - 1) * stride + item} bytes of data, but it has {len(raw)}")
         rows = np.lib.stride_tricks.as_strided(raw[start:], (count, item), (stride, 1))
@@ -125,6 +131,10 @@ class Document:
         if accessor.type not in COMPONENTS or accessor.componentType not in TYPES:
             raise self.error(f"expected an accessor type that skins use, but accessor {index} is {accessor.type}")
         dtype, width = TYPES[accessor.componentType], COMPONENTS[accessor.type]
+        if not 0 <= accessor.count <= MOST_VALUES:
+            raise self.error(
+                f"expected accessor {index} to hold up to {MOST_VALUES} values, but it says {accessor.count}"
+            )
         if accessor.bufferView is None:
             values = np.zeros((accessor.count, width), dtype)
         else:
@@ -228,7 +238,7 @@ def _parse(path: Path) -> pygltflib.GLTF2:
     try:
         tree = pygltflib.GLTF2()
         tree = tree.load_binary(str(path)) if head == b"glTF" else tree.load_json(str(path))
-    except (ValueError, KeyError, TypeError, AttributeError, OSError, struct.error) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OSError, RecursionError, struct.error) as error:
         raise UserError(f"{path}: expected a .glb or .gltf file, but it cannot be parsed ({error}).") from error
     if tree is None or tree.asset is None or not str(tree.asset.version or "").startswith("2"):
         raise UserError(f"{path}: expected glTF version 2, but it is another format or version.")

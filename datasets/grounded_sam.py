@@ -1,7 +1,7 @@
 """Masks by Grounding DINO (Liu et al. 2023) and SAM 2 (Ravi et al. 2024), through Hugging Face's `transformers`.
 
 The words name the animal, Grounding DINO finds its box in every frame, SAM 2 fills the box. An optional extra
-(`pip install rewild4d[masks]`); nothing is imported before it is used, and the weights are the user's to fetch.
+(`pip install -e '.[masks]'`); nothing is imported before it is used, and the weights are the user's to fetch.
 Images are prepared here, in plain torch, because the image processors of `transformers` want torchvision.
 """
 
@@ -80,8 +80,8 @@ def load_networks(detector: str, segmenter: str, device: torch.device) -> Networ
         from transformers import AutoModelForZeroShotObjectDetection, AutoTokenizer, Sam2Model
     except (ImportError, RuntimeError) as error:  # a torchvision that does not fit torch is a RuntimeError
         raise UserError(
-            "--tool grounded-sam2: expected the package transformers (4.56 or newer), run: pip install "
-            f"'rewild4d[masks]' ({_first_line(error)})."
+            "--tool grounded-sam2: expected the package transformers (4.56 or newer), run: pip install -e "
+            f"'.[masks]' ({_first_line(error)})."
         ) from error
     loaded = []
     for kind, name in (

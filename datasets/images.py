@@ -254,7 +254,10 @@ def _decode(path: Path, mode: int, upright: bool = False) -> np.ndarray:
     fault = _png_fault(data) if data.startswith(_PNG) else _jpeg_fault(data)
     # Cameras know nothing of EXIF, so an orientation tag must not turn the image.
     mode = mode if upright else mode | cv2.IMREAD_IGNORE_ORIENTATION
-    image = None if fault else cv2.imdecode(np.frombuffer(data, dtype=np.uint8), mode)
+    try:
+        image = None if fault else cv2.imdecode(np.frombuffer(data, dtype=np.uint8), mode)
+    except cv2.error:  # more pixels than it takes
+        image = None
     if image is None:
         raise UserError(f"{path}: expected a whole image, got {fault or 'a damaged one'}.")
     return image

@@ -90,7 +90,7 @@ class Online:
             if not path.exists():
                 raise UserError(f"{path}: expected a video file or a folder of images, but there is no such thing.")
         if self.fps is not None and not 0 < self.fps <= 1000:
-            raise UserError(f"--fps: expected a number above 0, got {self.fps:g}.")
+            raise UserError(f"--fps: expected a number above 0, up to 1000, got {self.fps:g}.")
         if (self.start or 0) < 0 or (self.end is not None and self.end <= (self.start or 0)):
             end = "no end" if self.end is None else f"{self.end:g}"
             raise UserError(f"--start and --end: expected 0 <= start < end, got {self.start or 0:g} and {end}.")

@@ -190,6 +190,8 @@ def inverse_binds(document: Document, skin: int) -> Floats:
         UserError: too few, or one that cannot be inverted.
     """
     found = document.tree.skins[skin]
+    if not found.joints:
+        raise document.error(f"expected joints, but skin {skin} has none")
     if found.inverseBindMatrices is None:
         return np.tile(np.eye(4), (len(found.joints), 1, 1))
     matrices = document.floats(found.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1)
@@ -233,6 +235,11 @@ def influences(document: Document, primitive: pygltflib.Primitive, count: int) -
         raise document.error("expected JOINTS_0 and WEIGHTS_0 in a skinned mesh, but a primitive lacks them")
     joints = np.concatenate([document.accessor(i).astype(np.int64) for i in indices if i is not None], axis=1)
     shares = np.concatenate([document.floats(i) for i in weights if i is not None], axis=1)
+    vertices = document.tree.accessors[primitive.attributes.POSITION].count
+    if not len(joints) == len(shares) == vertices:
+        raise document.error(
+            f"expected joints and weights of {vertices} vertices, but {len(joints)}, {len(shares)} came"
+        )
     total = shares.sum(1, keepdims=True)
     shares[:, :1] = np.where(total <= 0, 1.0, shares[:, :1])  # a vertex without weights follows its first joint
     joints = np.where(shares > 0, joints, joints[:, :1])

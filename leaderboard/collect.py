@@ -166,10 +166,13 @@ def _picture(source: Path, place: Path) -> str:
     if (source / target.name).is_file():
         shutil.copyfile(source / target.name, target)
     elif (source / "comparison.png").is_file():
-        with Image.open(source / "comparison.png") as image:
-            scale = min(1.0, PICTURE_WIDTH / image.width)
-            size = round(image.width * scale), round(image.height * scale)
-            small = image.convert("RGB").resize(size, Image.Resampling.LANCZOS)
+        try:
+            with Image.open(source / "comparison.png") as image:
+                scale = min(1.0, PICTURE_WIDTH / image.width)
+                size = round(image.width * scale), round(image.height * scale)
+                small = image.convert("RGB").resize(size, Image.Resampling.LANCZOS)
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            raise UserError(f"{source / 'comparison.png'}: expected a picture, got a damaged one ({error}).") from error
         small.save(target, quality=75, method=6)
     return target.name if target.is_file() else ""
 

@@ -106,6 +106,25 @@ class _Protocol(msgspec.Struct):
     title: str
     scores: list[str]
     floors: list[str] = []
+    selection: dict[str, Any] = {}
+
+
+class _Prior(msgspec.Struct):
+    """What tables and `evaluate` ask of its prior."""
+
+    name: str = ""
+    choice: str = ""
+    keypoints: str = "none"
+    config: dict[str, Any] | None = None
+
+
+class _Data(msgspec.Struct):
+    """What `evaluate` and `export` ask of its data."""
+
+    clip: str = ""
+    truth: str = ""
+    root: str = ""
+    settings: str = "{}"
 
 
 def make_run_id(**parts: Any) -> str:
@@ -147,10 +166,11 @@ def read_record(path: Path) -> RunRecord:
         raise UserError(f"{path}: expected a run record of schema {SCHEMA}, but {error}.") from error
     if record.schema != SCHEMA:
         raise UserError(f"{path}: expected a run record of schema {SCHEMA}, got schema {record.schema}.")
-    try:
-        msgspec.convert(record.protocol, _Protocol)
-    except msgspec.ValidationError as error:
-        raise UserError(f"{path}: expected the protocol of a run, but in `protocol`: {error}.") from error
+    for place, shape in (("protocol", _Protocol), ("prior", _Prior), ("data", _Data)):
+        try:
+            msgspec.convert(getattr(record, place), shape)
+        except msgspec.ValidationError as error:
+            raise UserError(f"{path}: expected the {place} of a run, but in `{place}`: {error}.") from error
     return record
 
 

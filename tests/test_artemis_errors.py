@@ -78,6 +78,18 @@ IMAGE = "img/walk/1/img_0002"
 FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no cameras": (lambda a: (a / "CamPose.inf").unlink(), r"CamPose\.inf: expected a file .* No such file"),
     "empty cameras": (lambda a: (a / "CamPose.inf").write_text("\n"), r"CamPose\.inf: expected one row .* empty file"),
+    "shrunken truth": (
+        lambda a: torch.save(0.3 * torch.ones(8, 1), a / "volumes" / "volume_weights.pth"),
+        r"volume_weights\.pth: expected weights that sum to 1, got 0\.3 at voxel 0\.",
+    ),
+    "sparse weights": (
+        lambda a: torch.save(torch.ones(8, 1).to_sparse(), a / "volumes" / "volume_weights.pth"),
+        r"volume_weights\.pth: expected a dense tensor of integers or floats, got torch\.sparse_coo of torch\.float32",
+    ),
+    "half weights": (
+        lambda a: torch.save(torch.ones(8, 1).bfloat16(), a / "volumes" / "volume_weights.pth"),
+        r"volume_weights\.pth: expected a dense tensor of integers or floats, got torch\.strided of torch\.bfloat16",
+    ),
     "11 numbers": (
         lambda a: replace_row(a / "CamPose.inf", 1, lambda row: row[:-1]),
         r"CamPose\.inf: expected 12 numbers in row 2 \(camera 1\), got 11\.",
@@ -251,6 +263,7 @@ def test_a_fault_is_one_sentence_and_check_finds_it(animal: Path, cache: Path, f
     assert str(caught.value).startswith(str(animal)) and "\n" not in str(caught.value)
     assert not list(cache.rglob("rgba.npy")) and not list(cache.rglob(".*"))
     errors = [finding for finding in Artemis(animal).check() if finding.level == "error"]
+    assert len({(error.path, error.message) for error in errors}) == len(errors), "each fault once"
     assert any(re.search(sentence.removesuffix(r"\."), f"{error.path}: {error.message}") for error in errors)
 
 

@@ -76,6 +76,10 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
         (["evaluate", "/no/such/run"], "/no/such/run/record.json: expected a run record"),
         (["make", "artemi"], "Did you mean 'artemis'?"),
         (["make", "artemis", "--rig", "/no.glb", "--clip", "Walk", "--out", "x", "--size", "640"], "got '640'"),
+        (
+            ["make", "artemis", "--rig", "/no.glb", "--clip", "Walk", "--out", "x", "--size", "640x99999"],
+            "of 16 to 8192 ",
+        ),
         (["make", "artemis", "--rig", "/no/rig.glb", "--clip", "Walk", "--out", "x"], "/no/rig.glb: expected"),
     ],
 )

@@ -192,7 +192,7 @@ def test_overlap_and_preparation() -> None:
 
 def test_without_transformers_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(UserError, match=r"expected the package transformers .* pip install 'rewild4d\[masks\]'"):
+    with pytest.raises(UserError, match=r"expected the package transformers .* pip install -e '\.\[masks\]'"):
         grounded_masks("wolf")
 
 

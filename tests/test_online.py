@@ -250,7 +250,7 @@ def test_check_tells_what_a_person_should_look_at(walk: Path, tmp_path: Path) ->
         ("before", "--start and --end: expected 0 <= start < end, got -1 and no end"),
         ("link to nothing", "00004.png: expected an image that can be read, but: No such file or directory"),
         ("link to itself", "00004.png: expected an image that can be read, but: Too many levels of"),
-        ("no rate", "--fps: expected a number above 0, got -1"),
+        ("no rate", "--fps: expected a number above 0, up to 1000, got -1"),
         ("missing", "expected a video file or a folder of images, but there is no such thing"),
     ],
 )

@@ -115,6 +115,8 @@ def nan(array: np.ndarray) -> np.ndarray:
         ("intrinsics", lambda a: 2 * a, "expected positive focal lengths and a last row 0 0 1 in 'intrinsics', got"),
         ("intrinsics_flip", None, "expected all or none of world_to_camera_flip"),
         ("quality", lambda a: np.array("[1]"), "expected 'quality' to be a JSON object of numbers"),
+        ("quality", lambda a: np.array('{"a": 1, "b": NaN}'), "expected finite numbers in 'quality', got nan for 'b'"),
+        ("quality", lambda a: np.array(f'{{"a": 1{"0" * 400}}}'), "expected 'quality' to be a JSON object of numbers"),
     ],
 )
 def test_each_broken_promise_is_one_sentence_with_the_path(prior, tmp_path, key, change, message) -> None:  # type: ignore[no-untyped-def]

@@ -54,6 +54,18 @@ def test_a_protocol_has_what_tables_ask_of_it(tmp_path: Path, name: str) -> None
         read_record(path)
 
 
+@pytest.mark.parametrize(
+    ("changes", "place"),
+    [
+        ({"prior": {"choice": 5}}, r"`prior`: Expected `str`, got `int` - at `\$.choice`"),
+        ({"protocol": {**PROTOCOL, "selection": 7}}, r"`protocol`: Expected `object`, got `int` - at `\$.selection`"),
+    ],
+)
+def test_prior_and_selection_are_what_tables_take_them_for(tmp_path: Path, changes: dict, place: str) -> None:  # type: ignore[type-arg]
+    with pytest.raises(UserError, match=f"record.json: expected the .* of a run, but in {place}"):
+        read_record(write_record(record(**changes), tmp_path))
+
+
 def test_a_folder_is_no_record(tmp_path: Path) -> None:
     (tmp_path / "run" / "record.json").mkdir(parents=True)
     with pytest.raises(UserError, match="expected a run record, but it cannot be read: Is a directory"):

@@ -191,7 +191,7 @@ def test_methods_get_the_clip_and_nothing_that_is_held_out(plan: runner.Plan, mo
 def test_evaluate_gives_the_same_scores(plan: runner.Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     record = runner.execute(plan)[1]
     folder = next(plan.out.rglob(f"prior-only-quick-seed0-{record.run_id[:8]}"))
-    monkeypatch.setattr("rewild4d.commands.evaluate.load_dataset", lambda _: lambda _: plan.reader)
+    monkeypatch.setattr("rewild4d.commands.shared.load_dataset", lambda _: lambda _: plan.reader)
     assert still(score_again(folder, EvaluateOptions(runs=(folder,)))) == still(record)
     state = folder / "reconstruction" / "surface.pt"
     for data in (state.read_bytes()[: state.stat().st_size // 2], b"text"):

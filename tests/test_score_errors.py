@@ -105,5 +105,7 @@ def test_folders_that_do_not_fit_are_one_sentence(capsys: pytest.CaptureFixture[
         ([images, images, "--fps", "0"], "--fps: expected a number above 0, got 0"),
         ([images, images, "--device", "tpu"], "--device: expected auto, cpu or cuda, got 'tpu'"),
         ([images, images, "--out", video / "x.json"], "expected a folder that can be written"),
+        ([images, images, "--out", images], "expected the name of a file to write, but it is a folder"),
+        ([images, images, "--unpaired", "--only", "psnr"], "--unpaired: expected kid or fvd among --only, got psnr"),
     ):
         assert sentence in refused(capsys, "--pred", words[0], "--truth", words[1], *words[2:])

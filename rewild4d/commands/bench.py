@@ -11,7 +11,7 @@ from rewild4d.benchmarks.results import Result, Row, default_path, to_json, writ
 from rewild4d.benchmarks.step_bench import bench_step
 from rewild4d.benchmarks.tables import markdown
 from rewild4d.benchmarks.timing import threads
-from rewild4d.commands.shared import require_writable
+from rewild4d.commands.shared import require_writable_file
 from rewild4d.config import load_preset, parse_flags
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.ours.config import Config
@@ -131,7 +131,7 @@ def _report(
 ) -> int:
     """Measure, write the data, print the table."""
     path = options.out or default_path(arguments[0])
-    require_writable(path.parent)
+    require_writable_file(path)
     with threads(options.threads) as count:
         result = Result(
             benchmark=arguments[0], command=["bench", *arguments], threads=count, settings=settings, peers=peers,

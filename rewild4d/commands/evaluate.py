@@ -1,6 +1,5 @@
 """`evaluate`: score a saved reconstruction again, by the protocol it was fitted for."""
 
-import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ import torch
 import tyro
 
 from rewild4d import describing
+from rewild4d.commands.shared import reader_of
 from rewild4d.config import parse_flags
 from rewild4d.coverage import coverage
 from rewild4d.errors import UserError
@@ -21,7 +21,7 @@ from rewild4d.progress import Progress
 from rewild4d.protocol import evaluate, find_protocol
 from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.refining import ready_to_score
-from rewild4d.registry import load_dataset, load_method
+from rewild4d.registry import load_method
 from rewild4d.runner import STAMP, fit_seconds
 from rewild4d.view import save_pictures
 from rewild4d.workers import share_cores, this_process
@@ -76,13 +76,13 @@ def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: s
     if not saved.is_dir():
         raise UserError(f"{saved}: expected a saved reconstruction, but there is no such folder.")
     protocol = find_protocol(record.dataset, record.protocol["name"])
-    root = data or Path(record.data["root"])
-    settings = json.loads(record.data.get("settings", "{}"))
-    reader = load_dataset(record.dataset)(root, **settings)
+    spent = fit_seconds(folder) if (folder / STAMP).is_file() else record.timing.fit_seconds
+    reader = reader_of(folder, record, data)
     clip, truth = reader.load(record.case, protocol.selection)
     for name, now in (("clip", clip.digest), ("truth", truth.digest)):
-        if now != record.data[name]:
-            raise UserError(f"{root}: the {name} of {record.case} is not the one that {folder} was fitted to.")
+        if now != record.data.get(name):
+            place = data or record.data["root"]
+            raise UserError(f"{place}: the {name} of {record.case} is not the one that {folder} was fitted to.")
     reconstruction = load_method(record.method).load(saved, device)
     begin = time.perf_counter()
     shown = describing.shown_of(clip, record.prior)
@@ -100,13 +100,12 @@ def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: s
         record, status="ok", error="", **found.keep(folder), coverage=coverage(clip, truth), pictures=pictures,
         diagnostics=describing.diagnostics(reconstruction, shown, protocol.background), protocol=described,
         marks=describing.marks(record.method, record.prior.get("choice", ""), reconstruction),
-        code=code_of(record.method), machine=machine(device, rasterizer), timing=_timing(record, folder, seconds),
+        code=code_of(record.method), machine=machine(device, rasterizer), timing=_timing(record, spent, seconds),
     )  # fmt: skip
     return read_record(write_record(renewed, folder))
 
 
-def _timing(record: RunRecord, folder: Path, seconds: float) -> Timing:
-    """When and how long it was fitted, which a failed record does not say, and how long scoring took now."""
-    fit = round(fit_seconds(folder), 2) if (folder / STAMP).is_file() else record.timing.fit_seconds
+def _timing(record: RunRecord, spent: float, seconds: float) -> Timing:
+    """When it was fitted, how long that took, which a failed record does not say, and how long scoring took now."""
     memory = max(record.timing.peak_memory_mib, round(peak_memory_mib(), 1))
-    return Timing(record.timing.started, fit, round(seconds, 2), memory)
+    return Timing(record.timing.started, round(spent, 2), round(seconds, 2), memory)

@@ -1,6 +1,5 @@
 """`export`: a saved reconstruction in files that other programs open."""
 
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,17 +7,16 @@ from pathlib import Path
 import tyro
 
 from rewild4d import describing
-from rewild4d.commands.shared import require_writable
+from rewild4d.commands.shared import reader_of, require_writable
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError
 from rewild4d.export import KINDS, export, parse_kinds, why_not
-from rewild4d.leaderboard.records import FILE, RunRecord, read_record
+from rewild4d.leaderboard.records import FILE, read_record
 from rewild4d.machine import pick_device
 from rewild4d.protocol import find_protocol
 from rewild4d.rasterizer import pick_rasterizer, set_default
 from rewild4d.recropping import all_moments, seen_by
-from rewild4d.registry import load_dataset, load_method
-from rewild4d.types import Clip, Truth
+from rewild4d.registry import load_method
 
 DESCRIPTION = """Write a run's reconstruction as files for other programs: Gaussians of every frame (ply), an animated
 skinned mesh (glb), cameras (OpenCV axes, JSON) and films (mp4). Of a video that is every frame which shows the animal,
@@ -55,7 +53,8 @@ def main(arguments: list[str]) -> int:
     saved = options.run / "reconstruction"
     if not saved.is_dir():
         raise UserError(f"{saved}: expected a saved reconstruction, but there is no such folder.")
-    clip, truth = load_data(record, options.data)
+    protocol = find_protocol(record.dataset, record.protocol["name"])
+    clip, truth = reader_of(options.run, record, options.data).load(record.case, protocol.selection)
     reconstruction = load_method(record.method).load(saved, device)
     clip = all_moments(*seen_by(reconstruction, clip, truth, describing.shown_of(clip, record.prior)))
     reasons = {kind: why_not(reconstruction, kind, clip) for kind in kinds}
@@ -68,16 +67,3 @@ def main(arguments: list[str]) -> int:
         if reason:
             print(f"{kind}: not written: {reason}", file=sys.stderr)
     return 0
-
-
-def load_data(record: RunRecord, data: Path | None) -> tuple[Clip, Truth]:
-    """The clip that a run was fitted to, and what was held out.
-
-    Raises:
-        UserError: the data is not there any more.
-    """
-    protocol = find_protocol(record.dataset, record.protocol["name"])
-    settings = json.loads(record.data.get("settings", "{}"))
-    return load_dataset(record.dataset)(data or Path(record.data["root"]), **settings).load(
-        record.case, protocol.selection
-    )

@@ -9,6 +9,8 @@ from rewild4d.datasets.studio import make_artemis
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.progress import Progress
 
+LONGEST_SIDE = 8192
+"""Of an image in pixels."""
 DESCRIPTION = """Render a skinned, animated glTF from a ring of cameras and write it as an Artemis folder: images,
 mattes, cameras, bones and the voxel volume with its skinning weights."""
 
@@ -59,9 +61,11 @@ def parse_size(text: str) -> tuple[int, int]:
     """Width and height of "640x360".
 
     Raises:
-        UserError: anything else, or a side under 16 pixels.
+        UserError: anything else, or a side that is too short or too long.
     """
-    match = re.fullmatch(r"(\d+)x(\d+)", text)
-    if match is None or min(int(match[1]), int(match[2])) < 16:
-        raise UserError(f"--size: expected <width>x<height> of at least 16 pixels each, like 640x360, got '{text}'.")
+    match = re.fullmatch(r"(\d{1,6})x(\d{1,6})", text)
+    if match is None or not all(16 <= int(side) <= LONGEST_SIDE for side in match.groups()):
+        raise UserError(
+            f"--size: expected <width>x<height> of 16 to {LONGEST_SIDE} pixels, like 640x360, got '{text}'."
+        )
     return int(match[1]), int(match[2])

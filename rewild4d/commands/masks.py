@@ -19,7 +19,7 @@ from rewild4d.machine import pick_device
 from rewild4d.runner import choose_cases
 
 DESCRIPTION = """Make masks of the animal. --tool program runs any command that reads a folder of frames and writes a
-folder of masks; --tool grounded-sam2 uses Grounding DINO and SAM 2 (pip install rewild4d[masks]; their weights are on
+folder of masks; --tool grounded-sam2 uses Grounding DINO and SAM 2 (pip install -e '.[masks]'; their weights are on
 Hugging Face); --tool rough is GrabCut from a box: it works offline and is rough, as its name says."""
 TOOLS = ("rough", "program", "grounded-sam2")
 

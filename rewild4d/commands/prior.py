@@ -4,7 +4,7 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rewild4d.commands.shared import require_writable
+from rewild4d.commands.shared import require_writable_file
 from rewild4d.config import parse_flags
 from rewild4d.contracts import Selection
 from rewild4d.datasets.online import Online
@@ -120,9 +120,7 @@ def _fit(options: FitOptions) -> None:
     for note in clip.notes:
         print(note)
     given, scored = split_marks(_marks(options, clip, mapping), options.use)
-    if options.out.is_dir():
-        raise UserError(f"--out {options.out}: expected the name of a file to write, but it is a folder.")
-    require_writable(options.out.parent)
+    require_writable_file(options.out)
     progress = Progress(f"prior: {options.frames}")
     said = Evidence(given, clip.travel)
     prior = fit_footage(clip, config=FOOTAGE, seed=options.seed, log=progress, said=said)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from rewild4d.cloud_scoring import score_clouds
-from rewild4d.commands.shared import require_writable
+from rewild4d.commands.shared import require_writable_file
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import write_text
@@ -58,7 +58,7 @@ class Options:
 def main(arguments: list[str]) -> int:
     options = parse_flags(Options, arguments, prog="rewild4d-bench score", description=DESCRIPTION)
     if options.out is not None:
-        require_writable(options.out.parent)
+        require_writable_file(options.out)
     report = score(options)
     if options.out is not None:
         write_text(options.out, to_json(report) + "\n")
@@ -90,6 +90,8 @@ def score(options: Options) -> Report:
     if options.unpaired and (options.masks or options.pred_masks):
         raise UserError("--unpaired: expected no masks, because only whole images are compared.")
     families = options.only or FAMILIES
+    if options.unpaired and not {"kid", "fvd"} & {*families}:
+        raise UserError(f"--unpaired: expected kid or fvd among --only, got {' '.join(families)}.")
     bar = _Bar()
     try:
         return score_pictures(

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from rewild4d.config import load_preset, preset_names
 from rewild4d.contracts import DatasetReader
 from rewild4d.errors import UserError
@@ -79,6 +81,29 @@ def choose_prior(name: str, preset: str, reader: DatasetReader, options: Any = N
     return PriorChoice(name, PRESETS.get(preset, STANDARD), chosen, use or default)
 
 
+def reader_of(run: Path, record: RunRecord, data: Path | None) -> DatasetReader:
+    """The reader of the data that a run was fitted to.
+
+    Args:
+        run: folder of the run.
+        record: of the run.
+        data: where the data is now; None: where the record says.
+
+    Raises:
+        UserError: the record does not say where or how it was read, or the data is not there any more.
+    """
+    reader, root = load_dataset(record.dataset), data or record.data.get("root")
+    if not root:
+        raise UserError(f"{run}: expected a record that names the folder of its data; --data names one.")
+    try:
+        settings = msgspec.json.decode(record.data.get("settings", "{}"), type=dict[str, Any])
+    except msgspec.MsgspecError as error:
+        raise UserError(f"{run}: expected the record's data.settings to be a JSON object, but: {error}.") from error
+    if unknown := sorted(set(settings) - {*getattr(reader, "options", ())}):
+        raise UserError(f"{run}: expected settings that data set {record.dataset} has, got {', '.join(unknown)}.")
+    return reader(Path(root), **settings)
+
+
 def require_writable(folder: Path) -> None:
     """Fail before hours of work, not after."""
     probe = folder / ".writable"
@@ -88,6 +113,13 @@ def require_writable(folder: Path) -> None:
         probe.unlink(missing_ok=True)  # another run may have taken it away
     except OSError as error:
         raise UserError(f"--out {folder}: expected a folder that can be written, but: {error.strerror}.") from error
+
+
+def require_writable_file(path: Path) -> None:
+    """The same of one file."""
+    if path.is_dir():
+        raise UserError(f"--out {path}: expected the name of a file to write, but it is a folder.")
+    require_writable(path.parent)
 
 
 def check_numbers(jobs: int, threads: int) -> None:

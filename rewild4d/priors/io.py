@@ -22,12 +22,11 @@ Keys (T frames, J bones, n vertices, f faces; lengths in object units, the rest 
 """
 
 import json
-import zlib
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -162,7 +161,7 @@ def _read(path: Path) -> Mapping[str, np.ndarray]:
             return {key: archive[key] for key in archive.files}
     except FileNotFoundError as error:
         raise UserError(f"{path}: expected a prior file, but there is no such file.") from error
-    except (OSError, ValueError, BadZipFile, EOFError, AttributeError, zlib.error) as error:
+    except Exception as error:  # a damaged archive fails in any way
         raise UserError(f"{path}: expected a prior file (npz), but it cannot be read as one: {error}.") from error
 
 
@@ -172,9 +171,12 @@ def _text(raw: Mapping[str, np.ndarray], key: str, default: str) -> str:
 
 def _quality(path: Path, text: str) -> dict[str, float]:
     try:
-        return {str(name): float(value) for name, value in json.loads(text).items()}
-    except (ValueError, TypeError, AttributeError) as error:
+        found = {str(name): float(value) for name, value in json.loads(text).items()}
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise UserError(f"{path}: expected 'quality' to be a JSON object of numbers, got {text[:60]!r}.") from error
+    if bad := next((name for name, value in found.items() if not math.isfinite(value)), None):
+        raise UserError(f"{path}: expected finite numbers in 'quality', got {found[bad]} for '{bad}'.")
+    return found
 
 
 def _checked(

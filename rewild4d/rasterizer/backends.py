@@ -109,7 +109,7 @@ def _missing(package: str) -> str:
         importlib.import_module(package)
     except ModuleNotFoundError as error:
         if error.name == package:
-            return f"{package} is not installed here (pip install 'rewild4d[{package}]')"
+            return f"{package} is not installed here (pip install -e '.[{package}]')"
         return f"{package} cannot be imported: {error}"
     except (ImportError, OSError, RuntimeError) as error:
         return f"{package} cannot be imported: {error}"
