@@ -21,7 +21,14 @@ import torch
 from torch import Tensor
 
 from rewild4d.baselines.external_alignment import UPS, Placement, place_by_search, place_fauna
-from rewild4d.baselines.external_folder import crop_box, find_outputs, program_digest, run_program, write_clip
+from rewild4d.baselines.external_folder import (
+    crop_box,
+    find_outputs,
+    program_digest,
+    require_program,
+    run_program,
+    write_clip,
+)
 from rewild4d.baselines.external_profiles import PROFILES, Profile
 from rewild4d.baselines.external_reading import Moment, moved_discs, painted, read_moments
 from rewild4d.contracts import Log, MethodInfo
@@ -116,14 +123,28 @@ class External:
         return digest(*(part for path in sorted(folder.rglob("*")) if path.is_file()
                         for part in (str(path.relative_to(folder)), path.read_bytes())))  # fmt: skip
 
+    def require(self, config: ExternalConfig, cases: Sequence[str]) -> None:
+        """Say what no case could be made with before any is (`Method`).
+
+        Raises:
+            UserError: an unknown profile, both or neither of command and folder, or one that cannot be used.
+        """
+        _profile(config)
+        if bool(config.command) == bool(config.folder):
+            raise UserError("external: expected either --command (a program to run) or --folder (its results).")
+        if config.command:
+            require_program(config.command)
+        elif not any(_folder(config, case).is_dir() for case in cases):
+            first = _folder(config, cases[0])
+            raise UserError(f"{first}: expected the folder of a program's results, but there is no such folder.")
+
     def fit(
         self, clip: Clip, prior: Prior, *, config: ExternalConfig, seed: int, device: torch.device, log: Log,
         workdir: Path | None,
     ) -> ExternalReconstruction:  # fmt: skip
         """Run the program, or take what it left, and read it; see contracts.Method."""
+        self.require(config, [clip.name])
         profile = _profile(config)
-        if bool(config.command) == bool(config.folder):
-            raise UserError("external: expected either --command (a program to run) or --folder (its results).")
         for frame in clip.frames:
             crop_box(frame.mask)  # an empty mask is said before hours of work
         if config.folder:

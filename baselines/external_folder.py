@@ -5,6 +5,7 @@ import math
 import os
 import re
 import shlex
+import shutil
 import signal
 import string
 import subprocess
@@ -104,6 +105,17 @@ def program_digest(command: str, case: str) -> str:
 def _content(file: Path) -> bytes | str:
     about = file.stat()
     return file.read_bytes() if about.st_size < LARGE else f"{about.st_size} {about.st_mtime_ns}"
+
+
+def require_program(command: str) -> None:
+    """Fail on a command whose words are wrong, or whose first is no program.
+
+    Raises:
+        UserError: so it is.
+    """
+    program = _words(command, dict.fromkeys(("clip", "out", "case", "seed"), "x"))[0]
+    if shutil.which(program) is None:
+        raise UserError(f"--command: expected a program that can be started, but '{program}': No such file or program.")
 
 
 def run_program(command: str, *, clip: Path, out: Path, case: str, seed: int, timeout: float, log: Path) -> None:

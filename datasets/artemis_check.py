@@ -84,11 +84,15 @@ class _Check:
         with ThreadPoolExecutor(2) as pool:
             results = pool.map(_is_seen, pairs, [source] * len(pairs))
             progress = tqdm(results, total=len(pairs), desc=title, disable=None, leave=False)
+            shown = False
             for pair, seen in zip(pairs, progress, strict=True):
+                shown = shown or seen is True
                 if isinstance(seen, UserError):
                     self._fault(seen)
                 elif not seen:
                     self._add("warning", pair.alpha, "the matte is empty: this image cannot be an input")
+        if pairs and not shown:
+            self._add("error", self.animal / "img" / motion, "no matte shows an animal that could be an input")
         if source and intrinsics is not None:
             self._principal_points(source, intrinsics)
         if any(pair.rgb.suffix.lower() != ".png" for pair in pairs):

@@ -97,7 +97,10 @@ def run_program(command: str) -> MaskMaker:
             lines = [f"{index} {' '.join(f'{x:g}' for x in box)}\n" for index, box in sorted(source.boxes.items())]
             places["boxes"].write_text("".join(lines))
             _call([word.format(**places) for word in words])
-            files, _ = match_masks(list_images(places["masks"]), stems, places["masks"])
+            written = list_images(places["masks"])
+            if not written:
+                raise UserError(f"{words[0]}: expected a mask for each of {len(stems)} frames, but it wrote none.")
+            files, _ = match_masks(written, stems, places["masks"])
             missing = files.count(None)
             if missing:
                 raise UserError(

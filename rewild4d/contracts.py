@@ -94,7 +94,8 @@ class Method(Protocol):
     """One competitor.
 
     `Config` is a frozen msgspec.Struct; its presets are TOML tables in baselines/presets/<name>.toml. A method that
-    reads files beside the clip has ``inputs(config, case)`` too, a digest of them, so that other files are another run.
+    reads files beside the clip has ``inputs(config, case)`` too, a digest of them, so that other files are another run;
+    one that cannot run with every config has ``require(config, cases)``, which says so before anything is fitted.
     """
 
     info: MethodInfo

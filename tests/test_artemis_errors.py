@@ -279,6 +279,13 @@ def test_empty_matte_of_an_input_image(animal: Path) -> None:
     assert not Artemis(animal).load("cat/walk", fixed)[1].held_out[3].mask.any()
 
 
+def test_a_motion_without_any_animal_is_an_error(animal: Path) -> None:
+    for path in animal.glob("img/walk/*/*_alpha.png"):
+        cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH), np.uint8))
+    errors = [(finding.path, finding.message) for finding in Artemis(animal).check() if finding.level == "error"]
+    assert errors == [(str(animal / "img" / "walk"), "no matte shows an animal that could be an input")]
+
+
 def test_no_such_folder_and_not_an_animal(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"nowhere: expected an animal's folder or a folder of animals, got no such"):
         Artemis(tmp_path / "nowhere")

@@ -10,9 +10,10 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from artemis_animals import write_animal
 from external_program import CPU, UPPER, OneCase, bodies, coarse_grid, fit, settings
 
-from rewild4d import runner
+from rewild4d import cli, runner
 from rewild4d.baselines.external import External, ExternalConfig
 from rewild4d.baselines.external_folder import crop_box, program_digest, write_clip
 from rewild4d.conformance import tiny_case
@@ -184,6 +185,28 @@ WHOLE = "--command: expected whole words and braces"
 def test_bad_settings_are_one_sentence(case: Case, tmp_path: Path, changes: dict[str, str], sentence: str) -> None:
     with pytest.raises(UserError, match=re.escape(sentence)):
         fit(case, settings(tmp_path, "plain", [], **changes))
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([], "external: expected either --command"),
+        (["--command", "prog {clip}"], FOLDERS),
+        (["--command", "/no/such/program {clip} {out}"], "that can be started, but '/no/such/program': No such file"),
+        (["--folder", "/no/such/{case}"], "expected the folder of a program's results, but there is no such folder"),
+        (["--folder", "/tmp", "--profile", "dreammesh"], "unknown profile 'dreammesh'. Did you mean 'dreammesh4d'?"),
+    ],
+)
+def test_settings_that_suit_no_case_end_a_run_before_it_begins(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, words: list[str], sentence: str
+) -> None:
+    data = write_animal(tmp_path / "cat")
+    run = ["run", "--method", "external", "--dataset", "artemis", "--data", str(data), "--out", str(tmp_path / "runs")]
+    with pytest.raises(SystemExit) as stop:
+        cli.main([*run, *words])
+    err = capsys.readouterr().err
+    assert stop.value.code == 2 and sentence in err and len(err.strip().splitlines()) == 1
+    assert not list((tmp_path / "runs").rglob("*.*"))
 
 
 def test_a_program_that_does_not_end_is_ended(case: Case, tmp_path: Path) -> None:

@@ -337,10 +337,8 @@ def test_the_variation_in_double_precision_is_the_kernels(case: Case) -> None:
     double = copy.deepcopy(single).double()
     points = case.prior.vertices[::40]
     found = [field(points.to(field.residual), True)[1] for field in (single, double)]
-    for variation in found:
-        variation.backward()
     torch.testing.assert_close(found[0].double(), found[1], atol=0, rtol=1e-5)
-    slopes = [field.residual.grad for field in (single, double)]
+    slopes = torch.autograd.grad(found, (single.residual, double.residual))
     torch.testing.assert_close(*slopes, atol=1e-9, rtol=1e-4, check_dtype=False)
 
 
@@ -348,6 +346,5 @@ def test_skinning_that_does_not_learn_stays(case: Case) -> None:
     for learn in (True, False):
         settings = SETTINGS | {"skinning": SETTINGS["skinning"] | {"learn": learn}, "poses": {"skinning_start": 0.0}}
         made = training(case, msgspec.convert(settings, GartConfig))
-        for index in range(3):
-            made.step(index)
+        made.step(0)
         assert bool(made.model.field.residual.any()) == learn

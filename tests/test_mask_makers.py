@@ -77,7 +77,7 @@ def test_any_program_through_folders(tmp_path: Path) -> None:
         ("mytool {frames} {out}", "expected a command line with {frames}, {masks}, {boxes} in it"),
         ("/no/such/tool {frames} {masks}", "/no/such/tool: expected a program that can be run, but: No such file"),
         ("sh -c 'echo no GPU >&2; exit 3' {frames} {masks}", "ended with status 3 and said: no GPU"),
-        ("sh -c 'true' {frames} {masks}", "expected masks"),
+        ("sh -c 'true' {frames} {masks}", "sh: expected a mask for each of 12 frames, but it wrote none"),
         ("sh -c 'cp $0/00000.png $1/' {frames} {masks}", "expected a mask for each of 12 frames, but 11 are missing"),
     ],
 )

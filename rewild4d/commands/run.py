@@ -133,6 +133,8 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
     names = reader.cases(protocol.selection)
     preferred = getattr(reader, "default_cases", None)
     cases = choose_cases(names, options.case or (preferred(protocol.selection) if preferred else ()))
+    if require := getattr(load_method(options.method), "require", None):
+        require(config, cases)
     floors = [floor_entry(name) for name in protocol.floors if name != options.method]
     entry = Entry(options.method, options.preset, config, tuple(dict.fromkeys(options.seeds)))
     prior = choose_prior(options.prior, options.preset, reader, options)
