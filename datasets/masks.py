@@ -113,7 +113,7 @@ def open_masks(files: Sequence[Path | None]) -> MaskFiles:
 def read_values(file: Path, indexed: bool = False) -> np.ndarray:
     """The values of a mask file, uint8 [h, w]: as they are stored, of a palette its greys or its indices.
 
-    An alpha channel that is not opaque everywhere is the mask; colours are taken as foreground unless nearly black; 16
+    An alpha channel that varies, or is zero everywhere, is the mask; colours are taken as foreground unless nearly black; 16
     bits become 8 where they are shades, and so do fractions up to 1.
 
     Args:
@@ -168,8 +168,9 @@ def _opened(file: Path, what: str = "a mask image") -> Iterator[Image.Image]:
 
 
 def _from_channels(values: np.ndarray, mode: str) -> np.ndarray:
-    if mode in ("LA", "RGBA", "PA") and values[..., -1].min() < 255:
-        return values[..., -1]
+    alpha = values[..., -1]
+    if mode in ("LA", "RGBA", "PA") and (alpha.min() < alpha.max() or not alpha.any()):
+        return alpha
     return shades(values[..., :3] if mode in ("RGB", "RGBA") else values[..., :1])
 
 

@@ -30,7 +30,7 @@ TWIN = 0.5
 """A second part above this share of the largest may be a second animal."""
 LOST = 0.02
 """Share of the animal outside the crop of a held-out frame above which it is told."""
-_CACHE_VERSION = "2"
+_CACHE_VERSION = "3"
 
 Masks = Callable[[], Iterator[np.ndarray | None]]
 
