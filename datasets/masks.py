@@ -113,8 +113,8 @@ def open_masks(files: Sequence[Path | None]) -> MaskFiles:
 def read_values(file: Path, indexed: bool = False) -> np.ndarray:
     """The values of a mask file, uint8 [h, w]: as they are stored, of a palette its greys or its indices.
 
-    An alpha channel that varies, or is zero everywhere, is the mask; colours are taken as foreground unless nearly black; 16
-    bits become 8 where they are shades, and so do fractions up to 1.
+    An alpha channel that varies, or is zero everywhere, is the mask; colours are taken as foreground unless nearly
+    black; 16 bits become 8 where they are shades, and so do fractions up to 1.
 
     Args:
         file: an image.
