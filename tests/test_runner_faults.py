@@ -150,7 +150,7 @@ def test_evaluate_makes_a_failed_record_whole(plan: runner.Plan, monkeypatch: py
         patch.setattr(runner, "evaluate", full)
         (failed,) = runner.execute(plan)
     assert failed.status == "failed"
-    monkeypatch.setattr("rewild4d.commands.evaluate.load_dataset", lambda _: lambda _: plan.reader)
+    monkeypatch.setattr("rewild4d.commands.shared.load_dataset", lambda _: lambda _: plan.reader)
     # The command scores by the protocol of the package, which asks for more than this plan.
     monkeypatch.setattr("rewild4d.commands.evaluate.find_protocol", lambda *_: plan.protocol)
     folder = only_job(plan).folder
