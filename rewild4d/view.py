@@ -78,9 +78,9 @@ def comparison(reconstruction: Reconstruction, clip: Clip, truth: Truth) -> Tens
 def canonical(splats: Splats, weights: Tensor) -> Tensor:
     """Canonical Gaussians from the side, obliquely, the front and above, each part in its own colour, [3, H, W]."""
     hues = np.array([[((part * 97) % 180, 200, 235) for part in range(weights.shape[1])]], np.uint8)
-    palette = torch.from_numpy(cv2.cvtColor(hues, cv2.COLOR_HSV2RGB)[0]).float() / 255
+    palette = torch.from_numpy(cv2.cvtColor(hues, cv2.COLOR_HSV2RGB)[0]).to(weights) / 255
     colored = Splats(splats.means, splats.quats, splats.scales, splats.opacities, (weights @ palette)[:, None])
-    center = splats.means.double().median(0).values
+    center = splats.means.double().median(0).values.cpu()
     up, ahead = torch.tensor((0.0, 1.0, 0.0)).double(), torch.tensor((0.0, 0.0, 1.0)).double()
     focal = PANEL * 1.9
     intrinsics = torch.tensor(((focal, 0, PANEL / 2), (0, focal, PANEL / 2), (0, 0, 1.0))).double()

@@ -101,12 +101,12 @@ def test_interpreted_kernels_draw_the_background_of_an_empty_scene(
 
 @needs_triton
 @pytest.mark.parametrize("capability", [80, 90])
-@pytest.mark.parametrize("name", ["blend", "blend_backward"])
+@pytest.mark.parametrize("name", ["project", "project_backward", "list_entries", "gather", "blend", "blend_backward"])
 def test_kernels_compile_without_a_gpu(
     name: str, capability: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
-    compiled = compile_kernel(name, capability, CHANNELS=3, PART=4)
+    compiled = compile_kernel(name, capability)
     assert f".target sm_{capability}" in compiled.asm["ptx"]
     assert compiled.asm["cubin"][:4] == b"\x7fELF"
     # A sum over channels that Triton turns into a product runs in TF32; the interpreter cannot see that.
@@ -120,20 +120,33 @@ def test_kernels_compile_without_a_gpu(
         assert stack <= 64
 
 
-def compile_kernel(name: str, capability: int, **constants: int) -> Any:
+TYPES = {
+    **dict.fromkeys(("keys", "first_keys", "starts", "slots", "ends"), "*i64"),
+    **dict.fromkeys(("tiles", "wides", "owners", "entries"), "*i32"),
+    **{"v_cameras": "*fp64", "eps2d": "fp32", "near": "fp32"},
+}
+"""Of all arguments that are neither sizes nor single precision arrays."""
+CONSTANTS = {"CHANNELS": 3, "PART": 4, "ANTIALIAS": True, "CAMERAS": True}
+
+
+def compile_kernel(name: str, capability: int) -> Any:
     from triton import compile
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
 
-    from rewild4d.rasterizer import cuda, triton_blend
+    from rewild4d.rasterizer import cuda, triton_blend, triton_project, triton_tiles
 
-    kernel = getattr(triton_blend, name)
+    modules = (triton_project, triton_tiles, triton_blend)
+    module = next(module for module in modules if hasattr(module, name))
+    kernel, launch = getattr(module, name), cuda.LAUNCHES[name]
     if not hasattr(kernel, "cache_key"):
         pytest.skip("TRITON_INTERPRET is set: there is nothing to compile")
-    types = {"starts": "*i64", "entries": "*i64", "slots": "*i64"} | dict.fromkeys(triton_blend.SIZES, "i32")
-    signature = {word: "constexpr" if word in constants else types.get(word, "*fp32") for word in kernel.arg_names}
+    constants = CONSTANTS | {word: value for word, value in launch.items() if word.isupper()}
     used = {word: value for word, value in constants.items() if word in kernel.arg_names}
-    return compile(ASTSource(kernel, signature, used), GPUTarget("cuda", capability, 32), options=cuda.LAUNCH)
+    types = TYPES | dict.fromkeys(module.SIZES, "i32")
+    signature = {word: "constexpr" if word in used else types.get(word, "*fp32") for word in kernel.arg_names}
+    options = {word: value for word, value in launch.items() if not word.isupper()}
+    return compile(ASTSource(kernel, signature, used), GPUTarget("cuda", capability, 32), options=options)
 
 
 @needs_gpu

@@ -72,8 +72,7 @@ def rasterize(
             )
         background = background.to(means).expand(views, channels)
         named["background"] = background
-    _check_finite(named)
-    _check_range(named)
+    _check_values(named)
     if not (eps2d >= 0 and near > 0):
         raise ValueError(f"expected eps2d >= 0 and near > 0, got eps2d={eps2d} and near={near}.")
     render = backends.load(backends.resolve(backend, means.device, means.dtype))
@@ -110,7 +109,34 @@ def _check_cameras(world_to_camera: Tensor, intrinsics: Tensor, width: int, heig
         raise ValueError(f"intrinsics: expected shape [{views}, 3, 3], got {list(intrinsics.shape)}.")
     if width < 1 or height < 1:
         raise ValueError(f"expected an image of at least one pixel, got {width} x {height}.")
-    for view, matrix in enumerate(intrinsics.tolist()):
+
+
+def _check_values(named: dict[str, Tensor]) -> None:
+    """Pinholes, and that all is finite and not too large."""
+    if named["means"].device.type == "cpu":
+        _check_pinholes(named["intrinsics"].tolist())
+    else:
+        largest, pinholes = fetch(named)
+        _check_pinholes(pinholes)
+        if largest <= MOST_FEATURE:  # NaN is not
+            return
+    _check_finite(named)
+    _check_range(named)
+
+
+def fetch(named: dict[str, Tensor]) -> tuple[float, list[list[list[float]]]]:
+    """The largest magnitude of all, NaN if anything is, and the intrinsics: in one go, as each waits for the GPU."""
+    filled = [tensor.detach() for tensor in named.values() if tensor.numel()]
+    norms = torch.stack([*torch._foreach_norm(filled, math.inf)])
+    # A maximum of Python's, or of some of torch's kernels, passes over NaN; a sum does not.
+    largest = torch.where(norms.sum().isfinite(), norms.amax(), math.nan)
+    flat = torch.cat((largest[None], named["intrinsics"].detach().flatten())).tolist()
+    rows = [flat[place : place + 3] for place in range(1, len(flat), 3)]
+    return flat[0], [rows[place : place + 3] for place in range(0, len(rows), 3)]
+
+
+def _check_pinholes(matrices: list[list[list[float]]]) -> None:
+    for view, matrix in enumerate(matrices):
         (fx, skew, _), (lower, fy, _), last = matrix
         if not (fx > 0 and fy > 0 and skew == 0 and lower == 0 and last == [0, 0, 1]) and all(
             map(math.isfinite, sum(matrix, []))

@@ -1,6 +1,5 @@
-"""The CUDA backend: projection and tile lists in torch, blending as Triton kernels behind one autograd function."""
+"""The CUDA backend: Triton kernels behind two autograd functions, and one sort of torch's between them."""
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,17 +8,28 @@ import triton
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rewild4d.rasterizer import ewa, triton_blend
+from rewild4d.rasterizer import triton_blend, triton_project, triton_tiles
 from rewild4d.rasterizer.conventions import RasterInfo
-from rewild4d.rasterizer.projection import HALF_LOG2_E
-from rewild4d.transforms import quat_to_matrix
 
 TILE, MOMENTS = triton_blend.SIDE.value, triton_blend.MOMENTS.value
-LAUNCH = {"num_warps": 8, "enable_fp_fusion": True}
-"""A thread a pixel: the scans along a group of Gaussians then stay within one thread."""
+BLOCK, RECORD, CAMERA = triton_project.BLOCK.value, triton_project.RECORD.value, triton_project.CAMERA.value
+OWNERS, ENTRIES = triton_tiles.OWNERS.value, triton_tiles.ENTRIES.value
+DEPTH_BITS = triton_project.DEPTH_BITS.value
+MOST_TILES = 1 << (63 - DEPTH_BITS)
+LAUNCHES: dict[str, dict[str, Any]] = {
+    "project": {"num_warps": 2},
+    "list_entries": {"num_warps": 4},
+    "blend": {"GROUP": 8, "num_warps": 4},
+    "blend_backward": {"GROUP": 8, "num_warps": 4},
+    "gather": {"num_warps": 1},
+    "project_backward": {"num_warps": 2},
+}
+"""How each kernel runs. Blending takes a thread a pixel: scans along a group of Gaussians stay within one thread."""
 MOST_CHANNELS = 16
 """What one program blends; for more of them the tile is walked again."""
-LN2 = math.log(2.0)
+
+Options = tuple[int, int, float, bool, float]
+"""Width, height, eps2d, antialias, near."""
 
 
 def rasterize(
@@ -37,81 +47,128 @@ def rasterize(
     antialias: bool,
     near: float,
 ) -> tuple[Tensor, Tensor, RasterInfo]:
-    """Same as `rewild4d.rasterizer.rasterize`, on checked float32 input on one GPU; ``background`` is [V, C]."""
-    # Double precision, as in the CPU backend: the determinant of a needle cancels, and memory is what projecting costs.
-    half = quat_to_matrix(quats.double()) * scales.double()[:, None, :]
-    centres, cov2d, depths, compensation = ewa.project(
-        means.double(), half @ half.mT, world_to_camera.double(), intrinsics.double(), width, height, eps2d
-    )
-    seen = opacities.double() * (compensation if antialias else torch.ones_like(compensation))
-    radii, extents = ewa.reach(centres, cov2d, depths, seen, width, height, near)
-    records = _records(cov2d, seen, radii > 0).to(means.dtype)
-    means2d = centres.to(means.dtype)
-    if means2d.requires_grad:
-        means2d.retain_grad()
-    if background is None:
-        background = features.new_zeros(len(world_to_camera), features.shape[1])
-    lists = list_tiles(centres, extents, depths, radii > 0, width, height)
-    image, alpha = _Blend.apply(means2d, records, features, background, lists, width, height)
-    return image, alpha, RasterInfo(radii.to(means.dtype), means2d)
+    """Same as `rewild4d.rasterizer.rasterize`, on checked float32 input on one GPU; ``background`` is [V, C].
+
+    Raises:
+        ValueError: more tiles than sorting keys have room for.
+    """
+    views, across, down = len(world_to_camera), -(-width // TILE), -(-height // TILE)
+    if views * across * down >= MOST_TILES:
+        raise ValueError(f"expected fewer than {MOST_TILES} tiles of {TILE} x {TILE} pixels in all views together.")
+    inputs = (means, quats, scales, opacities, world_to_camera, intrinsics)
+    contiguous = (tensor.contiguous() for tensor in inputs)
+    with torch.cuda.device_of(means):
+        means2d, records, radii, *rectangles = _Project.apply(*contiguous, (width, height, eps2d, antialias, near))
+        if means2d.requires_grad:
+            means2d.retain_grad()
+        if background is None:
+            background = features.new_zeros(views, features.shape[1])
+        lists = _list_tiles(*rectangles, views, across, down)
+        blended = (means2d, records, features.contiguous(), background.contiguous())
+        image, alpha = _Blend.apply(*blended, lists, width, height)
+    return image, alpha, RasterInfo(radii, means2d)
 
 
-def _records(cov2d: Tensor, opacities: Tensor, shown: Tensor) -> Tensor:
-    """Coefficients of dx^2, dx dy, dy^2 and the constant of log2 alpha, [V, N, 4]; harmless where not shown."""
-    xx, xy, yy = cov2d[..., 0, 0], cov2d[..., 0, 1], cov2d[..., 1, 1]
-    factor = HALF_LOG2_E / torch.where(shown, ewa.determinant(cov2d), 1.0)
-    return torch.stack((-factor * yy, 2 * factor * xy, -factor * xx, torch.where(shown, opacities, 1.0).log2()), dim=-1)
+class _Project(torch.autograd.Function):
+    """World to image: centres [V, N, 2] and records [V, N, 4]; without gradients radii, keys, wides, tiles [V, N]."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        world_to_camera: Tensor,
+        intrinsics: Tensor,
+        options: Options,
+    ) -> tuple[Tensor, ...]:
+        views, count = len(world_to_camera), len(means)
+        width, height, eps2d, antialias, near = options
+        inputs = (means, quats, scales, opacities, world_to_camera, intrinsics)
+        floats = means.new_empty(views * count * (RECORD + 3))
+        means2d, records, radii = floats.split((2 * views * count, RECORD * views * count, views * count))
+        means2d, records = means2d.view(views, count, 2), records.view(views, count, RECORD)
+        radii, keys = radii.view(views, count), means.new_empty(views, count, dtype=torch.int64)
+        wides, tiles = means.new_empty(2, views, count, dtype=torch.int32)
+        outputs = (means2d, records, radii, keys, wides, tiles)
+        triton_project.project[(triton.cdiv(count, BLOCK), views)](
+            *inputs, *outputs, width, height, -(-width // TILE), -(-height // TILE), count, eps2d, near,
+            ANTIALIAS=antialias, **LAUNCHES["project"],
+        )  # fmt: skip
+        ctx.save_for_backward(*inputs, radii)
+        ctx.options = options
+        ctx.mark_non_differentiable(*outputs[2:])
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_means2d: Tensor, g_records: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        *inputs, radii = ctx.saved_tensors
+        world_to_camera, intrinsics = inputs[4:]
+        (views, count), (width, height, eps2d, antialias, _) = radii.shape, ctx.options
+        blocks, with_cameras = triton.cdiv(count, BLOCK), any(ctx.needs_input_grad[4:6])
+        gradients = [torch.empty_like(tensor) for tensor in inputs[:4]]
+        v_cameras = radii.new_empty(blocks if with_cameras else 0, views, CAMERA, dtype=torch.float64)
+        with torch.cuda.device_of(radii):
+            triton_project.project_backward[(blocks,)](
+                *inputs, radii, g_means2d.contiguous(), g_records.contiguous(), *gradients, v_cameras,
+                width, height, views, count, eps2d, ANTIALIAS=antialias, CAMERAS=with_cameras,
+                **LAUNCHES["project_backward"],
+            )  # fmt: skip
+        v_world_to_camera = v_intrinsics = None
+        if with_cameras:
+            totals = v_cameras.sum(dim=0).to(radii.dtype)
+            v_world_to_camera, v_intrinsics = torch.zeros_like(world_to_camera), torch.zeros_like(intrinsics)
+            v_world_to_camera[:, :3] = totals[:, :12].view(views, 3, 4)
+            v_intrinsics[:, (0, 1, 0, 1), (0, 1, 2, 2)] = totals[:, 12:]
+        return *gradients, v_world_to_camera, v_intrinsics, None
 
 
 @dataclass(frozen=True)
-class TileLists:
-    """Which Gaussian touches which tile, front to back.
+class _TileLists:
+    """Which Gaussian touches which tile, front to back. A row is a view and a Gaussian: view * N + Gaussian.
 
     Attributes:
         tiles: tiles across and down.
         starts: where the list of each tile of each view begins in ``entries``, and their end, [V * tiles + 1].
-        entries: view * N + Gaussian, tile by tile, nearest first, [E].
-        slots: each entry's own place in an order that has the entries of one Gaussian side by side, [E].
-        visible: view * N + Gaussian of all that can be drawn, in that order, [M].
-        counts: how many tiles each of them touches, [M].
+        entries: rows, tile by tile, nearest first, [E].
+        slots: each entry's own place in an order that has the entries of one row side by side, [E].
+        counts: entries of each row, [V, N].
+        ends: their running sum, [V * N].
     """
 
     tiles: tuple[int, int]
     starts: Tensor
     entries: Tensor
     slots: Tensor
-    visible: Tensor
     counts: Tensor
+    ends: Tensor
 
 
 @torch.no_grad()
-def list_tiles(centres: Tensor, extents: Tensor, depths: Tensor, shown: Tensor, width: int, height: int) -> TileLists:
-    """Sort by depth (ties by index), repeat each Gaussian over its rectangle of tiles, sort by tile; both sorts stable.
+def _list_tiles(keys: Tensor, wides: Tensor, counts: Tensor, views: int, across: int, down: int) -> _TileLists:
+    """Repeat each row over its rectangle of tiles, and sort by tile, then depth, then row.
 
     Args:
-        centres: in pixels, [V, N, 2].
-        extents: half sides of the bounding boxes in pixels, [V, N, 2].
-        depths: along the camera's z, [V, N].
-        shown: which to list, [V, N].
-        width: image width in pixels.
-        height: image height in pixels.
+        keys: of the first tile of each row, see `triton_project.project`, [V, N].
+        wides: tiles across each rectangle, [V, N].
+        counts: tiles of each rectangle, [V, N].
+        views: V.
+        across: tiles across an image.
+        down: tiles down an image.
     """
-    across, down = -(-width // TILE), -(-height // TILE)
-    view, index = shown.nonzero(as_tuple=True)
-    order = depths[view, index].argsort(stable=True)
-    view, index = view[order], index[order]
-    middle, half = centres[view, index], extents[view, index] * 1.0001  # the kernel works in single precision
-    first = (middle - half - 0.5).ceil().clamp_min(0).long() // TILE
-    last = torch.minimum((middle + half - 0.5).floor(), middle.new_tensor((width - 1, height - 1))).long() // TILE
-    span = (last - first + 1).clamp_min(0)
-    counts = span.prod(dim=-1)
-    owner = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
-    rank = torch.arange(len(owner), device=counts.device) - (counts.cumsum(0) - counts)[owner]
-    column, row = first[owner, 0] + rank % span[owner, 0], first[owner, 1] + rank // span[owner, 0]
-    tiles, slots = ((view[owner] * down + row) * across + column).int().sort(stable=True)
-    starts = torch.searchsorted(tiles, torch.arange(len(shown) * down * across + 1, device=tiles.device).int())
-    visible = view * shown.shape[1] + index
-    return TileLists((across, down), starts, visible[owner[slots]], slots, visible, counts)
+    rows = counts.numel()
+    ends = counts.flatten().cumsum(0)
+    total = int(ends[-1]) if rows else 0
+    entry_keys, owners = keys.new_empty(total), counts.new_empty(total)
+    triton_tiles.list_entries[(triton.cdiv(total, ENTRIES),)](
+        ends, counts, wides, keys, entry_keys, owners, total, rows, rows.bit_length(), across,
+        **LAUNCHES["list_entries"],
+    )  # fmt: skip
+    entry_keys, slots = entry_keys.sort(stable=True)
+    first_keys = torch.arange(0, (views * across * down + 1) << DEPTH_BITS, 1 << DEPTH_BITS, device=keys.device)
+    return _TileLists((across, down), torch.searchsorted(entry_keys, first_keys), owners[slots], slots, counts, ends)
 
 
 class _Blend(torch.autograd.Function):
@@ -124,20 +181,17 @@ class _Blend(torch.autograd.Function):
         records: Tensor,
         features: Tensor,
         background: Tensor,
-        lists: TileLists,
+        lists: _TileLists,
         width: int,
         height: int,
     ) -> tuple[Tensor, Tensor]:
         views, (count, channels) = len(records), features.shape
         image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
-        features, background = features.contiguous(), background.contiguous()
         part = min(MOST_CHANNELS, triton.next_power_of_2(channels))
-        grid = (len(lists.starts) - 1, -(-channels // part))
-        with torch.cuda.device_of(records):
-            triton_blend.blend[grid](
-                lists.starts, lists.entries, means2d, records, features, background, image, alpha,
-                width, height, *lists.tiles, count, CHANNELS=channels, PART=part, **LAUNCH,
-            )  # fmt: skip
+        triton_blend.blend[(len(lists.starts) - 1, triton.cdiv(channels, part))](
+            lists.starts, lists.entries, means2d, records, features, background, image, alpha,
+            width, height, *lists.tiles, count, CHANNELS=channels, PART=part, **LAUNCHES["blend"],
+        )  # fmt: skip
         ctx.save_for_backward(means2d, records, features, image, alpha)
         ctx.lists = lists
         return image, alpha
@@ -146,22 +200,20 @@ class _Blend(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, g_image: Tensor, g_alpha: Tensor) -> tuple[Tensor | None, ...]:
         means2d, records, features, image, alpha = ctx.saved_tensors
-        lists: TileLists = ctx.lists
+        lists: _TileLists = ctx.lists
         views, channels, height, width = image.shape
+        count, part = len(features), min(MOST_CHANNELS, triton.next_power_of_2(channels))
         sums = records.new_zeros(len(lists.slots), MOMENTS + channels)
+        gradients = [torch.empty_like(tensor) for tensor in (means2d, records, features)]
         with torch.cuda.device_of(records):
             triton_blend.blend_backward[(len(lists.starts) - 1,)](
                 lists.starts, lists.entries, lists.slots, means2d, records, features, image, alpha,
                 g_image.contiguous(), g_alpha.contiguous(), sums,
-                width, height, *lists.tiles, len(features), CHANNELS=channels, **LAUNCH,
+                width, height, *lists.tiles, count, CHANNELS=channels, **LAUNCHES["blend_backward"],
             )  # fmt: skip
-        total = records.new_zeros(views * len(features), MOMENTS + channels)
-        if len(lists.visible):
-            total[lists.visible] = torch.segment_reduce(sums, "sum", lengths=lists.counts, axis=0, unsafe=True)
-        total = total.unflatten(0, records.shape[:2])
-        m, mx, my, mxx, mxy, myy = total[..., :MOMENTS].unbind(-1)
-        xx, xy, yy = records[..., :3].unbind(-1)
-        v_means2d = -LN2 * torch.stack((2 * xx * mx + xy * my, 2 * yy * my + xy * mx), dim=-1)
-        v_records = LN2 * torch.stack((mxx, mxy, myy, m), dim=-1)
-        v_background = (g_image * (1 - alpha)).sum(dim=(2, 3))
-        return v_means2d, v_records, total[..., MOMENTS:].sum(dim=0), v_background, None, None, None
+            triton_tiles.gather[(triton.cdiv(count, OWNERS), triton.cdiv(channels, part))](
+                lists.ends, lists.counts, sums, records, *gradients, views, count,
+                CHANNELS=channels, PART=part, **LAUNCHES["gather"],
+            )  # fmt: skip
+        v_background = (g_image * (1 - alpha)).sum(dim=(2, 3)) if ctx.needs_input_grad[3] else None
+        return *gradients, v_background, None, None, None

@@ -16,9 +16,8 @@ from rewild4d.rasterizer import conventions, projection
 SIDE = tl.constexpr(16)
 """A tile is 16 x 16 pixels."""
 PIXELS = tl.constexpr(256)
-GROUP = tl.constexpr(16)
 MOMENTS = tl.constexpr(6)
-"""Sums of q, q dx, q dy, q dx^2, q dx dy, q dy^2 that come before the channel sums in a slot, q = dL/dalpha alpha."""
+"""Sums of q, q t, q u, q t^2, q t u, q u^2 that come before the channel sums in a slot, q = dL/dalpha alpha."""
 
 _MAX_ALPHA = tl.constexpr(conventions.MAX_ALPHA)
 _WEAKEST = tl.constexpr(projection.LOG2_MIN_ALPHA)
@@ -46,20 +45,20 @@ def _alphas(
     records: tl.tensor,
     x: tl.tensor,
     y: tl.tensor,
+    GROUP: tl.constexpr,
 ) -> tuple:
-    """The group's Gaussians and which are any, [G]; offsets, log2 of the uncapped alpha, and alpha, [G, P]."""
+    """The group's Gaussians and which are any, [G]; t, u, log2 of the uncapped alpha, and alpha, [G, P]."""
     place = first + tl.arange(0, GROUP)
     real = place < end
     n = tl.load(entries + place, real, 0)
     dx = (x + 0.5)[None, :] - tl.load(centres + n * 2, real, 0.0)[:, None]
     dy = (y + 0.5)[None, :] - tl.load(centres + n * 2 + 1, real, 0.0)[:, None]
-    xx = tl.load(records + n * 4, real, 0.0)[:, None]
-    xy = tl.load(records + n * 4 + 1, real, 0.0)[:, None]
-    yy = tl.load(records + n * 4 + 2, real, 0.0)[:, None]
-    top = tl.load(records + n * 4 + 3, real, -1000.0)[:, None]
-    exponent = top + (xx * dx + xy * dy) * dx + yy * dy * dy
+    along_x = tl.load(records + n * 4, real, 0.0)[:, None]
+    along_y = tl.load(records + n * 4 + 1, real, 0.0)[:, None]
+    t, u = along_x * dx + along_y * dy, tl.load(records + n * 4 + 2, real, 0.0)[:, None] * dy
+    exponent = tl.load(records + n * 4 + 3, real, -1000.0)[:, None] - (t * t + u * u)
     alpha = tl.where(exponent >= _WEAKEST, tl.minimum(tl.exp2(exponent), _MAX_ALPHA), 0.0)
-    return n, real, dx, dy, exponent, alpha
+    return n, real, t, u, exponent, alpha
 
 
 @triton.jit
@@ -89,6 +88,7 @@ def blend(
     count: tl.tensor,
     CHANNELS: tl.constexpr,
     PART: tl.constexpr,
+    GROUP: tl.constexpr,
 ) -> None:
     """Fill image [V, C, h, w] and alpha [V, 1, h, w]; program (tile, part of the channels)."""
     tile = tl.program_id(0)
@@ -100,7 +100,7 @@ def blend(
     through = left
     total = tl.zeros((PART, PIXELS), tl.float32)
     while (first < end) & (tl.max(left, 0) > _LEAST_LEFT):
-        n, real, _, _, _, alpha = _alphas(entries, first, end, centres, records, x, y)
+        n, real, _, _, _, alpha = _alphas(entries, first, end, centres, records, x, y, GROUP)
         after, weight = _weights(alpha, left)
         place = (n - view * count)[:, None] * CHANNELS + channel[None, :]
         shade = tl.load(features + place, real[:, None] & real_channel[None, :], 0.0)
@@ -136,6 +136,7 @@ def blend_backward(
     down: tl.tensor,
     count: tl.tensor,
     CHANNELS: tl.constexpr,
+    GROUP: tl.constexpr,
 ) -> None:
     """Fill the slots' rows of the zeroed sums [E, 6 + C]; program (tile).
 
@@ -155,7 +156,7 @@ def blend_backward(
         slope = tl.load(g_image + plane + channel * area, inside, 0.0)
         behind += slope * tl.load(image + plane + channel * area, inside, 0.0)
     while (first < end) & (tl.max(left, 0) > _LEAST_LEFT):
-        n, real, dx, dy, exponent, alpha = _alphas(entries, first, end, centres, records, x, y)
+        n, real, t, u, exponent, alpha = _alphas(entries, first, end, centres, records, x, y, GROUP)
         after, weight = _weights(alpha, left)
         row = sums + tl.load(slots + first + tl.arange(0, GROUP), real, 0) * (MOMENTS + CHANNELS)
         shade = features + (n - view * count) * CHANNELS
@@ -168,13 +169,13 @@ def blend_backward(
         rest = behind[None, :] - tl.cumsum(drawn, 0)
         # alpha dL/dalpha, where the pixel took this Gaussian and the cap did not hold it.
         pull = tl.where((weight > 0.0) & (exponent <= _STRONGEST), drawn - rest * (alpha / (1.0 - alpha)), 0.0)
-        pull_x, pull_y = pull * dx, pull * dy
+        pull_t, pull_u = pull * t, pull * u
         tl.store(row, tl.sum(pull, 1), real)
-        tl.store(row + 1, tl.sum(pull_x, 1), real)
-        tl.store(row + 2, tl.sum(pull_y, 1), real)
-        tl.store(row + 3, tl.sum(pull_x * dx, 1), real)
-        tl.store(row + 4, tl.sum(pull_x * dy, 1), real)
-        tl.store(row + 5, tl.sum(pull_y * dy, 1), real)
+        tl.store(row + 1, tl.sum(pull_t, 1), real)
+        tl.store(row + 2, tl.sum(pull_u, 1), real)
+        tl.store(row + 3, tl.sum(pull_t * t, 1), real)
+        tl.store(row + 4, tl.sum(pull_t * u, 1), real)
+        tl.store(row + 5, tl.sum(pull_u * u, 1), real)
         behind -= tl.sum(drawn, 0)
         left = tl.min(after, 0)
         first += GROUP
