@@ -1,5 +1,6 @@
 """Scenes of Gaussians, and their images and gradients, for the rasterizer's tests."""
 
+import math
 import sys
 from typing import Any
 
@@ -61,6 +62,28 @@ def hard_scene(
     return made
 
 
+def spoilt_scenes() -> dict[str, tuple[dict[str, Tensor], str]]:
+    """Inputs that nobody can draw, in single precision, and what is said of each (a pattern), by name."""
+    made: dict[str, tuple[dict[str, Tensor], str]] = {}
+    for name, index, value, said in (
+        ("scales", (3, 1), math.nan, r"scales: expected finite values, got nan at index \[3, 1\]"),
+        ("quats", (1, 0), math.inf, r"quats: expected finite values, got inf at index \[1, 0\]"),
+        ("opacities", (4,), math.inf, r"opacities: expected finite values, got inf at index \[4\]"),
+        ("means", (0, 2), -math.inf, r"means: expected finite values, got -inf at index \[0, 2\]"),
+        ("features", (2, 0), 1e35, r"features: expected magnitudes up to 1.3e\+30, got 1e\+35 at index \[2, 0\]"),
+        ("features", (39, 2), math.nan, r"features: expected finite values, got nan at index \[39, 2\]"),
+        ("background", (1, 2), -1e35, r"background: expected magnitudes up to .* at index \[1, 2\]"),
+        ("world_to_camera", (1, 3, 3), math.nan, r"world_to_camera: .* got nan at index \[1, 3, 3\]"),
+        ("intrinsics", (1, 0, 2), math.nan, r"intrinsics: .* got nan at index \[1, 0, 2\]"),
+        ("intrinsics", (0, 1, 1), -1.0, r"intrinsics\[0\]: .* positive focal lengths"),
+        ("intrinsics", (1, 0, 1), 0.5, r"intrinsics\[1\]: .* positive focal lengths"),
+    ):
+        inputs = {key: tensor.float() for key, tensor in scene(40, 3, 2, 20, 18, seed=1).items()}
+        inputs[name][index] = value
+        made[f"{name}{list(index)} {value}"] = (inputs, said)
+    return made
+
+
 def render(inputs: dict[str, Tensor], width: int, height: int, **options: Any) -> tuple[Tensor, Tensor, RasterInfo]:
     background = inputs.get("background")
     return rasterize(*(inputs[name] for name in NAMES[:-1]), width, height, background=background, **options)
@@ -111,13 +134,16 @@ def image_bytes(seed: int) -> bytes:
 
 
 def main(source: str, target: str) -> None:
-    """Write the single-precision outcomes, by the Triton backend and twice, of a file of cases."""
+    """Write the single-precision outcomes, by Triton and twice, of a file of cases, or what the error says."""
     torch.set_num_threads(1)
     cases = torch.load(source)
-    made = {}
+    made: dict[str, list[dict[str, Tensor]] | str] = {}
     for name, (inputs, width, height, options) in cases.items():
         single = {key: tensor.float() for key, tensor in inputs.items()}
-        made[name] = [outcome(single, width, height, backend="triton", **options) for _ in range(2)]
+        try:
+            made[name] = [outcome(single, width, height, backend="triton", **options) for _ in range(2)]
+        except ValueError as error:
+            made[name] = str(error)
     torch.save(made, target)
 
 

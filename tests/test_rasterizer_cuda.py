@@ -15,14 +15,15 @@ from typing import Any
 import pytest
 import splats
 import torch
-from splats import NAMES, hard_scene, outcome, render, scene
+from splats import NAMES, hard_scene, outcome, render, scene, spoilt_scenes
 from torch import Tensor
 
 from rewild4d.errors import UserError
 from rewild4d.rasterizer import backends, pick_rasterizer, reference, set_default
 
 WIDTH, HEIGHT = 20, 18
-"""Four tiles, three of them cut by the frame."""
+"""Nine tiles, five of them cut by the frame."""
+KERNELS = ["project", "project_backward", "list_entries", "start_tiles", "gather", "blend", "blend_backward"]
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 needs_triton = pytest.mark.skipif(bool(backends._missing("triton")), reason="triton is not installed here")
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU here")
@@ -46,7 +47,7 @@ def cases() -> dict[str, Case]:
     return made
 
 
-CASES = cases()
+CASES, SPOILT = cases(), spoilt_scenes()
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +55,8 @@ def interpreted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict
     """Each case twice through the interpreter, which has to be asked for before Triton is imported: in a process."""
     folder = tmp_path_factory.mktemp("interpreted")
     empty = {f"empty, {count}": (nothing(count), WIDTH, HEIGHT, {}) for count in (0, 5)}
-    torch.save(CASES | empty, folder / "cases.pt")
+    spoilt = {name: (inputs, WIDTH, HEIGHT, {}) for name, (inputs, _) in SPOILT.items()}
+    torch.save(CASES | empty | spoilt, folder / "cases.pt")
     words = [sys.executable, splats.__file__, str(folder / "cases.pt"), str(folder / "made.pt")]
     done = subprocess.run(words, env=os.environ | {"TRITON_INTERPRET": "1"}, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
@@ -100,8 +102,17 @@ def test_interpreted_kernels_draw_the_background_of_an_empty_scene(
 
 
 @needs_triton
+@pytest.mark.parametrize("name", SPOILT)
+def test_the_kernels_themselves_find_bad_numbers(name: str, interpreted: dict[str, Any]) -> None:
+    said = SPOILT[name][1]
+    assert isinstance(interpreted[name], str) and re.match(said, interpreted[name]), interpreted[name]
+
+
+@needs_triton
 @pytest.mark.parametrize("capability", [80, 90])
-@pytest.mark.parametrize("name", ["project", "project_backward", "list_entries", "gather", "blend", "blend_backward"])
+@pytest.mark.parametrize(
+    "name", ["project", "project_backward", "list_entries", "start_tiles", "gather", "blend", "blend_backward"]
+)
 def test_kernels_compile_without_a_gpu(
     name: str, capability: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -167,6 +178,14 @@ def test_gpu_equals_the_reference(name: str, backend: str) -> None:
         image = render(single, width, height, backend=backend, **options)[0].cpu()
         expected = render(inputs, width, height, backend="reference", **options)[0]
         assert (image - expected).square().mean() <= 1e-6, "below 60 dB"
+
+
+@needs_gpu
+@pytest.mark.parametrize("name", SPOILT)
+def test_bad_numbers_on_a_gpu_are_named(name: str) -> None:
+    inputs, said = SPOILT[name]
+    with pytest.raises(ValueError, match=said):
+        render({key: tensor.to(CUDA) for key, tensor in inputs.items()}, WIDTH, HEIGHT)
 
 
 class StubGsplat(ModuleType):

@@ -4,8 +4,8 @@
 
     B  useful blends: pairs (pixel, Gaussian) with alpha >= 1/255 whose pixel is still open, counted exactly
     F  floating point operations of one: 40 forward, 110 forward and backward together
-    R  operations a second: fused multiply-adds on 16-lane vectors on all threads, median over the same rounds of
-       measurement as what is compared with the floor
+    R  operations a second: fused multiply-adds on 16-lane vectors on all threads (on a GPU: in floor_cuda.py), median
+       over the same rounds of measurement as what is compared with the floor
 
 40 and 110 are the operations of a blend of three channels: offset, exponent, exponential, transmittance, and their
 derivatives. Projection, sorting, culling and memory count nothing, so no program can reach the floor.

@@ -1,8 +1,9 @@
-"""Rasterizers to compare with: what installs from PyPI and computes on a CPU, and our own dense definition.
+"""Rasterizers to compare with: what installs from PyPI, and our own dense definition.
 
-Of the splat rasterizers on PyPI only gsplat has parts that run without a GPU: `gsplat.cuda._torch_impl`, the torch
-twin of its kernels. What it takes from CUDA is given here, in its favour: the list of useful (pixel, Gaussian) pairs is
-made beforehand and costs no time, and two functions of nerfacc, which blend along that list, are written in torch.
+On a GPU that is gsplat with its CUDA kernels. On a CPU only gsplat, of the splat rasterizers on PyPI, has parts that
+run: `gsplat.cuda._torch_impl`, the torch twin of its kernels. What it takes from CUDA is given here, in its favour: the
+list of useful (pixel, Gaussian) pairs is made beforehand and costs no time, and two functions of nerfacc, which blend
+along that list, are written in torch.
 """
 
 import math
@@ -127,6 +128,29 @@ def _accumulate(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_r
     terms = weights[:, None] if values is None else weights[:, None] * values
     return terms.new_zeros(n_rays, terms.shape[1]).index_add(0, ray_indices, terms)
 
+
+def _gsplat_kernels(scene: SplatScene) -> Render:
+    try:
+        gsplat = import_module("gsplat")
+        kernels = import_module("gsplat.cuda._backend")._C
+    except ModuleNotFoundError as error:
+        raise NotTimed("not installed: pip install gsplat") from error
+    if kernels is None:
+        raise NotTimed("gsplat is installed, but has no kernels here: it builds them with nvcc, or a wheel has them")
+    cameras = (scene.world_to_camera, scene.intrinsics, scene.size, scene.size)
+
+    def render(gaussians: tuple[Tensor, ...]) -> Tensor:
+        image, _, _ = gsplat.rasterization(*gaussians, *cameras, eps2d=EPS2D, packed=False)
+        return image[0].permute(2, 0, 1)
+
+    return render
+
+
+CUDA_PEERS = (
+    Peer("gsplat", "gsplat", _gsplat_kernels, "called without rewild4d's checks of the input"),
+    Peer("dense torch reference", "", _dense_reference),
+)
+"""Of the Triton backend, on a GPU."""
 
 PEERS = (
     Peer("gsplat's torch twin", "gsplat", _gsplat_twin, "its list of pairs is given and costs no time"),

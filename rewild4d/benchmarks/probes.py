@@ -46,6 +46,19 @@ def raster_rows(count: int, size: int) -> list[Row]:
     return rows
 
 
+def gpu_memory_row(scene: SplatScene) -> Row:
+    """Peak memory of forward and backward on the GPU that a scene is on."""
+    device = scene.intrinsics.device
+    forward_backward(scene)  # kernels are loaded, and torch has its workspaces
+    torch.cuda.synchronize(device)
+    torch.cuda.reset_peak_memory_stats(device)
+    before = torch.cuda.memory_allocated(device)
+    forward_backward(scene)
+    torch.cuda.synchronize(device)
+    found = {"before": before / 2**20, "peak": torch.cuda.max_memory_allocated(device) / 2**20}
+    return _memory_row(found, len(scene), scene.size)
+
+
 def step_row(count: int, size: int, preset: str) -> Row:
     """Peak memory of training steps of `ours`."""
     with progress(f"memory of a step at {size}²", 1) as bar:

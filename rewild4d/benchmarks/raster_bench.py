@@ -19,14 +19,24 @@ from rewild4d.benchmarks.floor import (
 from rewild4d.benchmarks.peers import PEERS, SAME_PSNR, NotTimed, Peer, Render, psnr
 from rewild4d.benchmarks.results import BOTH, FLOOR, FORWARD, OURS, Row, timed_row
 from rewild4d.benchmarks.scenes import SplatScene, splat_scene
-from rewild4d.benchmarks.timing import measure
+from rewild4d.benchmarks.timing import measure, per
 
 Contenders = dict[tuple[str, str], Callable[[], object]]
 """Calls to time, by subject and quantity."""
 
+TURN = 10
+"""Calls in a row on a GPU, which works while the next call is being prepared; then it is waited for."""
+
+CPU = torch.device("cpu")
+
 
 def bench_rasterizer(
-    counts: Sequence[int], sizes: Sequence[int], repeats: int, peers: Sequence[Peer] = PEERS, probe: bool = True
+    counts: Sequence[int],
+    sizes: Sequence[int],
+    repeats: int,
+    peers: Sequence[Peer] = PEERS,
+    probe: bool = True,
+    device: torch.device = CPU,
 ) -> list[Row]:
     """Time every number of Gaussians at every image side.
 
@@ -35,39 +45,74 @@ def bench_rasterizer(
         sizes: sides of the square images in pixels.
         repeats: rounds of measurement for each scene.
         peers: whom to compare with.
-        probe: measure start-up and memory too (of the largest scene), in processes of their own.
+        probe: measure peak memory too (of the largest scene), and on the CPU start-up, in processes of their own.
+        device: CPU, or a CUDA GPU.
     """
     scenes = [(count, size) for count in counts for size in sizes]
     rows: list[Row] = []
     for place, (count, size) in enumerate(scenes, 1):
-        rows += scene_rows(splat_scene(count, size), repeats, peers, f"[{place}/{len(scenes)}] {count:,} at {size}²")
-    return rows + (probes.raster_rows(max(counts), max(sizes)) if probe else [])
+        title = f"[{place}/{len(scenes)}] {count:,} at {size}²"
+        rows += scene_rows(splat_scene(count, size), repeats, peers, title, device)
+    if not probe:
+        return rows
+    if device.type == "cuda":
+        return [*rows, probes.gpu_memory_row(splat_scene(max(counts), max(sizes)).to(device))]
+    return rows + probes.raster_rows(max(counts), max(sizes))
 
 
-def scene_rows(scene: SplatScene, repeats: int, peers: Sequence[Peer], title: str) -> list[Row]:
-    """Everything that is measured on one scene."""
+def scene_rows(
+    scene: SplatScene, repeats: int, peers: Sequence[Peer], title: str, device: torch.device = CPU
+) -> list[Row]:
+    """Everything that is measured on one scene, which is on the CPU."""
     count, size = len(scene), scene.size
-    blends = count_blends(scene)
+    blends, placed = count_blends(scene), scene.to(device)
     rows = [Row(subject="scene", quantity="useful blends", value=blends, unit="1", gaussians=count, size=size)]
-    admitted = {peer: _admit(peer, scene) for peer in peers}
-    contenders = _calls(OURS, lambda gaussians: scene.render(gaussians)[0], scene)
+    admitted = {peer: _admit(peer, placed) for peer in peers}
+    contenders = _calls(OURS, lambda gaussians: placed.render(gaussians)[0], placed)
     for calls, _ in admitted.values():
         contenders |= calls
-    arithmetic: Contenders = {(FLOOR, str(chains)): partial(multiply_adds, chains) for chains in CHAINS}
-    samples = measure(contenders | arithmetic, repeats, title)
+    arithmetic, flops = _arithmetic(device)
+    samples = measure({name: _turn(call, device) for name, call in (contenders | arithmetic).items()}, repeats, title)
+    if device.type == "cuda":
+        samples = {name: per(sample, TURN) for name, sample in samples.items()}
 
     def timed(subject: str, note: str = "") -> list[Row]:
         return [timed_row(*key, samples[key], count, size, note) for key in contenders if key[0] == subject]
 
-    gflops = max(multiply_adds_flops(chains) / samples[FLOOR, str(chains)].median / 1e6 for chains in CHAINS)
+    gflops = max(flops[key] / samples[key].median / 1e6 for key in arithmetic)
     rows.append(Row(subject=FLOOR, quantity="multiply-adds", value=gflops, unit="GFLOP/s", gaussians=count, size=size))
-    for quantity, flops in ((FORWARD, FLOPS_FORWARD), (BOTH, FLOPS_BOTH)):
-        floor = floor_ms(blends, flops, gflops)
+    for quantity, each in ((FORWARD, FLOPS_FORWARD), (BOTH, FLOPS_BOTH)):
+        floor = floor_ms(blends, each, gflops)
         rows.append(Row(subject=FLOOR, quantity=quantity, value=floor, unit="ms", gaussians=count, size=size))
     rows += timed(OURS)
     for peer, (_, found) in admitted.items():
         rows += [*found, *timed(peer.name, peer.note)]
     return rows
+
+
+def _arithmetic(device: torch.device) -> tuple[Contenders, dict[tuple[str, str], int]]:
+    """Multiply-adds to time, and how many operations each call does."""
+    if device.type == "cuda":
+        from rewild4d.benchmarks import floor_cuda  # needs Triton
+
+        key = (FLOOR, str(floor_cuda.CHAINS))
+        return {key: partial(floor_cuda.multiply_adds, device)}, {key: floor_cuda.multiply_adds_flops(device)}
+    keys = {chains: (FLOOR, str(chains)) for chains in CHAINS}
+    calls: Contenders = {key: partial(multiply_adds, chains) for chains, key in keys.items()}
+    return calls, {key: multiply_adds_flops(chains) for chains, key in keys.items()}
+
+
+def _turn(call: Callable[[], object], device: torch.device) -> Callable[[], object]:
+    """What is timed: a call, or on a GPU `TURN` of them and the wait for the last."""
+    if device.type != "cuda":
+        return call
+
+    def turn() -> None:
+        for _ in range(TURN):
+            call()
+        torch.cuda.synchronize(device)
+
+    return turn
 
 
 def _admit(peer: Peer, scene: SplatScene) -> tuple[Contenders, list[Row]]:
@@ -98,7 +143,7 @@ def _admit(peer: Peer, scene: SplatScene) -> tuple[Contenders, list[Row]]:
 
 def _calls(name: str, render: Render, scene: SplatScene) -> Contenders:
     leaves = tuple(tensor.clone().requires_grad_() for tensor in scene.gaussians)
-    gradient = torch.rand(3, scene.size, scene.size, generator=torch.Generator().manual_seed(0))
+    gradient = torch.rand(3, scene.size, scene.size, generator=torch.Generator().manual_seed(0)).to(leaves[0].device)
 
     def forward() -> Tensor:
         with torch.no_grad():

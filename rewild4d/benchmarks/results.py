@@ -10,6 +10,7 @@ import torch
 from rewild4d.benchmarks.timing import Sample
 from rewild4d.files import write_text
 from rewild4d.machine import code_version, machine
+from rewild4d.rasterizer import pick_rasterizer
 
 SCHEMA = 1
 
@@ -17,9 +18,10 @@ OURS, FLOOR = "rewild4d", "arithmetic floor"
 FORWARD, BOTH = "forward", "forward+backward"
 
 
-def this_machine() -> dict[str, str]:
-    """The benchmarks compute on the CPU, with its own backend."""
-    return machine(torch.device("cpu"), "numba")
+def this_machine(device: torch.device | None = None) -> dict[str, str]:
+    """Of a benchmark that computes with the device's own backend, the CPU's where none is given."""
+    device = device or torch.device("cpu")
+    return machine(device, pick_rasterizer("auto", device))
 
 
 class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -108,7 +110,8 @@ def write_result(result: Result, path: Path) -> None:
     write_text(path, to_json(result) + "\n")
 
 
-def default_path(benchmark: str) -> Path:
-    """Where a result goes: named after benchmark, processor and day, so that a day's last run stays."""
-    processor = re.sub(r"[^a-z0-9]+", "-", this_machine()["processor"].lower()).strip("-")
+def default_path(benchmark: str, device: torch.device | None = None) -> Path:
+    """Where a result goes: named after benchmark, processor (or GPU) and day, so that a day's last run stays."""
+    found = this_machine(device)
+    processor = re.sub(r"[^a-z0-9]+", "-", found.get("gpu", found["processor"]).lower()).strip("-")
     return Path("leaderboard", "speed", f"{benchmark}-{processor}-{datetime.now(UTC):%Y-%m-%d}.json")

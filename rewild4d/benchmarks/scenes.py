@@ -61,6 +61,11 @@ class SplatScene:
     def __len__(self) -> int:
         return len(self.gaussians[0])
 
+    def to(self, device: torch.device) -> "SplatScene":
+        """The same scene on a device."""
+        moved = tuple(tensor.to(device) for tensor in self.gaussians)
+        return SplatScene(moved, self.world_to_camera.to(device), self.intrinsics.to(device), self.size)
+
     def render(self, gaussians: tuple[Tensor, ...] | None = None, backend: str = "auto") -> tuple[Tensor, Tensor]:
         """Image [3, size, size] on black and alpha [size, size], of these Gaussians or of others in their place."""
         means, quats, scales, opacities, colors = gaussians or self.gaussians
@@ -117,25 +122,27 @@ def step_config(size: int, gaussians: int, preset: str) -> Config:
     )
 
 
-def training(size: int, gaussians: int, preset: str) -> tuple[Training, int]:
+def training(size: int, gaussians: int, preset: str, device: torch.device | None = None) -> tuple[Training, int]:
     """A main stage of `ours` in its midst, and the index of its next step.
 
     Args:
         size: side of the square frames in pixels.
         gaussians: how many.
         preset: of `ours`.
+        device: the CPU where it is left out.
 
     Raises:
         UserError: no such preset.
     """
+    device = device or torch.device("cpu")
     config = step_config(size, gaussians, preset)
     clip, prior = posed_clip(size, gaussians)
     generator = torch.Generator().manual_seed(0)
     model = build_model(config, prior, generator)
     for layer in (model.network.head, model.deform.out):  # they start at zero, where gradients vanish
         torch.nn.init.normal_(layer.weight, std=0.01, generator=generator)
-    supervision = Supervision(clip, prior, size, torch.device("cpu"))
-    return Training(model, supervision, config, generator), round(PROGRESS * config.iterations)
+    supervision = Supervision(clip, prior, size, device)
+    return Training(model.to(device), supervision, config, generator), round(PROGRESS * config.iterations)
 
 
 def posed_clip(size: int, gaussians: int) -> tuple[Clip, Prior]:

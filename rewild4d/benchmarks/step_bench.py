@@ -11,13 +11,15 @@ from torch.profiler import ProfilerActivity, profile
 from rewild4d.benchmarks import probes
 from rewild4d.benchmarks.results import OURS, Row, timed_row
 from rewild4d.benchmarks.scenes import posed_clip, step_config, training
-from rewild4d.benchmarks.timing import Sample, measure, progress
+from rewild4d.benchmarks.timing import measure, per, progress
 from rewild4d.harmonics import seen_colors
 from rewild4d.kernels.threads import torch_on_one
 from rewild4d.ours.config import Config, WarmUp
 from rewild4d.ours.method import Ours
 from rewild4d.rasterizer import rasterize
 from rewild4d.types import Camera, Splats
+
+CPU = torch.device("cpu")
 
 STEP, CACHED, UNCACHED = "step", "rendering, frames cached", "rendering, frames not cached"
 
@@ -41,7 +43,9 @@ OPERATORS = 12
 """Operators that are listed one by one."""
 
 
-def bench_step(count: int, sizes: Sequence[int], repeats: int, preset: str, probe: bool = True) -> list[Row]:
+def bench_step(
+    count: int, sizes: Sequence[int], repeats: int, preset: str, probe: bool = True, device: torch.device = CPU
+) -> list[Row]:
     """Time steps at every image side, in turns; profile them; render the result.
 
     Args:
@@ -49,22 +53,23 @@ def bench_step(count: int, sizes: Sequence[int], repeats: int, preset: str, prob
         sizes: sides of the square frames in pixels.
         repeats: rounds of measurement.
         preset: of `ours`.
-        probe: measure memory too, in processes of their own.
+        probe: measure memory too (on the CPU), in processes of their own.
+        device: CPU, or a CUDA GPU.
 
     Raises:
         UserError: no such preset.
     """
-    steppers = {size: Stepper(count, size, preset) for size in sizes}
+    steppers = {size: Stepper(count, size, preset, device) for size in sizes}
     samples = measure({size: stepper.turn for size, stepper in steppers.items()}, repeats, "training step")
     rows = [
-        timed_row(OURS, STEP, _per(samples[size], stepper.period), count, size) for size, stepper in steppers.items()
+        timed_row(OURS, STEP, per(samples[size], stepper.period), count, size) for size, stepper in steppers.items()
     ]
     rows.append(REPORTED)
     for size, stepper in steppers.items():
         rows += stepper.operators(min(repeats, PROFILED))
-        if probe:
+        if probe and device.type == "cpu":
             rows.append(probes.step_row(count, size, preset))
-    return rows + render_rows(count, max(sizes), repeats, preset)
+    return rows + render_rows(count, max(sizes), repeats, preset, device)
 
 
 class Stepper:
@@ -74,9 +79,9 @@ class Stepper:
         period: steps of one turn: some losses act in every n-th step only, so that single steps are not alike.
     """
 
-    def __init__(self, count: int, size: int, preset: str) -> None:
-        self.count, self.size = count, size
-        self.training, self.first = training(size, count, preset)
+    def __init__(self, count: int, size: int, preset: str, device: torch.device = CPU) -> None:
+        self.count, self.size, self.device = count, size, device
+        self.training, self.first = training(size, count, preset, device)
         self.period, self.taken = loss_period(self.training.config), 0
 
     def turn(self) -> None:
@@ -85,6 +90,7 @@ class Stepper:
             for _ in range(self.period):
                 self.training.step(self.first + self.taken % (SPAN * self.period))
                 self.taken += 1
+        _wait(self.device)
 
     def operators(self, turns: int) -> list[Row]:
         """Which of torch's operators and of our autograd functions take the time, as shares of all."""
@@ -118,29 +124,31 @@ def loss_period(config: Config) -> int:
     return math.lcm(config.geometry.smooth_every, config.geometry.tv_every)
 
 
-def render_rows(count: int, size: int, repeats: int, preset: str) -> list[Row]:
+def render_rows(count: int, size: int, repeats: int, preset: str, device: torch.device = CPU) -> list[Row]:
     """Frames a second of a fitted clip: its Gaussians made for each frame anew, or kept."""
     clip, prior = posed_clip(size, count)
     config = msgspec.structs.replace(
         step_config(size, count, preset), iterations=1, warmup=WarmUp(iterations=0, regress=0)
     )
     with progress("a fitted clip", 1) as bar:  # the quality of the fit is nothing to the time of its rendering
-        made = Ours().fit(
-            clip, prior, config=config, seed=0, device=torch.device("cpu"), log=lambda *_: None, workdir=None
-        )
+        made = Ours().fit(clip, prior, config=config, seed=0, device=device, log=lambda *_: None, workdir=None)
         bar.update()
     views = [(frame.time, frame.camera) for frame in clip.frames if frame.camera is not None]
     kept = [made.at(time) for time, _ in views]
 
     def cached() -> list[Tensor]:
-        return [_render(splats, camera) for splats, (_, camera) in zip(kept, views, strict=True)]
+        images = [_render(splats, camera) for splats, (_, camera) in zip(kept, views, strict=True)]
+        _wait(device)
+        return images
 
     def uncached() -> list[Tensor]:
-        return [_render(made.at(time), camera) for time, camera in views]
+        images = [_render(made.at(time), camera) for time, camera in views]
+        _wait(device)
+        return images
 
     calls: dict[str, Callable[[], object]] = {CACHED: cached, UNCACHED: uncached}
     samples = measure(calls, repeats, f"rendering at {size}²")
-    return [timed_row(OURS, name, _per(sample, len(views)), count, size) for name, sample in samples.items()]
+    return [timed_row(OURS, name, per(sample, len(views)), count, size) for name, sample in samples.items()]
 
 
 @torch.no_grad()
@@ -153,6 +161,7 @@ def _render(splats: Splats, camera: Camera) -> Tensor:
     return image[0]
 
 
-def _per(sample: Sample, parts: int) -> Sample:
-    """The time of one of several equal parts."""
-    return Sample(sample.median / parts, sample.minimum / parts, sample.spread / parts, sample.repeats)
+def _wait(device: torch.device) -> None:
+    """Until a GPU has done what it was asked."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

@@ -15,10 +15,12 @@ def markdown(result: Result) -> str:
 
 def _place(result: Result) -> str:
     machine = result.machine
-    versions = {name: machine[name] for name in ("python", "torch", "numpy", "numba") if name in machine} | result.peers
+    names = ("python", "torch", "numpy", "numba", "triton")
+    versions = {name: machine[name] for name in names if name in machine} | result.peers
+    processor = ", ".join(machine[name] for name in ("gpu", "processor") if name in machine) or "an unknown processor"
     listed = ", ".join(f"{name} {version}" for name, version in versions.items())
     return (
-        f"**bench {result.benchmark}** on {machine.get('processor', 'an unknown processor')}, "
+        f"**bench {result.benchmark}** on {processor}, "
         f"{machine.get('system', '')}, {_plural(result.threads, 'thread')}; {listed}; "
         f"rewild4d {result.code['version']} ({result.code['sources']}); {result.started}"
     )

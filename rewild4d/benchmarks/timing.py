@@ -40,6 +40,11 @@ def summary(times: list[float]) -> Sample:
     return Sample(statistics.median(times), min(times), quartiles[2] - quartiles[0], len(times))
 
 
+def per(sample: Sample, parts: int) -> Sample:
+    """The time of one of several equal parts."""
+    return Sample(sample.median / parts, sample.minimum / parts, sample.spread / parts, sample.repeats)
+
+
 def measure(
     contenders: Mapping[Name, Callable[[], object]],
     repeats: int,

@@ -5,21 +5,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rewild4d.benchmarks.peers import PEERS, installed
+import torch
+
+from rewild4d.benchmarks.peers import CUDA_PEERS, PEERS, installed
 from rewild4d.benchmarks.raster_bench import bench_rasterizer
-from rewild4d.benchmarks.results import Result, Row, default_path, to_json, write_result
+from rewild4d.benchmarks.results import Result, Row, default_path, this_machine, to_json, write_result
 from rewild4d.benchmarks.step_bench import bench_step
 from rewild4d.benchmarks.tables import markdown
 from rewild4d.benchmarks.timing import threads
 from rewild4d.commands.shared import require_writable_file
 from rewild4d.config import load_preset, parse_flags
 from rewild4d.errors import UserError, unknown_name
+from rewild4d.machine import pick_device
 from rewild4d.ours.config import Config
+from rewild4d.rasterizer import pick_rasterizer
 
-RASTERIZER = """Time the rasterizer on the CPU, forward and with backward, against peers from PyPI that run on a CPU and
+RASTERIZER = """Time the rasterizer, forward and with backward, against peers from PyPI that run on the same device and
 against the least time that the arithmetic itself would take here. Contenders take turns within one run."""
 
-STEP = """Time one training step of `ours` on the CPU with every loss acting, show where its time goes, and how fast
+STEP = """Time one training step of `ours` with every loss acting, show where its time goes, and how fast
 what it fits is rendered."""
 
 
@@ -31,8 +35,9 @@ class RasterizerOptions:
         gaussians: how many the scenes have.
         sizes: sides of the square images in pixels; every number of Gaussians is timed at every size.
         repeats: rounds of measurement for each scene.
+        device: cpu, or cuda: the Triton backend against gsplat's kernels.
         peers: time the peers too.
-        probes: measure start-up times and peak memory too, in processes of their own.
+        probes: measure peak memory too, and on the CPU start-up times, in processes of their own.
         threads: that compute; torch's own number where it is left out.
         out: file for the data; leaderboard/speed/rasterizer-<processor>-<day>.json where it is left out.
         json: print the data as JSON, and nothing else, to standard output.
@@ -41,6 +46,7 @@ class RasterizerOptions:
     gaussians: tuple[int, ...] = (10_000, 30_000, 100_000)
     sizes: tuple[int, ...] = (256, 512)
     repeats: int = 20
+    device: str = "cpu"
     peers: bool = True
     probes: bool = True
     threads: int | None = None
@@ -57,7 +63,8 @@ class StepOptions:
         sizes: sides of the square frames in pixels; clips are rendered at the largest.
         repeats: rounds of measurement.
         preset: of `ours`; its image size and number of Gaussians are those above.
-        probes: measure peak memory too, in processes of their own.
+        device: cpu or cuda.
+        probes: measure peak memory too (on the CPU), in processes of their own.
         threads: that compute; torch's own number where it is left out.
         out: file for the data; leaderboard/speed/step-<processor>-<day>.json where it is left out.
         json: print the data as JSON, and nothing else, to standard output.
@@ -67,6 +74,7 @@ class StepOptions:
     sizes: tuple[int, ...] = (512, 256)
     repeats: int = 20
     preset: str = "paper"
+    device: str = "cpu"
     probes: bool = True
     threads: int | None = None
     out: Path | None = None
@@ -91,10 +99,11 @@ def _rasterizer(arguments: list[str]) -> int:
     settings: dict[str, int | str | list[int]] = {
         "gaussians": list(options.gaussians), "sizes": list(options.sizes), "repeats": options.repeats,
     }  # fmt: skip
-    peers = PEERS if options.peers else ()
+    device = pick_device(options.device)
+    peers = (CUDA_PEERS if device.type == "cuda" else PEERS) if options.peers else ()
     return _report(
-        arguments, options, settings, installed(peers),
-        lambda: bench_rasterizer(options.gaussians, options.sizes, options.repeats, peers, options.probes),
+        arguments, options, settings, installed(peers), device,
+        lambda: bench_rasterizer(options.gaussians, options.sizes, options.repeats, peers, options.probes, device),
     )  # fmt: skip
 
 
@@ -106,9 +115,10 @@ def _step(arguments: list[str]) -> int:
         "gaussians": options.gaussians, "sizes": list(options.sizes), "repeats": options.repeats,
         "preset": options.preset,
     }  # fmt: skip
+    device = pick_device(options.device)
     return _report(
-        arguments, options, settings, {},
-        lambda: bench_step(options.gaussians, options.sizes, options.repeats, options.preset, options.probes),
+        arguments, options, settings, {}, device,
+        lambda: bench_step(options.gaussians, options.sizes, options.repeats, options.preset, options.probes, device),
     )  # fmt: skip
 
 
@@ -127,15 +137,18 @@ def _report(
     options: RasterizerOptions | StepOptions,
     settings: dict[str, int | str | list[int]],
     peers: dict[str, str],
+    device: torch.device,
     measure: Callable[[], list[Row]],
 ) -> int:
     """Measure, write the data, print the table."""
-    path = options.out or default_path(arguments[0])
+    if device.type == "cuda" and pick_rasterizer("auto", device) != "triton":
+        raise UserError(f"--device {device}: expected Triton, which is what is timed on a GPU; pip install triton.")
+    path = options.out or default_path(arguments[0], device)
     require_writable_file(path)
     with threads(options.threads) as count:
         result = Result(
             benchmark=arguments[0], command=["bench", *arguments], threads=count, settings=settings, peers=peers,
-            rows=measure(),
+            rows=measure(), machine=this_machine(device),
         )  # fmt: skip
     write_result(result, path)
     print(to_json(result) if options.json else markdown(result))

@@ -18,6 +18,8 @@ logger = logging.getLogger(__name__)
 MODULES = {"numba": "cpu", "triton": "cuda", "gsplat": "gsplat_backend", "reference": "reference"}
 """Files of this folder; imported on first use, as not every machine has Triton or gsplat."""
 BACKENDS = ("auto", *MODULES)
+CHECK_VALUES = ("triton",)
+"""Those that look at the values themselves: a look of its own would wait for the GPU once more."""
 _default = "auto"
 
 

@@ -13,9 +13,9 @@ import triton.language as tl
 
 from rewild4d.rasterizer import conventions, projection
 
-SIDE = tl.constexpr(16)
-"""A tile is 16 x 16 pixels."""
-PIXELS = tl.constexpr(256)
+SIDE = tl.constexpr(8)
+"""A tile is 8 x 8 pixels: one warp's, so that sums over its pixels need no shared memory."""
+PIXELS = tl.constexpr(SIDE.value**2)
 MOMENTS = tl.constexpr(6)
 """Sums of q, q t, q u, q t^2, q t u, q u^2 that come before the channel sums in a slot, q = dL/dalpha alpha."""
 
@@ -138,7 +138,7 @@ def blend_backward(
     CHANNELS: tl.constexpr,
     GROUP: tl.constexpr,
 ) -> None:
-    """Fill the slots' rows of the zeroed sums [E, 6 + C]; program (tile).
+    """Fill the slots' rows of the sums [E, 6 + C]; program (tile).
 
     Walks front to back as the blend does: what lies behind a Gaussian is the pixel's total minus the prefix.
     """
@@ -178,4 +178,10 @@ def blend_backward(
         tl.store(row + 5, tl.sum(pull_u * u, 1), real)
         behind -= tl.sum(drawn, 0)
         left = tl.min(after, 0)
+        first += GROUP
+    while first < end:  # behind the last open pixel
+        place = first + tl.arange(0, GROUP)
+        row = sums + tl.load(slots + place, place < end, 0) * (MOMENTS + CHANNELS)
+        for column in range(MOMENTS + CHANNELS):
+            tl.store(row + column, tl.zeros((GROUP,), tl.float32), place < end)
         first += GROUP

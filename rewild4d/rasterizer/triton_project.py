@@ -9,22 +9,26 @@ import triton
 import triton.language as tl
 
 from rewild4d.rasterizer import conventions, projection
+from rewild4d.rasterizer.checks import MOST_FEATURE
+from rewild4d.rasterizer.triton_blend import SIDE
 
 BLOCK = tl.constexpr(64)
 RECORD = tl.constexpr(4)
 CAMERA = tl.constexpr(16)
 """Numbers of a camera's gradient: the upper three rows of world_to_camera, then fx, fy, cx, cy."""
+UNUSABLE = tl.constexpr(1 << 30)
+"""Stands for the tiles of a Gaussian whose input nobody can draw."""
 DEPTH_BITS = tl.constexpr(40)
 """Of a sorting key, below the tile: exponent and 29 bits of the depth's mantissa."""
 
-_TILE = tl.constexpr(projection.TILE)
 _HALF_LOG2_E = tl.constexpr(projection.HALF_LOG2_E)
 _WEAKEST = tl.constexpr(projection.LOG2_MIN_ALPHA)
 _MIN_ALPHA = tl.constexpr(conventions.MIN_ALPHA)
 _MARGIN = tl.constexpr(conventions.FRUSTUM_MARGIN)
 _FLOOR = tl.constexpr(conventions.MIN_COMPENSATION)
+_MOST_FEATURE = tl.constexpr(MOST_FEATURE)
 
-SIZES = ["width", "height", "across", "down", "views", "count"]
+SIZES = ["width", "height", "across", "down", "views", "count", "channels"]
 
 
 @triton.jit
@@ -95,17 +99,35 @@ def _span(center: tl.tensor, extent: tl.tensor, size: tl.tensor) -> tuple:
     return tl.maximum(tl.ceil(center - reach - 0.5), 0.0), tl.minimum(tl.floor(center + reach - 0.5), size - 1.0)
 
 
+@triton.jit
+def _flaw_of_camera(
+    world_to_camera: tl.tensor, intrinsics: tl.tensor, background: tl.tensor, view: tl.tensor, channels: tl.tensor
+) -> tl.tensor:
+    """0 where a view's numbers are finite, its pinhole is one (see checks.py), its background not too bright; NaN."""
+    lane = tl.arange(0, 16)
+    total = tl.sum(tl.load(world_to_camera + view * 16 + lane).to(tl.float64))
+    k = intrinsics + view * 9
+    total += tl.sum(tl.load(k + lane, lane < 9, 0.0).to(tl.float64))
+    sound = (total - total == 0) & (tl.load(k) > 0) & (tl.load(k + 4) > 0) & (tl.load(k + 8) == 1)
+    sound &= (tl.load(k + 1) == 0) & (tl.load(k + 3) == 0) & (tl.load(k + 6) == 0) & (tl.load(k + 7) == 0)
+    for channel in range(channels):
+        sound &= tl.abs(tl.load(background + view * channels + channel)) <= _MOST_FEATURE
+    return tl.where(sound, 0.0, float("nan"))
+
+
 @triton.jit(do_not_specialize=[*SIZES, "eps2d", "near"])
 def project(
     means: tl.tensor, quats: tl.tensor, scales: tl.tensor, opacities: tl.tensor, world_to_camera: tl.tensor,
-    intrinsics: tl.tensor, means2d: tl.tensor, records: tl.tensor, radii: tl.tensor, keys: tl.tensor, wides: tl.tensor,
-    tiles: tl.tensor, width: tl.tensor, height: tl.tensor, across: tl.tensor, down: tl.tensor, count: tl.tensor,
-    eps2d: tl.tensor, near: tl.tensor, ANTIALIAS: tl.constexpr,
+    intrinsics: tl.tensor, features: tl.tensor, background: tl.tensor, means2d: tl.tensor, records: tl.tensor,
+    radii: tl.tensor, keys: tl.tensor, wides: tl.tensor, tiles: tl.tensor, width: tl.tensor, height: tl.tensor,
+    across: tl.tensor, down: tl.tensor, count: tl.tensor, channels: tl.tensor, eps2d: tl.tensor, near: tl.tensor,
+    ANTIALIAS: tl.constexpr,
 ) -> None:  # fmt: skip
     """Fill means2d [V, N, 2], records [V, N, 4], radii [V, N] and what lists the tiles; program (block, view).
 
     Keys sort by tile, then depth: those of the first tile of each bounding rectangle, [V, N]. The rectangle is wides
-    [V, N] tiles across and has tiles [V, N] in all, 0 where nothing is drawn.
+    [V, N] tiles across and has tiles [V, N] in all, 0 where nothing is drawn, `UNUSABLE` where its input is not finite
+    or its features [N, C] are too bright; the first Gaussian's also where the view's camera or background is so.
     """
     n, view = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.program_id(1)
     real = n < count
@@ -135,6 +157,13 @@ def project(
     xx, yy = raw_xx + eps2d, raw_yy + eps2d
     det = xx * yy - xy * xy
     drawn = tl.load(opacities + n, real, 0.0).to(tl.float64)
+    whole = x + y + z + quat_w + quat_x + quat_y + quat_z + sa + sb + sc + drawn
+    if tl.program_id(0) == 0:
+        whole += _flaw_of_camera(world_to_camera, intrinsics, background, view, channels)
+    usable = whole - whole == 0
+    if view == 0:
+        for channel in range(channels):
+            usable &= tl.abs(tl.load(features + n * channels + channel, real, 0.0)) <= _MOST_FEATURE
     sound = real & ahead & (det > 0)
     if ANTIALIAS:
         drawn *= tl.sqrt(tl.maximum((raw_xx * raw_yy - xy * xy) / tl.where(sound, det, 1.0), _FLOOR))
@@ -159,13 +188,13 @@ def project(
     left, right = _span(tl.where(sound, u, 0.0), extent_x, width)
     upper, lower = _span(tl.where(sound, v, 0.0), extent_y, height)
     sound &= (left <= right) & (upper <= lower)
-    left, upper = left.to(tl.int32) // _TILE, upper.to(tl.int32) // _TILE
-    wide, high = right.to(tl.int32) // _TILE - left + 1, lower.to(tl.int32) // _TILE - upper + 1
+    left, upper = left.to(tl.int32) // SIDE, upper.to(tl.int32) // SIDE
+    wide, high = right.to(tl.int32) // SIDE - left + 1, lower.to(tl.int32) // SIDE - upper + 1
     tile = ((view * down + upper) * across + left).to(tl.int64)
     near_first = tl.where(ahead, depth, 1.0).to(tl.int64, bitcast=True) >> (63 - DEPTH_BITS)
     tl.store(keys + row, (tile << DEPTH_BITS) + near_first, real)
     tl.store(wides + row, wide, real)
-    tl.store(tiles + row, tl.where(sound, wide * high, 0), real)
+    tl.store(tiles + row, tl.where(usable, tl.where(sound, wide * high, 0), UNUSABLE), real)
 
 
 @triton.jit

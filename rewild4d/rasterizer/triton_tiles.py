@@ -9,7 +9,7 @@ from rewild4d.rasterizer.triton_blend import MOMENTS
 from rewild4d.rasterizer.triton_project import DEPTH_BITS, RECORD
 
 ENTRIES = tl.constexpr(256)
-"""Entries that a program of `list_entries` makes."""
+"""Entries that a program of `list_entries` or `start_tiles` makes."""
 OWNERS = tl.constexpr(32)
 """Gaussians whose sums a program of `gather` makes."""
 ROWS = tl.constexpr(4)
@@ -17,7 +17,7 @@ ROWS = tl.constexpr(4)
 
 _LN2 = tl.constexpr(math.log(2.0))
 
-SIZES = ["total", "rows", "steps", "across", "views", "count"]
+SIZES = ["total", "rows", "steps", "across", "views", "count", "number"]
 
 
 @triton.jit(do_not_specialize=SIZES)
@@ -51,6 +51,27 @@ def list_entries(
     step = (rank // wide * across + rank % wide).to(tl.int64)
     tl.store(keys + entry, tl.load(first_keys + low, real, 0) + (step << DEPTH_BITS), real)
     tl.store(owners + entry, low, real)
+
+
+@triton.jit(do_not_specialize=SIZES)
+def start_tiles(
+    keys: tl.tensor, slots: tl.tensor, owners: tl.tensor, entries: tl.tensor, starts: tl.tensor, total: tl.tensor,
+    number: tl.tensor, steps: tl.tensor,
+) -> None:  # fmt: skip
+    """Fill entries [E], the owners in the order of the sorted keys, and starts [tiles + 1]; program (block).
+
+    Each of ``number`` starts is the place of the first key that is not before its tile, found by halving.
+    """
+    index = tl.program_id(0).to(tl.int64) * ENTRIES + tl.arange(0, ENTRIES)
+    real = index < total
+    tl.store(entries + index, tl.load(owners + tl.load(slots + index, real, 0), real, 0), real)
+    low = tl.zeros((ENTRIES,), tl.int64)
+    high = low + total
+    for _ in range(steps):
+        middle = (low + high) // 2
+        before = (low < high) & (tl.load(keys + middle, low < high, 0) < (index << DEPTH_BITS))
+        low, high = tl.where(before, middle + 1, low), tl.where(before, high, middle)
+    tl.store(starts + index, low, index < number)
 
 
 @triton.jit(do_not_specialize=SIZES)

@@ -1,0 +1,94 @@
+"""What the rasterizer takes: shapes, types, and values that no kernel has to expect to be odd."""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+MOST_FEATURE = 2.0**100
+"""Single precision ends at 3e38, and the backward pass multiplies channels by derivatives."""
+
+
+def check_gaussians(named: dict[str, Tensor]) -> None:
+    """Shapes, types and devices of means, quats, scales, opacities and features.
+
+    Raises:
+        ValueError: names the tensor.
+    """
+    means = named["means"]
+    count = means.shape[0] if means.ndim else 0
+    if means.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"means: expected float32 or float64, got {means.dtype}.")
+    wanted = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,)}
+    for name, tensor in named.items():
+        shape = tuple(tensor.shape)
+        if name == "features":
+            if tensor.ndim != 2 or shape[0] != count or shape[1] < 1:
+                raise ValueError(f"features: expected shape [{count}, C] with C >= 1, got {list(shape)}.")
+        elif shape != wanted[name]:
+            raise ValueError(f"{name}: expected shape {list(wanted[name])}, got {list(shape)}.")
+        if tensor.dtype != means.dtype or tensor.device != means.device:
+            raise ValueError(
+                f"{name}: expected {means.dtype} on {means.device} as means has, got {tensor.dtype} on {tensor.device}."
+            )
+
+
+def check_cameras(world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int) -> None:
+    """Shapes, and the size of the image.
+
+    Raises:
+        ValueError: names the tensor.
+    """
+    views = world_to_camera.shape[0] if world_to_camera.ndim else 0
+    if views < 1 or tuple(world_to_camera.shape[1:]) != (4, 4):
+        raise ValueError(f"world_to_camera: expected shape [V, 4, 4] with V >= 1, got {list(world_to_camera.shape)}.")
+    if tuple(intrinsics.shape) != (views, 3, 3):
+        raise ValueError(f"intrinsics: expected shape [{views}, 3, 3], got {list(intrinsics.shape)}.")
+    if width < 1 or height < 1:
+        raise ValueError(f"expected an image of at least one pixel, got {width} x {height}.")
+
+
+def check_values(named: dict[str, Tensor]) -> None:
+    """Pinholes, and that all is finite and not too large.
+
+    Raises:
+        ValueError: names the tensor and the index.
+    """
+    _check_pinholes(named["intrinsics"].tolist())
+    _check_finite(named)
+    _check_range(named)
+
+
+def _check_pinholes(matrices: list[list[list[float]]]) -> None:
+    for view, matrix in enumerate(matrices):
+        (fx, skew, _), (lower, fy, _), last = matrix
+        if not (fx > 0 and fy > 0 and skew == 0 and lower == 0 and last == [0, 0, 1]) and all(
+            map(math.isfinite, sum(matrix, []))
+        ):
+            raise ValueError(
+                f"intrinsics[{view}]: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths, "
+                f"got {matrix}."
+            )
+
+
+def _check_finite(named: dict[str, Tensor]) -> None:
+    # A sum is one fast pass and is finite unless something in it is not (or it overflows, then the slow look decides).
+    # NumPy's wakes no OpenMP threads, see `cpu._zeros`.
+    with np.errstate(all="ignore"):
+        for name, tensor in named.items():
+            values = tensor.detach()
+            total = float(values.numpy().sum()) if values.device.type == "cpu" else values.sum().item()
+            if not math.isfinite(total) and len(bad := (~torch.isfinite(values)).nonzero()):
+                index = tuple(bad[0].tolist())
+                raise ValueError(f"{name}: expected finite values, got {values[index].item()} at index {list(index)}.")
+
+
+def _check_range(named: dict[str, Tensor]) -> None:
+    """Channels whose products with each other's derivatives would overflow, and leave NaN in a gradient."""
+    for name in ("features", "background"):
+        values = named[name].detach() if name in named else torch.empty(0)
+        if values.numel() and float(torch.maximum(values.max(), -values.min())) > MOST_FEATURE:
+            index = tuple((values.abs() > MOST_FEATURE).nonzero()[0].tolist())
+            found = f"{values[index].item():g} at index {list(index)}"
+            raise ValueError(f"{name}: expected magnitudes up to {MOST_FEATURE:.2g}, got {found}.")
