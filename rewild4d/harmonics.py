@@ -16,35 +16,57 @@ from rewild4d.types import Splats
 
 def basis(directions: Tensor, degree: int) -> Tensor:
     """Values of the basis functions for unit directions, [..., 3] -> [..., (degree + 1)^2], degree 0 to 3."""
-    return torch.cat([_band(directions, level) for level in range(degree + 1)], dim=-1)
+    powers = [torch.ones_like(directions[..., :1])]
+    for _ in range(degree):
+        powers.append(_times(powers[-1], directions))
+    tables = [_table(level, directions.device, directions.dtype) for level in range(degree + 1)]
+    return torch.cat([power @ table for power, table in zip(powers, tables, strict=True)], dim=-1)
 
 
 def _band(directions: Tensor, level: int) -> Tensor:
     """Values of the functions of one degree, [..., 3] -> [..., 2 level + 1]."""
-    x, y, z = directions.unbind(-1)
-    if level == 0:
-        values = [torch.full_like(x, C0)]
-    elif level == 1:
-        values = [-C1 * y, C1 * z, -C1 * x]
-    elif level == 2:
-        values = [
-            C2[0] * x * y,
-            C2[1] * y * z,
-            C2[2] * (2 * z * z - x * x - y * y),
-            C2[3] * x * z,
-            C2[4] * (x * x - y * y),
-        ]
-    else:
-        values = [
-            C3[0] * y * (3 * x * x - y * y),
-            C3[1] * x * y * z,
-            C3[2] * y * (4 * z * z - x * x - y * y),
-            C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y),
-            C3[4] * x * (4 * z * z - x * x - y * y),
-            C3[5] * z * (x * x - y * y),
-            C3[6] * x * (x * x - 3 * y * y),
-        ]
-    return torch.stack(values, dim=-1)
+    power = torch.ones_like(directions[..., :1])
+    for _ in range(level):
+        power = _times(power, directions)
+    return power @ _table(level, directions.device, directions.dtype)
+
+
+FUNCTIONS: tuple[tuple[dict[str, float], ...], ...] = (
+    ({"": C0},),
+    ({"y": -C1}, {"z": C1}, {"x": -C1}),
+    (
+        {"xy": C2[0]},
+        {"yz": C2[1]},
+        {"zz": 2 * C2[2], "xx": -C2[2], "yy": -C2[2]},
+        {"xz": C2[3]},
+        {"xx": C2[4], "yy": -C2[4]},
+    ),
+    (
+        {"xxy": 3 * C3[0], "yyy": -C3[0]},
+        {"xyz": C3[1]},
+        {"yzz": 4 * C3[2], "xxy": -C3[2], "yyy": -C3[2]},
+        {"zzz": 2 * C3[3], "xxz": -3 * C3[3], "yyz": -3 * C3[3]},
+        {"xzz": 4 * C3[4], "xxx": -C3[4], "xyy": -C3[4]},
+        {"xxz": C3[5], "yyz": -C3[5]},
+        {"xxx": C3[6], "xyy": -3 * C3[6]},
+    ),
+)
+"""The functions of each degree as polynomials in the coordinates of a unit direction."""
+
+
+def _times(power: Tensor, directions: Tensor) -> Tensor:
+    """Products with one more coordinate, [..., 3^k] -> [..., 3^(k + 1)]; few operations, for which a GPU waits."""
+    return (power[..., :, None] * directions[..., None, :]).flatten(-2)
+
+
+@cache
+def _table(level: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """Coefficients of the products of ``level`` coordinates in each function of that degree, [3^level, 2 level + 1]."""
+    table = torch.zeros(3**level, 2 * level + 1, dtype=torch.float64)
+    for column, polynomial in enumerate(FUNCTIONS[level]):
+        for letters, factor in polynomial.items():
+            table[int("0" + letters.translate(str.maketrans("xyz", "012")), 3), column] = factor
+    return table.to(device, dtype)
 
 
 def rotated(coefficients: Tensor, rotations: Tensor) -> Tensor:

@@ -51,16 +51,15 @@ def compact_loss(points: Tensor, weights: Tensor, opacities: Tensor, power: floa
         return compactness(points, weights, opacities, power)
     mass = weights.detach() ** power * opacities.detach()[:, None]
     total = mass.sum(0)
-    mass, total = mass[:, total >= 1], total[total >= 1]
-    if len(total) == 0:
-        return points.sum() * 0.0
-    share = mass / total
+    counted = (total >= 1).to(total)  # a mask would wait for a GPU
+    share = mass / torch.where(total >= 1, total, 1.0)
     center = share.T @ points
     outer = (points[:, :, None] * points[:, None, :]).flatten(1)
     covariance = (share.T @ outer).view(-1, 3, 3) - center[:, :, None] * center[:, None, :]
-    top = torch.linalg.eigh(covariance.detach())[1][..., -1]
+    top = torch.linalg.eigh(covariance.detach().cpu())[1][..., -1].to(covariance)  # a GPU takes longer for so few
     trace = covariance.diagonal(dim1=1, dim2=2).sum(-1)
-    return (trace - torch.einsum("ja,jab,jb->j", top, covariance, top)).mean()
+    rest = trace - torch.einsum("ja,jab,jb->j", top, covariance, top)
+    return (rest * counted).sum() / counted.sum().clamp_min(1)
 
 
 def smooth_loss(posed: Posed, opacities: Tensor, size: int, generator: torch.Generator) -> Tensor:

@@ -9,6 +9,7 @@ from functools import cache
 
 import torch
 from torch import Tensor
+from torch.nn.functional import binary_cross_entropy
 
 from rewild4d.kernels.arrays import fits
 from rewild4d.ours.fused.images import colour_means, matte_loss
@@ -41,8 +42,12 @@ def _extent(alphas: list[Tensor]) -> tuple[tuple[int, int], tuple[int, int]]:
     if all(map(fits, alphas)):
         return extent(alphas)
     union = torch.stack([alpha[0].detach() for alpha in alphas]).amax(0) > 0
-    rows, columns = (union.any(dim=axis).nonzero()[:, 0].tolist() or [0] for axis in (1, 0))
-    return (rows[0], rows[-1]), (columns[0], columns[-1])
+    ends = []
+    for marks in (union.any(dim=1), union.any(dim=0)):
+        places = torch.arange(len(marks), device=marks.device)
+        ends += [torch.where(marks, places, len(marks)).amin(), torch.where(marks, places, -1).amax()]
+    top, bottom, left, right = torch.stack(ends).tolist()  # one look: each waits for a GPU
+    return ((top, bottom), (left, right)) if top <= bottom else ((0, 0), (0, 0))
 
 
 def silhouette_loss(alpha: Tensor, target: Target, window: Window) -> Tensor:
@@ -50,8 +55,7 @@ def silhouette_loss(alpha: Tensor, target: Target, window: Window) -> Tensor:
     if fits(alpha):
         return matte_loss(alpha, target.mask, _corner_and_size(window), target.side**2)
     rendered, truth = alpha[:, *window], target.mask[:, *window]
-    inside = rendered.clamp(1e-5, 1 - 1e-5)
-    bce = -(truth * inside.log() + (1 - truth) * (1 - inside).log()).sum() / target.side**2
+    bce = binary_cross_entropy(rendered.clamp(1e-5, 1 - 1e-5), truth, reduction="sum") / target.side**2
     dice = 1 - (2 * (rendered * truth).sum() + 1) / (rendered.sum() + truth.sum() + 1)
     return bce + dice
 

@@ -66,11 +66,11 @@ def rasterize(
     *inputs, features, background = (tensor.contiguous() for tensor in named.values())
     shades = (features.detach(), background.detach())
     with torch.cuda.device_of(means):
-        made = _Project.apply(*inputs, shades, (width, height, eps2d, antialias, near))
-        means2d, records, radii, *rectangles = made
+        options = (width, height, eps2d, antialias, near)
+        means2d, records, radii, keys, wides, tiles = _Project.apply(*inputs, shades, options)
         if means2d.requires_grad:
             means2d.retain_grad()
-        lists = _list_tiles(*rectangles, views, across, down)
+        lists = _list_tiles(keys, wides, tiles, views, across, down)
         if lists is None:
             check_values(named)
             raise ValueError(f"expected fewer than {UNUSABLE} pairs of a Gaussian and a tile that it touches.")
