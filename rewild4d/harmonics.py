@@ -11,6 +11,7 @@ from torch.nn.functional import normalize
 from rewild4d.kernels.arrays import fits
 from rewild4d.kernels.harmonics import C0 as C0
 from rewild4d.kernels.harmonics import C1, C2, C3, shade, turn
+from rewild4d.products import products
 from rewild4d.types import Splats
 
 
@@ -18,7 +19,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
     """Values of the basis functions for unit directions, [..., 3] -> [..., (degree + 1)^2], degree 0 to 3."""
     powers = [torch.ones_like(directions[..., :1])]
     for _ in range(degree):
-        powers.append(_times(powers[-1], directions))
+        powers.append(products(powers[-1], directions))
     tables = [_table(level, directions.device, directions.dtype) for level in range(degree + 1)]
     return torch.cat([power @ table for power, table in zip(powers, tables, strict=True)], dim=-1)
 
@@ -27,7 +28,7 @@ def _band(directions: Tensor, level: int) -> Tensor:
     """Values of the functions of one degree, [..., 3] -> [..., 2 level + 1]."""
     power = torch.ones_like(directions[..., :1])
     for _ in range(level):
-        power = _times(power, directions)
+        power = products(power, directions)
     return power @ _table(level, directions.device, directions.dtype)
 
 
@@ -52,11 +53,6 @@ FUNCTIONS: tuple[tuple[dict[str, float], ...], ...] = (
     ),
 )
 """The functions of each degree as polynomials in the coordinates of a unit direction."""
-
-
-def _times(power: Tensor, directions: Tensor) -> Tensor:
-    """Products with one more coordinate, [..., 3^k] -> [..., 3^(k + 1)]; few operations, for which a GPU waits."""
-    return (power[..., :, None] * directions[..., None, :]).flatten(-2)
 
 
 @cache

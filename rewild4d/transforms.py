@@ -12,19 +12,19 @@ import torch
 from torch import Tensor
 
 from rewild4d.harmonics import rotated
+from rewild4d.products import products
 from rewild4d.types import Camera, Splats
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product a ⊗ b of wxyz quaternions, [..., 4]."""
-    products = _products(a, b)
-    return products @ _table(HAMILTON, products.device, products.dtype)
+    return products(a, b) @ _table(HAMILTON, a.device, a.dtype)
 
 
 def quat_to_matrix(quats: Tensor) -> Tensor:
     """Rotation matrices of quaternions (normalised here), [..., 4] -> [..., 3, 3]."""
     unit = torch.nn.functional.normalize(quats, dim=-1)
-    return (_products(unit, unit) @ _table(ROTATION, unit.device, unit.dtype)).unflatten(-1, (3, 3))
+    return (products(unit, unit) @ _table(ROTATION, unit.device, unit.dtype)).unflatten(-1, (3, 3))
 
 
 HAMILTON = ("ww-xx-yy-zz", "wx+xw+yz-zy", "wy-xz+yw+zx", "wz+xy-yx+zw")
@@ -35,11 +35,6 @@ ROTATION = (
     "xz+zx-wy-yw", "yz+zy+wx+xw", "ww-xx-yy+zz",
 )  # fmt: skip
 """Each element of the matrix, row by row, of a unit quaternion times itself."""
-
-
-def _products(a: Tensor, b: Tensor) -> Tensor:
-    """All sixteen products of two quaternions' components, [..., 16]: on a GPU what counts is how few operations."""
-    return (a[..., :, None] * b[..., None, :]).flatten(-2)
 
 
 @cache
