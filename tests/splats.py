@@ -81,6 +81,9 @@ def spoilt_scenes() -> dict[str, tuple[dict[str, Tensor], str]]:
         inputs = {key: tensor.float() for key, tensor in scene(40, 3, 2, 20, 18, seed=1).items()}
         inputs[name][index] = value
         made[f"{name}{list(index)} {value}"] = (inputs, said)
+    nobody = {key: tensor.float() for key, tensor in scene(0, 3, 2, 20, 18, seed=1).items()}
+    nobody["world_to_camera"][0, 1, 2] = math.nan
+    made["no Gaussian, a camera of NaN"] = (nobody, r"world_to_camera: .* got nan at index \[0, 1, 2\]")
     return made
 
 

@@ -26,7 +26,7 @@ LAUNCHES: dict[str, dict[str, Any]] = {
     "gather": {"num_warps": 1},
     "project_backward": {"num_warps": 2},
 }
-"""How each kernel runs: the fastest of groups of 2 to 16 Gaussians on 1 to 8 warps, on an H100."""
+"""How each kernel runs; for blending the fastest of groups of 2 to 16 Gaussians on 1 to 8 warps, on an H100."""
 MOST_CHANNELS = 16
 """What one program blends; for more of them the tile is walked again."""
 
@@ -63,6 +63,8 @@ def rasterize(
         "means": means, "quats": quats, "scales": scales, "opacities": opacities,
         "world_to_camera": world_to_camera, "intrinsics": intrinsics, "features": features, "background": background,
     }  # fmt: skip
+    if not len(means):
+        check_values(named)  # no kernel looks
     *inputs, features, background = (tensor.contiguous() for tensor in named.values())
     shades = (features.detach(), background.detach())
     with torch.cuda.device_of(means):

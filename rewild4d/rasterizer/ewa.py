@@ -1,4 +1,4 @@
-"""EWA projection in differentiable torch, for one camera or a batch of them: what the torch and CUDA backends share."""
+"""EWA projection in differentiable torch, for one camera or a batch of them: the definition, for the reference."""
 
 import torch
 from torch import Tensor
@@ -64,7 +64,7 @@ def determinant(matrix: Tensor) -> Tensor:
 @torch.no_grad()
 def reach(
     centres: Tensor, cov2d: Tensor, depths: Tensor, opacities: Tensor, width: int, height: int, near: float
-) -> tuple[Tensor, Tensor]:
+) -> Tensor:
     """How far from its centre a Gaussian is drawn, where alpha falls to 1/255.
 
     Args:
@@ -77,8 +77,7 @@ def reach(
         near: depth from which on Gaussians are drawn.
 
     Returns:
-        Radii along the longest axis, 0 where nothing can be drawn [..., N], and half sides of the bounding boxes
-        [..., N, 2].
+        Radii along the longest axis, 0 where nothing can be drawn, [..., N].
     """
     squared = 2 * (opacities / MIN_ALPHA).clamp_min(1).log()
     variance_x, variance_y = cov2d[..., 0, 0], cov2d[..., 1, 1]
@@ -88,4 +87,4 @@ def reach(
     size = centres.new_tensor((width, height))
     inside = ((centres + extents > 0) & (centres - extents < size)).all(dim=-1)
     drawn = inside & (depths > near) & (squared > 0) & (determinant(cov2d) > 0)
-    return torch.where(drawn, (squared * longest).sqrt(), 0.0), extents
+    return torch.where(drawn, (squared * longest).sqrt(), 0.0)

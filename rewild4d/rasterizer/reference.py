@@ -39,7 +39,7 @@ def rasterize(
     images, alphas, radii = [], [], []
     for view, (_, cov2d, depths, compensation) in enumerate(projected):
         visible_opacities = opacities * compensation if antialias else opacities
-        radii.append(ewa.reach(means2d[view], cov2d, depths, visible_opacities, width, height, near)[0])
+        radii.append(ewa.reach(means2d[view], cov2d, depths, visible_opacities, width, height, near))
         image, alpha = _blend(means2d[view], cov2d, depths, visible_opacities, features, radii[view] > 0, width, height)
         if background is not None:
             image = image + (1 - alpha) * background[view][:, None, None]
