@@ -110,9 +110,7 @@ def test_the_kernels_themselves_find_bad_numbers(name: str, interpreted: dict[st
 
 @needs_triton
 @pytest.mark.parametrize("capability", [80, 90])
-@pytest.mark.parametrize(
-    "name", ["project", "project_backward", "list_entries", "start_tiles", "gather", "blend", "blend_backward"]
-)
+@pytest.mark.parametrize("name", KERNELS)
 def test_kernels_compile_without_a_gpu(
     name: str, capability: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

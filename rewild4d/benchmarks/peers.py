@@ -77,15 +77,19 @@ def _dense_reference(scene: SplatScene) -> Render:
     return lambda gaussians: scene.render(gaussians, backend="reference")[0]
 
 
-def _gsplat_twin(scene: SplatScene) -> Render:
+def _part_of_gsplat(module: str) -> Any:
     try:
-        twin = import_module("gsplat.cuda._torch_impl")
+        return import_module(module)
     except ModuleNotFoundError as error:
         if error.name == "gsplat":
             raise NotTimed("not installed: pip install gsplat") from error
         raise NotTimed(f"gsplat is installed, but needs {error.name}: pip install {error.name}") from error
     except Exception as error:  # a foreign package may fail in any way while it looks for CUDA
         raise NotTimed(f"gsplat is installed, but does not import: {error}") from error
+
+
+def _gsplat_twin(scene: SplatScene) -> Render:
+    twin = _part_of_gsplat("gsplat.cuda._torch_impl")
     blends = list_blends(scene)
     chosen, pixels = torch.from_numpy(blends.gaussians), torch.from_numpy(blends.pixels)
     images, size = torch.zeros_like(pixels), scene.size
@@ -130,12 +134,8 @@ def _accumulate(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_r
 
 
 def _gsplat_kernels(scene: SplatScene) -> Render:
-    try:
-        gsplat = import_module("gsplat")
-        kernels = import_module("gsplat.cuda._backend")._C
-    except ModuleNotFoundError as error:
-        raise NotTimed("not installed: pip install gsplat") from error
-    if kernels is None:
+    gsplat = _part_of_gsplat("gsplat")
+    if _part_of_gsplat("gsplat.cuda._backend")._C is None:
         raise NotTimed("gsplat is installed, but has no kernels here: it builds them with nvcc, or a wheel has them")
     cameras = (scene.world_to_camera, scene.intrinsics, scene.size, scene.size)
 

@@ -37,7 +37,7 @@ class RasterizerOptions:
         repeats: rounds of measurement for each scene.
         device: cpu, or cuda: the Triton backend against gsplat's kernels.
         peers: time the peers too.
-        probes: measure peak memory too, and on the CPU start-up times, in processes of their own.
+        probes: measure peak memory too, and on the CPU start-up times (there in processes of their own).
         threads: that compute; torch's own number where it is left out.
         out: file for the data; leaderboard/speed/rasterizer-<processor>-<day>.json where it is left out.
         json: print the data as JSON, and nothing else, to standard output.

@@ -284,7 +284,7 @@ def project_backward(
         v_z += local_x * r02 + local_y * r12 + local_z * r22
         if CAMERAS:
             place = v_cameras + (tl.program_id(0) * views + view) * CAMERA
-            qz_x, qz_y = -jx * tangent_x, -jy * tangent_y
+            jz_x, jz_y = -jx * tangent_x, -jy * tangent_y
             tl.store(place, tl.sum(local_x * x + jx * v_p0))
             tl.store(place + 1, tl.sum(local_x * y + jx * v_p1))
             tl.store(place + 2, tl.sum(local_x * z + jx * v_p2))
@@ -293,9 +293,9 @@ def project_backward(
             tl.store(place + 5, tl.sum(local_y * y + jy * v_q1))
             tl.store(place + 6, tl.sum(local_y * z + jy * v_q2))
             tl.store(place + 7, tl.sum(local_y))
-            tl.store(place + 8, tl.sum(local_z * x + qz_x * v_p0 + qz_y * v_q0))
-            tl.store(place + 9, tl.sum(local_z * y + qz_x * v_p1 + qz_y * v_q1))
-            tl.store(place + 10, tl.sum(local_z * z + qz_x * v_p2 + qz_y * v_q2))
+            tl.store(place + 8, tl.sum(local_z * x + jz_x * v_p0 + jz_y * v_q0))
+            tl.store(place + 9, tl.sum(local_z * y + jz_x * v_p1 + jz_y * v_q1))
+            tl.store(place + 10, tl.sum(local_z * z + jz_x * v_p2 + jz_y * v_q2))
             tl.store(place + 11, tl.sum(local_z))
             tl.store(place + 12, tl.sum(g_u * slope_x + rest_x * by))
             tl.store(place + 13, tl.sum(g_v * slope_y + rest_y * by))
