@@ -41,7 +41,7 @@ TINY = Config(
     checkpoint_every=5,
     canonical=Canonical(samples=200, sh_degree=1),
     skinning=Skinning(resolution=10, sweeps=5),
-    deform=Deform(width=16),
+    deform=Deform(width=16, sampled=60),
     warmup=WarmUp(iterations=6, regress=4, samples=150, size=48, views=2),
     geometry=Geometry(smooth_size=24, temporal=0.1, rigid=0.1),
     density=Density(every=0.2, cap=260),

@@ -123,7 +123,8 @@ class Stepper:
 
 def loss_period(config: Config) -> int:
     """After how many steps the same losses act again."""
-    return math.lcm(config.geometry.smooth_every, config.geometry.tv_every)
+    geometry = config.geometry
+    return math.lcm(geometry.smooth_every, geometry.tv_every, geometry.compact_every)
 
 
 def render_rows(count: int, size: int, repeats: int, preset: str, device: torch.device = CPU) -> list[Row]:

@@ -93,8 +93,7 @@ class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     time_noise_until: Weight = 0.5
     """Fraction at which the jitter ends."""
     tied: bool = False
-    """Pose of a flipped image = mirror image of that of the image, not its own. More evidence for each pose, yet worse
-    than poses of their own in preset `standard` (baselines/presets/ours.toml)."""
+    """Pose of a flipped image = mirror image of that of the image, not its own (see baselines/presets/ours.toml)."""
 
     def __post_init__(self) -> None:
         _require_heads(self.width, self.heads)
@@ -108,8 +107,7 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     anchors: bool = True
     """The query holds skinning weights times part anchors; False: the weights themselves ("w/o Part Anchors")."""
     width: Count = 64
-    """Hidden width; the dearest network of the method. 128 for 64: +0.03 dB on one horse, +0.3 on one cow (one seed,
-    3,000 steps, preset standard), 0 on the cows of DAVIS, and 1.3 times the time of the whole fit."""
+    """Hidden width. 128 for 64: +0.03 dB on one horse, +0.3 on one cow (one seed), 0 on the cows of DAVIS."""
     heads: Count = 4
     """Attention heads over the parts."""
     frequencies: Whole = 6
@@ -120,6 +118,8 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """Bound on the change of log scale (tanh): unbounded offsets make points fly off."""
     half: bool = True
     """Factors of the network's products in bfloat16 where a CPU multiplies such pairs (sums keep single precision)."""
+    sampled: Whole = 2000
+    """Gaussians that stand for all in the network's own gradients (ours/fused/sampled_rows.py); 0: all."""
     ramp_start: Weight = 0.05
     """Fraction at which the deformation starts to fade in: the pose explains the motion first."""
     ramp_end: Weight = 0.15
@@ -199,16 +199,18 @@ class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """Total variation of the skinning probabilities (paper)."""
     tv_delta: Positive = 0.05
     """Where the Huber function turns linear (paper)."""
-    tv_every: Count = 1
-    """Steps between evaluations, weight multiplied accordingly."""
+    tv_every: Count = 4
+    """Steps between evaluations, weight multiplied accordingly (the next two likewise)."""
     compact: Weight = 0.1
     """Compactness of the parts (paper)."""
     compact_power: Positive = 2.0
     """Exponent on the weights: a squared weight leaves less torso in every part."""
+    compact_every: Count = 4
+    """Steps between evaluations."""
     smooth: Weight = 0.1
     """Smoothness of rendered normals (paper)."""
-    smooth_every: Count = 2
-    """Steps between evaluations, weight multiplied accordingly."""
+    smooth_every: Count = 4
+    """Steps between evaluations."""
     smooth_size: Size = 256
     """Side of the square image of normals."""
     limit: Weight = 1.0
@@ -229,8 +231,7 @@ class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     1e-3 27.6 25.1; 3 and 2e-3 27.8 25.0; 10 and 3e-3 28.8 24.6 28.1 23.2. The last for those joints alone that hardly
     move in the prior (standard deviation below .03): 27.6 25.1."""
     rigid: Weight = 1.0
-    """Deformed branch: change of distance between canonical neighbours (as isometric as possible); +0.3 dB on one
-    horse, one seed, 1,500 steps, against a run that also had more Gaussians."""
+    """Deformed branch: change of distance between canonical neighbours (as isometric as possible)."""
     rigid_neighbours: Count = 5
     """Neighbours a Gaussian is compared with."""
     steady: Weight = 0.1
@@ -253,12 +254,11 @@ class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     skinning: Rate = (1e-3, 1e-4)
     """Logits of the field."""
     pose: Rate = (6e-4, 1e-5)
-    """Anchors and pose network; 2e-4 was 0.6 dB worse on one horse in 1,500 steps (with more Gaussians)."""
+    """Anchors and pose network."""
     rise: Weight = 0.02
     """Fraction over which the networks' rates rise from zero: Adam's first steps would undo the warm-up."""
     deform: Rate = (8e-4, 1.6e-6)
-    """Deformation network. (2e-3, 2e-5) for it (standard, seed 0): rigged horse and cow 25.2 and 27.6 for 25.2 and 27.5
-    dB, giraffe 30.1 for 30.2; of films see `Footage`."""
+    """Deformation network. At (2e-3, 2e-5) animals differ by .1 dB at most (one seed); of films see `Footage`."""
     clip: Positive = 1.0
     """Bound on the gradient norm of the networks."""
 

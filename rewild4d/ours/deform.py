@@ -44,7 +44,13 @@ class DeformNetwork(nn.Module):
         nn.init.zeros_(self.out.weight)
 
     def forward(
-        self, features: Tensor, weights: Tensor, anchors: Tensor | None, posed: Posed, strength: float
+        self,
+        features: Tensor,
+        weights: Tensor,
+        anchors: Tensor | None,
+        posed: Posed,
+        strength: float,
+        offset: float = 0.0,
     ) -> Posed:
         """Deform skinned Gaussians.
 
@@ -54,13 +60,15 @@ class DeformNetwork(nn.Module):
             anchors: of the parts; their mixture tells a Gaussian's place on the body. None: the weights do, [J, D].
             posed: skinned Gaussians; gradients pass through to them, but not through the query.
             strength: the ramp, in [0, 1].
+            offset: decides which Gaussians stand for all in the gradients of the parameters (`config.sampled`; the
+                plain path sums over all), in [0, 1).
 
         Returns:
             Deformed Gaussians.
         """
         weights = weights.detach()
         if fits(posed.means) and (anchors is None or anchors.shape[1] <= LANES):
-            return Posed(*self._fused(features, weights, anchors, posed, strength))
+            return Posed(*self._fused(features, weights, anchors, posed, strength, offset))
         parts = weights if anchors is None else weights @ anchors
         query = torch.cat((parts, self._place(posed)), dim=-1)
         hidden = self._attend(query, features) + self.skip(query)
@@ -101,7 +109,7 @@ class DeformNetwork(nn.Module):
         return asked * size**-0.5, bias * size**-0.5, mixed
 
     def _fused(
-        self, features: Tensor, weights: Tensor, anchors: Tensor | None, posed: Posed, strength: float
+        self, features: Tensor, weights: Tensor, anchors: Tensor | None, posed: Posed, strength: float, offset: float
     ) -> tuple[Tensor, Tensor, Tensor]:
         config = self.config
         layers = (self.query, self.skip, self.key, self.value, self.project, self.up, self.down, self.out)
@@ -111,4 +119,4 @@ class DeformNetwork(nn.Module):
         reach = Reach(
             2 / OBJECT_DIAGONAL, config.frequencies, parts, float(strength), config.reach, config.max_log_scale
         )
-        return deform(flat, sizes, reach, config.half, weights, anchors, *posed)
+        return deform(flat, sizes, reach, config.half, weights, anchors, *posed, config.sampled, offset)

@@ -112,7 +112,8 @@ class Training:
             live, opacities.detach(), opacities.new_zeros(len(opacities), 1), target, detach_scales=True
         )
         strength = ramp(progress, config.deform.ramp_start, config.deform.ramp_end)
-        deformed = model.deformed(pose, weights, posed, strength)
+        offset = float(torch.rand((), generator=self.generator)) if config.deform.sampled else 0.0
+        deformed = model.deformed(pose, weights, posed, strength, offset)
         degree = min(config.canonical.sh_degree, int(progress / config.canonical.sh_every))
         colors = model.gaussians.seen_rgb(deformed.means, deformed.quats, target.camera.center, degree)
         rgb, alpha, info = self._render(deformed, opacities, colors, target)
@@ -171,12 +172,12 @@ class Training:
         config, own = self.config.geometry, self.model.gaussians
         losses: dict[str, Tensor] = {}
         if index < config.until * self.config.iterations:
-            if config.compact:
+            if config.compact and index % config.compact_every == 0:
                 both = [
                     compact_loss(points, weights, opacities, config.compact_power)
                     for points in (own.means, posed.means)
                 ]
-                losses["compact"] = config.compact * torch.stack(both).mean()
+                losses["compact"] = config.compact * config.compact_every * torch.stack(both).mean()
             if config.smooth and index % config.smooth_every == 0:
                 smooth = smooth_loss(deformed, opacities, config.smooth_size, self.generator)
                 losses["smooth"] = config.smooth * config.smooth_every * smooth

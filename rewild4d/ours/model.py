@@ -86,7 +86,7 @@ class Model(nn.Module):
         )
         return live, still if self.config.loss.isolated else live
 
-    def deformed(self, pose: Pose, weights: Tensor, posed: Posed, strength: float) -> Posed:
+    def deformed(self, pose: Pose, weights: Tensor, posed: Posed, strength: float, offset: float = 0.0) -> Posed:
         """Skinned Gaussians after the deformation network.
 
         Args:
@@ -94,12 +94,13 @@ class Model(nn.Module):
             weights: of each Gaussian, [n, J].
             posed: skinned Gaussians of the appearance branch.
             strength: of the deformation, in [0, 1].
+            offset: see `DeformNetwork.forward`.
         """
         if strength == 0 or not self.config.deform.enabled:
             return posed
         features = pose.features[0].detach() if self.config.deform.detach_features else pose.features[0]
         anchors = self.network.anchors if self.config.deform.anchors else None
-        return self.deform(features, weights, anchors, posed, strength)
+        return self.deform(features, weights, anchors, posed, strength, offset)
 
     def moved(self, pose: Pose, weights: Tensor, strength: float) -> tuple[Posed, Posed]:
         """Skinned Gaussians, and the same deformed, of the appearance branch at a pose of one code."""

@@ -37,6 +37,7 @@ from rewild4d.ours.fused.layers import (
     round_up,
 )
 from rewild4d.ours.fused.queries import Reach, mix_back, read_query
+from rewild4d.ours.fused.sampled_rows import sample_rows
 
 CHUNK = 11 * BLOCK
 """Gaussians a unit of work holds; parameter gradients are summed over these, whatever the number of threads."""
@@ -91,9 +92,9 @@ def _quaternion(out: np.ndarray, lane: int) -> tuple:
 @kernel
 def _apply_back(
     begin: int, end: int, reach: Reach, out: np.ndarray, quats: np.ndarray, g_means: np.ndarray, g_quats: np.ndarray,
-    g_log_scales: np.ndarray, slope_out: np.ndarray, on_quats: np.ndarray,
+    g_log_scales: np.ndarray, slope_out: np.ndarray,
 ) -> None:  # fmt: skip
-    """From the gradients of the moved Gaussians to those of the outputs and of the orientations."""
+    """From the gradients of the moved Gaussians to those of the outputs."""
     slope_out[:] = 0
     strength, far = np.float32(reach.strength), np.float32(reach.reach * reach.strength)
     steep, bend = np.float32(reach.grow * reach.strength), np.float32(reach.strength / reach.grow)
@@ -106,10 +107,6 @@ def _apply_back(
         w, x, y, z = _quaternion(out, lane)
         a, b, c, d = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
         p, q, r, s = g_quats[n, 0], g_quats[n, 1], g_quats[n, 2], g_quats[n, 3]
-        on_quats[n, 0] = p * w + q * x + r * y + s * z
-        on_quats[n, 1] = -p * x + q * w - r * z + s * y
-        on_quats[n, 2] = -p * y + q * z + r * w - s * x
-        on_quats[n, 3] = -p * z - q * y + r * x + s * w
         v_w = p * a + q * b + r * c + s * d
         v_x = -p * b + q * a + r * d - s * c
         v_y = -p * c - q * d + r * a + s * b
@@ -118,6 +115,21 @@ def _apply_back(
         slope_out[3 * BLOCK + lane] = strength * w * (v_x - along * x)
         slope_out[4 * BLOCK + lane] = strength * w * (v_y - along * y)
         slope_out[5 * BLOCK + lane] = strength * w * (v_z - along * z)
+
+
+@kernel
+def _turn_back(quats: np.ndarray, new_quats: np.ndarray, g_quats: np.ndarray, on_quats: np.ndarray) -> None:
+    """From the gradients of the turned orientations to those of the unit quaternions that were turned."""
+    for n in range(len(quats)):
+        a, b, c, d = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
+        e, f, g, h = new_quats[n, 0], new_quats[n, 1], new_quats[n, 2], new_quats[n, 3]
+        w, x = a * e + b * f + c * g + d * h, a * f - b * e - c * h + d * g
+        y, z = a * g + b * h - c * e - d * f, a * h - b * g + c * f - d * e
+        p, q, r, s = g_quats[n, 0], g_quats[n, 1], g_quats[n, 2], g_quats[n, 3]
+        on_quats[n, 0] = p * w + q * x + r * y + s * z
+        on_quats[n, 1] = -p * x + q * w - r * z + s * y
+        on_quats[n, 2] = -p * y + q * z + r * w - s * x
+        on_quats[n, 3] = -p * z - q * y + r * x + s * w
 
 
 @kernel
@@ -149,7 +161,7 @@ def _forward(
 def _backward(
     tickets: np.ndarray, chunk: int, sizes: Layout, reach: Reach, net: Factors, weights: np.ndarray,
     anchors: np.ndarray, means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, g_means: np.ndarray,
-    g_quats: np.ndarray, g_log_scales: np.ndarray, gradients: np.ndarray, on_anchors: np.ndarray, on_quats: np.ndarray,
+    g_quats: np.ndarray, g_log_scales: np.ndarray, gradients: np.ndarray, on_anchors: np.ndarray,
 ) -> None:  # fmt: skip
     count, wide = len(means), round_up(sizes.width) * BLOCK
     query = np.empty(round_up(sizes.inputs) * BLOCK, np.float32)
@@ -173,7 +185,7 @@ def _backward(
             read_query(begin, end, reach, weights, anchors, means, quats, log_scales, query)
             forward_block(net, sizes, query, words, shares, first, opened, middle, last, out)
             _activate(reach, out)
-            _apply_back(begin, end, reach, out, quats, g_means, g_quats, g_log_scales, slope_out, on_quats)
+            _apply_back(begin, end, reach, out, quats, g_means, g_quats, g_log_scales, slope_out)
             backward_block(
                 net, sizes, query, words, shares, opened, middle, last, slope_out, slope, inner, on_shares, turned,
                 gradients[unit], on_query,
@@ -184,7 +196,7 @@ def _backward(
 
 def deform(
     flat: Tensor, sizes: Layout, reach: Reach, half: bool, weights: Tensor, anchors: Tensor | None, means: Tensor,
-    quats: Tensor, log_scales: Tensor,
+    quats: Tensor, log_scales: Tensor, sampled: int = 0, offset: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Moved Gaussians; float32 on the CPU.
 
@@ -199,11 +211,14 @@ def deform(
         means: [n, 3]; like the next two, differentiable only as what is moved, not as the network's input.
         quats: unit, [n, 4].
         log_scales: [n, 3].
+        sampled: Gaussians that stand for all in the gradients of ``flat`` and ``anchors``; 0: every one counts.
+        offset: uniform in [0, 1), decides which.
 
     Returns:
         Means [n, 3], quats [n, 4] and log scales [n, 3].
     """
-    return _Deform.apply(flat, anchors, means, quats, log_scales, weights, sizes, reach, half and AVAILABLE)
+    half = half and AVAILABLE
+    return _Deform.apply(flat, anchors, means, quats, log_scales, weights, sizes, reach, half, sampled, offset)
 
 
 def _factors(flat: np.ndarray, sizes: Layout, half: bool) -> Factors:
@@ -217,35 +232,46 @@ class _Deform(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, flat: Tensor, anchors: Tensor | None, means: Tensor, quats: Tensor, log_scales: Tensor,
-        weights: Tensor, sizes: Layout, reach: Reach, half: bool,
+        weights: Tensor, sizes: Layout, reach: Reach, half: bool, sampled: int, offset: float,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         made = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(log_scales)
         wide = np.zeros((0 if anchors is None else len(anchors), LANES), np.float32)
         if anchors is not None:
             wide[:, : anchors.shape[1]] = array(anchors)
-        ctx.call = (
-            sizes, reach, _factors(array(flat), sizes, half), array(weights), wide.ravel(),
-            *map(array, (means, quats, log_scales)),
-        )  # fmt: skip
+        ctx.network = sizes, reach, _factors(array(flat), sizes, half)
+        ctx.given, ctx.wide = tuple(map(array, (weights, means, quats, log_scales))), wide.ravel()
         ctx.anchors = None if anchors is None else anchors.shape
-        run(_forward, [(np.zeros(1, np.int64), *ctx.call, *(tensor.numpy() for tensor in made))] * thread_count())
+        ctx.sampled, ctx.offset, ctx.turned = sampled, offset, made[1].numpy()
+        weighed, *moved = ctx.given
+        call = (*ctx.network, weighed, ctx.wide, *moved, *(tensor.numpy() for tensor in made))
+        run(_forward, [(np.zeros(1, np.int64), *call)] * thread_count())
         return made
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g_means: Tensor, g_quats: Tensor, g_log_scales: Tensor) -> tuple[Tensor | None, ...]:
-        total, count = ctx.call[0].total, len(ctx.call[3])
-        chunks = max(1, -(-count // CHUNK))
-        gradients, on_anchors = np.zeros((chunks, total), np.float32), np.zeros((chunks, len(ctx.call[4])), np.float32)
-        on_quats = torch.empty(count, 4)
-        call = (
-            np.zeros(1, np.int64), CHUNK, *ctx.call, *map(array, (g_means, g_quats, g_log_scales)), gradients,
-            on_anchors, on_quats.numpy(),
-        )  # fmt: skip
-        run(_backward, [call] * thread_count())
+        slopes = tuple(map(array, (g_means, g_quats, g_log_scales)))
+        on_quats = torch.empty(g_quats.shape)
+        _turn_back(ctx.given[2], ctx.turned, slopes[1], on_quats.numpy())
+        flat, on_anchors = _parameter_gradients(ctx, slopes)
         by_anchors = None
         if ctx.anchors is not None:
-            summed = on_anchors.sum(axis=0).reshape(-1, LANES)[:, : ctx.anchors[1]]
+            summed = on_anchors.reshape(-1, LANES)[:, : ctx.anchors[1]]
             by_anchors = torch.from_numpy(np.ascontiguousarray(summed))
-        flat = torch.from_numpy(gradients.sum(axis=0))
-        return flat, by_anchors, g_means, on_quats, g_log_scales, None, None, None, None
+        return torch.from_numpy(flat), by_anchors, g_means, on_quats, g_log_scales, *[None] * 6
+
+
+def _parameter_gradients(ctx: Any, slopes: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Of the flat parameters and of the anchors, summed over the Gaussians or over those that stand for them."""
+    given = ctx.given
+    sizes, reach, _ = ctx.network
+    if 0 < ctx.sampled < len(given[0]):
+        rows, factors = sample_rows(reach.reach, reach.grow, ctx.turned, *slopes, ctx.sampled, ctx.offset)
+        given = tuple(each[rows] for each in given)
+        slopes = tuple(each[rows] * factors[:, None] for each in slopes)
+    chunks = max(1, -(-len(given[0]) // CHUNK))
+    gradients, on_anchors = np.zeros((chunks, sizes.total), np.float32), np.zeros((chunks, len(ctx.wide)), np.float32)
+    weighed, *moved = given
+    call = (np.zeros(1, np.int64), CHUNK, *ctx.network, weighed, ctx.wide, *moved, *slopes, gradients, on_anchors)
+    run(_backward, [call] * thread_count())
+    return gradients.sum(axis=0), on_anchors.sum(axis=0)
