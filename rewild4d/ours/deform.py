@@ -93,8 +93,8 @@ class DeformNetwork(nn.Module):
     def _attend(self, query: Tensor, features: Tensor) -> Tensor:
         """Multi-head cross-attention over the parts, [n, inputs] and [J, K] -> [n, width]."""
         asked, asked_bias, mixed = self._attention(features)
-        shares = torch.addmm(asked_bias, query, asked.T).view(len(query), self.config.heads, -1).softmax(dim=-1)
-        return torch.addmm(self.project.bias, shares.flatten(1), mixed.T)
+        scores = torch.addmm(asked_bias, query, asked.T).view(len(query), self.config.heads, len(features))
+        return torch.addmm(self.project.bias, scores.softmax(dim=-1).flatten(1), mixed.T)
 
     def _attention(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The attention over the parts as matrices: scores from a query [H J, inputs], their bias [H J], and the hidden

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rewild4d.kernels.arrays import array
+from rewild4d.kernels.arrays import Held, array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.halves import AVAILABLE
 from rewild4d.kernels.powers import LOG2_E, exp2
@@ -57,8 +57,8 @@ def _activate(reach: Reach, out: np.ndarray) -> None:
             store(out, row * BLOCK + lane, load(out, row * BLOCK + lane) * far)
             turn = load(out, (3 + row) * BLOCK + lane) * strength
             square = fma(turn, turn, square)
-            # tanh x = 1 - 2 / (1 + exp 2x)
-            power = exp2(minimum(maximum(load(out, (6 + row) * BLOCK + lane) * twice, low), high))
+            # tanh x = 1 - 2 / (1 + exp 2x); in this order of limits a NaN stays one
+            power = exp2(minimum(high, maximum(low, load(out, (6 + row) * BLOCK + lane) * twice)))
             store(out, (6 + row) * BLOCK + lane, (one - divide(one + one, one + power)) * grow)
         inverse = divide(one, square_root(square))
         store(out, 9 * BLOCK + lane, inverse)
@@ -240,6 +240,7 @@ class _Deform(torch.autograd.Function):
             wide[:, : anchors.shape[1]] = array(anchors)
         ctx.network = sizes, reach, _factors(array(flat), sizes, half)
         ctx.given, ctx.wide = tuple(map(array, (weights, means, quats, log_scales))), wide.ravel()
+        ctx.held = Held((flat, weights, means, quats, log_scales))
         ctx.anchors = None if anchors is None else anchors.shape
         ctx.sampled, ctx.offset, ctx.turned = sampled, offset, made[1].numpy()
         weighed, *moved = ctx.given
@@ -250,6 +251,7 @@ class _Deform(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g_means: Tensor, g_quats: Tensor, g_log_scales: Tensor) -> tuple[Tensor | None, ...]:
+        ctx.held.check()
         slopes = tuple(map(array, (g_means, g_quats, g_log_scales)))
         on_quats = torch.empty(g_quats.shape)
         _turn_back(ctx.given[2], ctx.turned, slopes[1], on_quats.numpy())

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rewild4d.kernels.arrays import array
+from rewild4d.kernels.arrays import Held, array
 from rewild4d.ours.fused.layers import OUTPUTS, Layout, layout, padded
 
 
@@ -72,13 +72,15 @@ class _Fold(torch.autograd.Function):
         pieces.up[0][:], pieces.up[1][:] = own.up, own.up_bias
         pieces.down[0][:], pieces.down[1][:] = own.down, own.down_bias
         pieces.out[0][:], pieces.out[1][:] = own.out, own.out_bias
-        ctx.sizes, ctx.scale, ctx.held = sizes, scale, (given, own, keys, values, asking, mixing)
+        ctx.sizes, ctx.scale, ctx.made = sizes, scale, (given, own, keys, values, asking, mixing)
+        ctx.held = Held((features, *layers))
         return torch.from_numpy(flat)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
-        sizes, (given, own, keys, values, asking, mixing) = ctx.sizes, ctx.held
+        ctx.held.check()
+        sizes, (given, own, keys, values, asking, mixing) = ctx.sizes, ctx.made
         heads, width = sizes.heads, sizes.width
         pieces = matrices(array(slope), sizes)
         on_asked = pieces.ask[0].reshape(heads, -1, sizes.inputs)

@@ -156,7 +156,7 @@ def _layer_gradient(
 def _positive(given: np.ndarray, count: int, result: np.ndarray) -> None:
     zero = splat(np.float32(0))
     for i in range(0, count, LANES):
-        store(result, i, maximum(load(given, i), zero))
+        store(result, i, maximum(zero, load(given, i)))  # in this order a NaN stays one
 
 
 @kernel
@@ -178,7 +178,7 @@ def _softmax(scores: np.ndarray, heads: int, parts: int) -> None:
                 top = maximum(top, load(scores, first + part * BLOCK))
             total = splat(np.float32(0))
             for part in range(parts):
-                power = exp2(maximum((load(scores, first + part * BLOCK) - top) * log2_e, lowest))
+                power = exp2(maximum(lowest, (load(scores, first + part * BLOCK) - top) * log2_e))
                 store(scores, first + part * BLOCK, power)
                 total = total + power
             share = divide(splat(np.float32(1)), total)

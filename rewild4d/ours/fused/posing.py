@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rewild4d.kernels.arrays import array
+from rewild4d.kernels.arrays import Held, array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import take_ticket
 from rewild4d.kernels.threads import run, thread_count
@@ -137,7 +137,7 @@ def poses(
 
     Args:
         sizes: of the network.
-        parameters: contiguous float32, in the network's own order; the only inputs that get gradients.
+        parameters: float32, in the network's own order; the only inputs that get gradients.
         code: [B, E].
         flipped: which poses are wanted with left and right exchanged, bool, [B].
         mirror: joint on the other side, int64, [J].
@@ -156,16 +156,19 @@ class _Poses(torch.autograd.Function):
         batch, units = len(code), -(-len(code) // sizes.items)
         made = tuple(np.empty((batch, sizes.joints, size), np.float32) for size in (4, 3, sizes.width))
         kept = np.empty((units if keep else 1, sizes.kept), np.float32)
-        addresses = np.array([parameter.data_ptr() for parameter in parameters])
+        flat = tuple(parameter.contiguous() for parameter in parameters)
+        addresses = np.array([parameter.data_ptr() for parameter in flat])
         starts = _starts(tuple(parameter.numel() for parameter in parameters))
         call = (np.zeros(1, np.int64), sizes, addresses, starts, array(code), flipped, mirror, kept, *made)
         run(_forward, [call] * min(thread_count(), len(kept)))
+        ctx.held, ctx.flat = Held(parameters), flat
         ctx.parameters, ctx.given = parameters, (sizes, addresses, starts, flipped, mirror, kept)
         return tuple(map(torch.from_numpy, made))
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        ctx.held.check()
         kept, starts = ctx.given[5], ctx.given[2]
         gradients = np.empty((len(kept), starts[-1]), np.float32)
         call = np.zeros(1, np.int64), *ctx.given, *map(array, slopes), gradients

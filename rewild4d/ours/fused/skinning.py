@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rewild4d.kernels.arrays import array
+from rewild4d.kernels.arrays import Held, array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.rows import sum_rows
 from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
@@ -149,12 +149,13 @@ class _Skin(torch.autograd.Function):
         given = tuple(map(array, (means, quats, weights)))
         call = np.zeros(1, np.int64), *given, rows, new_means.numpy(), new_quats.numpy()
         run(_forward, [call] * thread_count())
-        ctx.given, ctx.tables = given, (rows, signs)
+        ctx.given, ctx.tables, ctx.held = given, (rows, signs), Held((means, quats, weights))
         return new_means, new_quats, new_means.clone(), new_quats.clone()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor, ...]:
+        ctx.held.check()
         made = tuple(torch.empty(each.shape) for each in ctx.given)
         joints, chunks = ctx.given[2].shape[1], max(1, -(-len(ctx.given[0]) // CHUNK))
         on_rows = np.zeros((chunks, joints * LANES), np.float32)

@@ -126,7 +126,7 @@ def gelu(given: np.ndarray, count: int, bend: np.ndarray) -> None:
     lowest, exponent = splat(np.float32(-126)), splat(np.float32(-0.5) * LOG2_E)
     for place in range(0, count, LANES):
         x = load(given, place)
-        bell = exp2(maximum(x * x * exponent, lowest))
+        bell = exp2(maximum(lowest, x * x * exponent))
         t = divide(one, fma(absolute(x), splat(np.float32(0.3275911 / math.sqrt(2.0))), one))
         tail = fma(t, splat(np.float32(1.061405429)), splat(np.float32(-1.453152027)))
         tail = fma(tail, t, splat(np.float32(1.421413741)))
@@ -146,7 +146,7 @@ def softmax(scores: np.ndarray, first: int, keys: int, wide: int, factor: float)
         for key in range(1, keys):
             top = maximum(top, load(scores, lane + key * wide))
         for key in range(keys):
-            power = exp2(maximum((load(scores, lane + key * wide) - top) * scale, lowest))
+            power = exp2(maximum(lowest, (load(scores, lane + key * wide) - top) * scale))
             store(scores, lane + key * wide, power)
             total = total + power
         share = divide(splat(np.float32(1)), total)
