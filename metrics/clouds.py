@@ -14,6 +14,10 @@ THREADED = 50_000
 """From this many queries on, two threads are worth their start."""
 
 
+LARGEST = 1e100
+"""Coordinate whose square, and whose products with others, are still numbers."""
+
+
 def as_points(cloud: Tensor, name: str, empty: bool = False) -> Points:
     """The points in double precision on the CPU, [n, 3].
 
@@ -23,7 +27,7 @@ def as_points(cloud: Tensor, name: str, empty: bool = False) -> Points:
         empty: whether a cloud without points will do.
 
     Raises:
-        ValueError: another shape, a NaN or an infinite value, no points.
+        ValueError: another shape, a NaN, an infinite or a huge value, no points.
     """
     if cloud.ndim != 2 or cloud.shape[1] != 3:
         raise ValueError(f"expected the {name} as points [n, 3], got {tuple(cloud.shape)}")
@@ -31,6 +35,8 @@ def as_points(cloud: Tensor, name: str, empty: bool = False) -> Points:
     bad = int((~np.isfinite(points)).any(axis=1).sum())
     if bad:
         raise ValueError(f"expected finite points in the {name}, got {bad} of {len(points)} with a NaN or an infinity")
+    if len(points) and np.abs(points).max() > LARGEST:
+        raise ValueError(f"expected coordinates up to {LARGEST:g} in the {name}, got {np.abs(points).max():.3g}")
     if not len(points) and not empty:
         raise ValueError(f"expected at least one point in the {name}, got none")
     return points

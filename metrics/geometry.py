@@ -145,6 +145,8 @@ def compare_sequence(
     for prediction, truth in zip(predictions, truths, strict=True):
         as_points(prediction, "prediction", empty=True)
         as_points(truth, "truth")
+    if diagonal is not None and not 0 <= diagonal < math.inf:
+        raise ValueError(f"expected a finite diagonal that is not negative, got {diagonal}")
     length = box_diagonal(as_points(truths[0], "truth")) if diagonal is None else diagonal
     given = [subsample(cloud, points, seed) for cloud in predictions]
     targets = [subsample(cloud, points, seed + 1) for cloud in truths]

@@ -228,6 +228,10 @@ def i3d_dist(prediction: Features, truth: Features, *, conditions: Conditions = 
     if len(x) != len(y):
         raise ValueError(f"expected pairs of clips, got {len(x)} and {len(y)}")
     reason = not_computed(prediction, truth, least=1)
+    if not bool(x.isfinite().all() and y.isfinite().all()):
+        raise ValueError("expected finite features, got a NaN or an infinite value")
+    if not reason and x.shape[1] < 2:
+        reason = f"not computed: a spread over at least 2 features is needed, got {x.shape[1]}"
     if not reason:
         spread = x.std(1) - y.std(1)
         value = float(((x - y).square().sum(1) + spread.square()).mean())

@@ -104,7 +104,7 @@ def write_splats(path: Path, splats: Splats) -> None:
     Raises:
         UserError: the folder cannot be written.
         ValueError: values that are not finite, scales not above zero, opacities outside [0, 1], coefficients other
-            than 1, 4, 9 or 16 a Gaussian.
+            than 1, 4, 9 or 16 a Gaussian, and what `read_splats` refuses.
     """
     count, bands = len(splats), splats.colors.shape[1]
     if bands not in (1, 4, 9, 16):
@@ -125,6 +125,11 @@ def write_splats(path: Path, splats: Splats) -> None:
     values = torch.cat([part.detach().cpu().float() for part in parts.values()], dim=1).numpy()
     if not np.isfinite(values).all():
         raise ValueError("expected finite Gaussians, scales above zero, opacities in [0, 1]; got something else")
+    for name, most in LARGEST.items():
+        if (largest := float(getattr(splats, name).detach().abs().max()) if count else 0.0) > most:
+            raise ValueError(f"expected {name} up to {most:g}, which is what can be read again, got {largest:.3g}")
+    if count and not splats.quats.detach().square().sum(1).min() > 0:
+        raise ValueError("expected orientations (quats) of any length but zero, got a zero")
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     header = "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""])
     with atomic(Path(path)) as temporary:

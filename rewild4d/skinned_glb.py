@@ -55,10 +55,16 @@ def write_glb(path: Path, reconstruction: Articulated, times: Sequence[float], n
     Args:
         path: of the file.
         reconstruction: what is written.
-        times: key times in seconds, ascending.
+        times: key times in seconds, strictly ascending in single precision, as glTF stores them.
         name: of the mesh.
         copyright: goes into the file.
+
+    Raises:
+        ValueError: times that do not ascend.
     """
+    keys = torch.tensor(times, dtype=torch.float32)
+    if not bool((keys[1:] > keys[:-1]).all()):
+        raise ValueError(f"expected key times that ascend in single precision, got {list(times)}")
     splats, weights = _seen(reconstruction.canonical(), reconstruction.weights)
     pivots, parents = reconstruction.pivots.double().cpu(), reconstruction.parents.cpu().tolist()
     corners, faces, normals = squares(splats)

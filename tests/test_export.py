@@ -25,7 +25,7 @@ from rewild4d.ours.config import Canonical, Config, Deform, Skinning
 from rewild4d.ours.model import build_model
 from rewild4d.ours.reconstruction import OursReconstruction, from_fit
 from rewild4d.ply import read_splats
-from rewild4d.skinned_glb import SEEN, influences, squares
+from rewild4d.skinned_glb import SEEN, influences, squares, write_glb
 from rewild4d.transforms import skin_points
 from rewild4d.types import Case, Crop, Frame, Splats
 
@@ -208,3 +208,9 @@ def test_the_command(
     assert stop.value.code == 2
     assert "nothing can be written: glb: the method has no skeleton" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
+
+
+def test_key_times_that_do_not_ascend_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"key times that ascend in single precision, got \[0.0, 0.1, 0.1\]"):
+        write_glb(tmp_path / "a.glb", None, [0.0, 0.1, 0.1], "", "")  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())

@@ -190,6 +190,11 @@ def test_bad_clouds_are_named() -> None:
     good, broken = animal(50, 0), animal(50, 0).index_fill(0, torch.tensor(7), math.inf)
     with pytest.raises(ValueError, match="finite points in the prediction, got 1 of 50 with a NaN or an infinity"):
         compare(broken, good)
+    with pytest.raises(ValueError, match=r"coordinates up to 1e\+100 in the prediction, got [0-9.]+e\+200"):
+        compare(good.double() * 1e200, good)
+    for diagonal in (math.inf, math.nan, -1.0):
+        with pytest.raises(ValueError, match="a finite diagonal that is not negative"):
+            compare(good, good, diagonal=diagonal)
     with pytest.raises(ValueError, match="finite points in the truth, got 1 of 50"):
         chamfer(good, broken)
     with pytest.raises(ValueError, match="at least one point in the truth, got none"):

@@ -115,6 +115,10 @@ def test_what_cannot_be_written_leaves_nothing(change: str, value: float, tmp_pa
         write_splats(tmp_path / "a.ply", broken)
     with pytest.raises(ValueError, match="expected 1, 4, 9 or 16 colour coefficients per Gaussian, got 2"):
         write_splats(tmp_path / "a.ply", replace(splats(0), colors=torch.zeros(7, 2, 3)))
+    with pytest.raises(ValueError, match=r"expected means up to 1e\+09, .* got 2e\+09"):
+        write_splats(tmp_path / "a.ply", replace(splats(0), means=torch.full((7, 3), 2e9)))
+    with pytest.raises(ValueError, match="any length but zero"):
+        write_splats(tmp_path / "a.ply", replace(splats(0), quats=torch.zeros(7, 4)))
     assert not list(tmp_path.iterdir())
 
 

@@ -118,6 +118,16 @@ def test_no_nan_from_any_finite_input(seed: int) -> None:
         assert torch.isfinite(slope).all(), name
 
 
+def test_a_zero_quaternion_turns_nothing() -> None:
+    inputs = {name: value.float() for name, value in scene(50, 3, 1, 40, 30, 1).items()}
+    inputs["quats"][::2] = 0
+    turned = inputs | {"quats": inputs["quats"].clone()}
+    turned["quats"][::2, 0] = 1
+    assert torch.equal(render(inputs, 40, 30)[0], render(turned, 40, 30)[0])
+    wanted = render({name: value.double() for name, value in inputs.items()}, 40, 30, backend="reference")[0]
+    assert float((wanted - render(inputs, 40, 30)[0]).abs().max()) < 1e-4
+
+
 def test_features_up_to_their_limit_have_gradients() -> None:
     inputs = {name: value.float() for name, value in scene(50, 3, 1, 40, 30, 0).items()}
     loud = inputs | {"features": 2.0**100 * (2 * (torch.arange(150).view(50, 3) % 2) - 1).float()}

@@ -141,6 +141,11 @@ def test_paired_distance_by_hand_and_averaged() -> None:
     found = i3d_dist(x, y)
     assert found.value == pytest.approx((4 + math.sqrt(2) ** 2 + 0) / 2)
     assert found.name == "I3D-dist (paired, N=1)"
+    with pytest.raises(ValueError, match="expected finite features, got a NaN"):
+        i3d_dist(Features(f * math.nan, torch.arange(2), "i3d-k400", "", "", 16), y)
+    narrow = [Features(rows[:, :1], torch.arange(2), "i3d-k400", "", "", 16) for rows in (f, g)]
+    assert i3d_dist(*narrow).value is None
+    assert i3d_dist(*narrow).note == "not computed: a spread over at least 2 features is needed, got 1"
 
 
 def test_ragged_matrices_are_refused() -> None:

@@ -1,5 +1,7 @@
 """The one entry point: checks the input and hands it to a backend."""
 
+import math
+
 from torch import Tensor
 
 from rewild4d.rasterizer import backends
@@ -30,7 +32,7 @@ def rasterize(
 
     Args:
         means: centres in the world, [N, 3].
-        quats: orientations, wxyz, of any length but zero (normalised here), [N, 4].
+        quats: orientations, wxyz, of any length (normalised here; zero turns nothing), [N, 4].
         scales: standard deviations along the Gaussian's own axes, [N, 3].
         opacities: in [0, 1], [N].
         features: any number of channels (colour, normal, depth, part), magnitudes up to `checks.MOST_FEATURE`, [N, C].
@@ -66,8 +68,8 @@ def rasterize(
             )
         background = background.to(means).expand(views, channels)
         named["background"] = background
-    if not (eps2d >= 0 and near > 0):
-        raise ValueError(f"expected eps2d >= 0 and near > 0, got eps2d={eps2d} and near={near}.")
+    if not (0 <= eps2d < math.inf and 0 < near < math.inf):
+        raise ValueError(f"expected finite eps2d >= 0 and near > 0, got eps2d={eps2d} and near={near}.")
     name = backends.resolve(backend, means.device, means.dtype)
     if name not in backends.CHECK_VALUES:
         check_values(named)
