@@ -28,9 +28,7 @@ def rasterize(
 ) -> tuple[Tensor, Tensor, RasterInfo]:
     """Same as `rewild4d.rasterizer.rasterize`, on checked input; ``background`` is [V, C]."""
     still = quats.new_tensor((1.0, 0.0, 0.0, 0.0))
-    quats = torch.where(
-        (quats == 0).all(-1, keepdim=True), still, quats
-    )  # no length: no rotation, as in the kernels
+    quats = torch.where((quats == 0).all(-1, keepdim=True), still, quats)  # no length: no rotation, as in the kernels
     half = quat_to_matrix(quats) * scales[:, None, :]
     covariances = half @ half.mT
     projected = [
