@@ -252,7 +252,7 @@ class _Deform(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, g_means: Tensor, g_quats: Tensor, g_log_scales: Tensor) -> tuple[Tensor | None, ...]:
         ctx.held.check()
-        slopes = tuple(map(array, (g_means, g_quats, g_log_scales)))
+        slopes = array(g_means), array(g_quats), array(g_log_scales)
         on_quats = torch.empty(g_quats.shape)
         _turn_back(ctx.given[2], ctx.turned, slopes[1], on_quats.numpy())
         flat, on_anchors = _parameter_gradients(ctx, slopes)
@@ -263,14 +263,15 @@ class _Deform(torch.autograd.Function):
         return torch.from_numpy(flat), by_anchors, g_means, on_quats, g_log_scales, *[None] * 6
 
 
-def _parameter_gradients(ctx: Any, slopes: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _parameter_gradients(ctx: Any, slopes: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Of the flat parameters and of the anchors, summed over the Gaussians or over those that stand for them."""
     given = ctx.given
     sizes, reach, _ = ctx.network
     if 0 < ctx.sampled < len(given[0]):
         rows, factors = sample_rows(reach.reach, reach.grow, ctx.turned, *slopes, ctx.sampled, ctx.offset)
         given = tuple(each[rows] for each in given)
-        slopes = tuple(each[rows] * factors[:, None] for each in slopes)
+        on_means, on_quats, on_scales = (each[rows] * factors[:, None] for each in slopes)
+        slopes = on_means, on_quats, on_scales
     chunks = max(1, -(-len(given[0]) // CHUNK))
     gradients, on_anchors = np.zeros((chunks, sizes.total), np.float32), np.zeros((chunks, len(ctx.wide)), np.float32)
     weighed, *moved = given
