@@ -12,8 +12,6 @@ Points = NDArray[np.float64]
 
 THREADED = 50_000
 """From this many queries on, two threads are worth their start."""
-
-
 LARGEST = 1e100
 """Coordinate whose square, and whose products with others, are still numbers."""
 

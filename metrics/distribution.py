@@ -296,5 +296,14 @@ def _require_rows(x: Tensor, y: Tensor) -> None:
     if x.ndim != 2 or y.ndim != 2 or x.shape[1] != y.shape[1] or min(len(x), len(y)) < 2:
         shapes = f"{tuple(x.shape)} and {tuple(y.shape)}"
         raise ValueError(f"expected features [n, D] and [m, D] with n, m of at least 2, got {shapes}")
+    require_finite(x, y)
+
+
+def require_finite(x: Tensor, y: Tensor) -> None:
+    """Refuse two sets of features with a NaN or an infinite value in them.
+
+    Raises:
+        ValueError: there is one.
+    """
     if not bool(x.isfinite().all() and y.isfinite().all()):
         raise ValueError("expected finite features, got a NaN or an infinite value")

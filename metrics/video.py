@@ -15,7 +15,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from rewild4d.metrics.distribution import frechet, kid
+from rewild4d.metrics.distribution import frechet, kid, require_finite
 from rewild4d.metrics.samples import (
     Conditions,
     Distance,
@@ -228,8 +228,7 @@ def i3d_dist(prediction: Features, truth: Features, *, conditions: Conditions = 
     if len(x) != len(y):
         raise ValueError(f"expected pairs of clips, got {len(x)} and {len(y)}")
     reason = not_computed(prediction, truth, least=1)
-    if not bool(x.isfinite().all() and y.isfinite().all()):
-        raise ValueError("expected finite features, got a NaN or an infinite value")
+    require_finite(x, y)
     if not reason and x.shape[1] < 2:
         reason = f"not computed: a spread over at least 2 features is needed, got {x.shape[1]}"
     if not reason:

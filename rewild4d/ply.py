@@ -128,7 +128,7 @@ def write_splats(path: Path, splats: Splats) -> None:
     for name, most in LARGEST.items():
         if (largest := float(getattr(splats, name).detach().abs().max()) if count else 0.0) > most:
             raise ValueError(f"expected {name} up to {most:g}, which is what can be read again, got {largest:.3g}")
-    if count and not splats.quats.detach().square().sum(1).min() > 0:
+    if bool((splats.quats == 0).all(dim=1).any()):
         raise ValueError("expected orientations (quats) of any length but zero, got a zero")
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     header = "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""])

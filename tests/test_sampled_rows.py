@@ -10,7 +10,7 @@ from rewild4d.ours.deform import DeformNetwork, Posed
 from rewild4d.ours.fused.sampled_rows import sample_rows
 
 
-def worth_one_each(worth: list[float]) -> tuple[np.ndarray, ...]:
+def gradients_of(worth: list[float]) -> tuple[np.ndarray, ...]:
     """Gradients of the means alone, of these lengths; orientations and gradients as `sample_rows` takes them."""
     means = np.zeros((len(worth), 3), np.float32)
     means[:, 1] = worth
@@ -19,7 +19,7 @@ def worth_one_each(worth: list[float]) -> tuple[np.ndarray, ...]:
 
 
 def draw(worth: list[float], wanted: int, offset: float) -> tuple[list[int], list[float]]:
-    rows, factors = sample_rows(1.0, 1.0, *worth_one_each(worth), wanted, offset)
+    rows, factors = sample_rows(1.0, 1.0, *gradients_of(worth), wanted, offset)
     return rows.tolist(), factors.tolist()
 
 
@@ -71,9 +71,8 @@ def network() -> DeformNetwork:
     return made
 
 
-def slopes_of(network: DeformNetwork, sampled: bool, offset: float) -> tuple[list[torch.Tensor], torch.Tensor]:
+def slopes_of(network: DeformNetwork, count: int, offset: float) -> tuple[list[torch.Tensor], torch.Tensor]:
     """Gradients of the Gaussians and of anchors, and of all parameters in one row."""
-    count = 300 if sampled else 60  # 60 Gaussians of 60 are all of them
     places = [normal(count, 3, seed=2), unit(count, 4, seed=3), normal(count, 3, seed=4) - 3, normal(20, 8, seed=5)]
     leaves = [place.float().requires_grad_() for place in places]
     weights = normal(count, 20, seed=6).float().softmax(-1)
@@ -87,9 +86,9 @@ def slopes_of(network: DeformNetwork, sampled: bool, offset: float) -> tuple[lis
 
 def test_the_networks_gradient_is_right_in_the_mean_and_that_of_the_gaussians_exact(network: DeformNetwork) -> None:
     offsets = [(i + 0.5) / 200 for i in range(200)]
-    drawn = [slopes_of(network, True, offset) for offset in offsets]
+    drawn = [slopes_of(network, 300, offset) for offset in offsets]
     network.config = Deform(width=16, heads=2, half=False)
-    whole, own = slopes_of(network, True, 0.0)
+    whole, own = slopes_of(network, 300, 0.0)
     for given, _ in drawn:
         assert all(torch.equal(a, b) for a, b in zip(given[:3], whole[:3], strict=True))
     assert (torch.stack([given[3] for given, _ in drawn]).mean(0) - whole[3]).norm() < 0.02 * whole[3].norm()
@@ -100,6 +99,6 @@ def test_the_networks_gradient_is_right_in_the_mean_and_that_of_the_gaussians_ex
 
 
 def test_as_many_as_there_are_is_the_whole_sum(network: DeformNetwork) -> None:
-    _, drawn = slopes_of(network, False, 0.3)
+    _, drawn = slopes_of(network, 60, 0.3)
     network.config = Deform(width=16, heads=2, half=False)
-    assert torch.equal(drawn, slopes_of(network, False, 0.3)[1])
+    assert torch.equal(drawn, slopes_of(network, 60, 0.3)[1])

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rewild4d.kernels.arrays import Held, array
+from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.halves import AVAILABLE
 from rewild4d.kernels.powers import LOG2_E, exp2
@@ -239,23 +239,22 @@ class _Deform(torch.autograd.Function):
         if anchors is not None:
             wide[:, : anchors.shape[1]] = array(anchors)
         ctx.network = sizes, reach, _factors(array(flat), sizes, half)
-        ctx.given, ctx.wide = tuple(map(array, (weights, means, quats, log_scales))), wide.ravel()
-        ctx.held = Held((flat, weights, means, quats, log_scales))
-        ctx.anchors = None if anchors is None else anchors.shape
-        ctx.sampled, ctx.offset, ctx.turned = sampled, offset, made[1].numpy()
-        weighed, *moved = ctx.given
-        call = (*ctx.network, weighed, ctx.wide, *moved, *(tensor.numpy() for tensor in made))
+        ctx.wide, ctx.anchors = wide.ravel(), None if anchors is None else anchors.shape
+        ctx.sampled, ctx.offset = sampled, offset
+        moved = map(array, (means, quats, log_scales))
+        call = (*ctx.network, array(weights), ctx.wide, *moved, *(tensor.numpy() for tensor in made))
         run(_forward, [(np.zeros(1, np.int64), *call)] * thread_count())
+        ctx.save_for_backward(flat, weights, means, quats, log_scales, made[1])
         return made
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g_means: Tensor, g_quats: Tensor, g_log_scales: Tensor) -> tuple[Tensor | None, ...]:
-        ctx.held.check()
+        _, *given, turned = map(array, ctx.saved_tensors)
         slopes = array(g_means), array(g_quats), array(g_log_scales)
         on_quats = torch.empty(g_quats.shape)
-        _turn_back(ctx.given[2], ctx.turned, slopes[1], on_quats.numpy())
-        flat, on_anchors = _parameter_gradients(ctx, slopes)
+        _turn_back(given[2], turned, slopes[1], on_quats.numpy())
+        flat, on_anchors = _parameter_gradients(ctx, given, turned, slopes)
         by_anchors = None
         if ctx.anchors is not None:
             summed = on_anchors.reshape(-1, LANES)[:, : ctx.anchors[1]]
@@ -263,13 +262,14 @@ class _Deform(torch.autograd.Function):
         return torch.from_numpy(flat), by_anchors, g_means, on_quats, g_log_scales, *[None] * 6
 
 
-def _parameter_gradients(ctx: Any, slopes: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _parameter_gradients(
+    ctx: Any, given: list[np.ndarray], turned: np.ndarray, slopes: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
     """Of the flat parameters and of the anchors, summed over the Gaussians or over those that stand for them."""
-    given = ctx.given
     sizes, reach, _ = ctx.network
     if 0 < ctx.sampled < len(given[0]):
-        rows, factors = sample_rows(reach.reach, reach.grow, ctx.turned, *slopes, ctx.sampled, ctx.offset)
-        given = tuple(each[rows] for each in given)
+        rows, factors = sample_rows(reach.reach, reach.grow, turned, *slopes, ctx.sampled, ctx.offset)
+        given = [each[rows] for each in given]
         on_means, on_quats, on_scales = (each[rows] * factors[:, None] for each in slopes)
         slopes = on_means, on_quats, on_scales
     chunks = max(1, -(-len(given[0]) // CHUNK))

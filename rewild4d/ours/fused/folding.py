@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rewild4d.kernels.arrays import Held, array
+from rewild4d.kernels.arrays import array
 from rewild4d.ours.fused.layers import OUTPUTS, Layout, layout, padded
 
 
@@ -51,6 +51,13 @@ def fold(features: Tensor, layers: Layers, heads: int) -> tuple[Tensor, Layout]:
     return _Fold.apply(features, sizes, *layers), sizes
 
 
+def _by_head(own: Layers, heads: int) -> tuple[np.ndarray, np.ndarray]:
+    """Query weights [H, S, inputs] and projection weights [H, width, S] of each head."""
+    width, inputs = own.query.shape
+    asking = own.query.reshape(heads, width // heads, inputs)
+    return asking, own.project.reshape(width, heads, width // heads).transpose(1, 0, 2)
+
+
 class _Fold(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, sizes: Layout, *layers: Tensor) -> Tensor:
@@ -61,8 +68,7 @@ class _Fold(torch.autograd.Function):
         # [H, J, S] and [H, S, J]
         keys = (given @ own.key.T + own.key_bias).reshape(-1, heads, size).transpose(1, 0, 2) * scale
         values = (given @ own.value.T + own.value_bias).reshape(-1, heads, size).transpose(1, 2, 0)
-        asking = own.query.reshape(heads, size, inputs)
-        mixing = own.project.reshape(width, heads, size).transpose(1, 0, 2)
+        asking, mixing = _by_head(own, heads)
         flat = np.zeros(sizes.total, np.float32)
         pieces = matrices(flat, sizes)
         pieces.ask[0][:] = (keys @ asking).reshape(sizes.scores, inputs)
@@ -72,16 +78,18 @@ class _Fold(torch.autograd.Function):
         pieces.up[0][:], pieces.up[1][:] = own.up, own.up_bias
         pieces.down[0][:], pieces.down[1][:] = own.down, own.down_bias
         pieces.out[0][:], pieces.out[1][:] = own.out, own.out_bias
-        ctx.sizes, ctx.scale, ctx.made = sizes, scale, (given, own, keys, values, asking, mixing)
-        ctx.held = Held((features, *layers))
+        ctx.save_for_backward(features, *layers)
+        ctx.sizes, ctx.scale, ctx.made = sizes, scale, (keys, values)
         return torch.from_numpy(flat)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
-        ctx.held.check()
-        sizes, (given, own, keys, values, asking, mixing) = ctx.sizes, ctx.made
+        features, *layers = ctx.saved_tensors
+        given, own = array(features), Layers(*map(array, layers))
+        sizes, (keys, values) = ctx.sizes, ctx.made
         heads, width = sizes.heads, sizes.width
+        asking, mixing = _by_head(own, heads)
         pieces = matrices(array(slope), sizes)
         on_asked = pieces.ask[0].reshape(heads, -1, sizes.inputs)
         on_bias = pieces.ask[1].reshape(heads, -1, 1)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rewild4d.kernels.arrays import Held, array
+from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import take_ticket
 from rewild4d.kernels.threads import run, thread_count
@@ -148,6 +148,12 @@ def poses(
     return _Poses.apply(sizes, code, flipped, mirror, torch.is_grad_enabled(), *parameters)
 
 
+def _placed(parameters: Sequence[Tensor]) -> tuple[list[Tensor], np.ndarray]:
+    """The parameters without gaps, to be held while a kernel reads them, and their addresses."""
+    flat = [parameter.contiguous() for parameter in parameters]
+    return flat, np.array([parameter.data_ptr() for parameter in flat])
+
+
 class _Poses(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -156,27 +162,27 @@ class _Poses(torch.autograd.Function):
         batch, units = len(code), -(-len(code) // sizes.items)
         made = tuple(np.empty((batch, sizes.joints, size), np.float32) for size in (4, 3, sizes.width))
         kept = np.empty((units if keep else 1, sizes.kept), np.float32)
-        flat = tuple(parameter.contiguous() for parameter in parameters)
-        addresses = np.array([parameter.data_ptr() for parameter in flat])
+        flat, addresses = _placed(parameters)
         starts = _starts(tuple(parameter.numel() for parameter in parameters))
         call = (np.zeros(1, np.int64), sizes, addresses, starts, array(code), flipped, mirror, kept, *made)
         run(_forward, [call] * min(thread_count(), len(kept)))
-        ctx.held, ctx.flat = Held(parameters), flat
-        ctx.parameters, ctx.given = parameters, (sizes, addresses, starts, flipped, mirror, kept)
+        ctx.save_for_backward(*parameters)
+        ctx.given = sizes, starts, flipped, mirror, kept
         return tuple(map(torch.from_numpy, made))
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
-        ctx.held.check()
-        kept, starts = ctx.given[5], ctx.given[2]
+        parameters = ctx.saved_tensors
+        flat, addresses = _placed(parameters)
+        sizes, starts, flipped, mirror, kept = ctx.given
         gradients = np.empty((len(kept), starts[-1]), np.float32)
-        call = np.zeros(1, np.int64), *ctx.given, *map(array, slopes), gradients
+        call = (np.zeros(1, np.int64), sizes, addresses, starts, flipped, mirror, kept, *map(array, slopes), gradients)
         run(_backward, [call] * min(thread_count(), len(kept)))
         total = torch.from_numpy(gradients[0] if len(kept) == 1 else gradients.sum(axis=0))
-        pieces = total.split([parameter.numel() for parameter in ctx.parameters])
+        pieces = total.split([parameter.numel() for parameter in parameters])
         shaped = (
             piece if parameter.dim() == 1 else piece.view(parameter.shape)
-            for piece, parameter in zip(pieces, ctx.parameters, strict=True)
+            for piece, parameter in zip(pieces, parameters, strict=True)
         )
         return None, None, None, None, None, *shaped

@@ -12,7 +12,7 @@ import numpy as np
 from rewild4d.kernels.compiling import kernel
 
 ROUNDS = 30
-"""Most rounds of finding the limit; each settles at least one Gaussian more, and nearly all are settled in five."""
+"""Most rounds of finding the limit. After fewer than it needs the draw is smaller than wanted, and as unbiased."""
 
 
 @kernel

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rewild4d.kernels.arrays import Held, array
+from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.rows import sum_rows
 from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
@@ -149,18 +149,19 @@ class _Skin(torch.autograd.Function):
         given = tuple(map(array, (means, quats, weights)))
         call = np.zeros(1, np.int64), *given, rows, new_means.numpy(), new_quats.numpy()
         run(_forward, [call] * thread_count())
-        ctx.given, ctx.tables, ctx.held = given, (rows, signs), Held((means, quats, weights))
+        ctx.save_for_backward(means, quats, weights)
+        ctx.tables = rows, signs
         return new_means, new_quats, new_means.clone(), new_quats.clone()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor, ...]:
-        ctx.held.check()
-        made = tuple(torch.empty(each.shape) for each in ctx.given)
-        joints, chunks = ctx.given[2].shape[1], max(1, -(-len(ctx.given[0]) // CHUNK))
+        given = tuple(map(array, ctx.saved_tensors))
+        made = tuple(torch.empty(each.shape) for each in given)
+        joints, chunks = given[2].shape[1], max(1, -(-len(given[0]) // CHUNK))
         on_rows = np.zeros((chunks, joints * LANES), np.float32)
         call = (
-            np.zeros(1, np.int64), *ctx.given, *ctx.tables, *map(array, slopes), *(each.numpy() for each in made),
+            np.zeros(1, np.int64), *given, *ctx.tables, *map(array, slopes), *(each.numpy() for each in made),
             on_rows,
         )  # fmt: skip
         run(_backward, [call] * thread_count())
