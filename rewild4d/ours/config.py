@@ -205,8 +205,8 @@ class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """Compactness of the parts (paper)."""
     compact_power: Positive = 2.0
     """Exponent on the weights: a squared weight leaves less torso in every part."""
-    compact_every: Count = 1
-    """Steps between evaluations."""
+    compact_every: Count = 4
+    """Steps between evaluations; +.02 dB in the mean of 24 pairs with `deform.sampled` (leaderboard/results)."""
     smooth: Weight = 0.1
     """Smoothness of rendered normals (paper)."""
     smooth_every: Count = 2
