@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from rewild4d.datasets.animal import Surface
-from rewild4d.datasets.gltf import Document, Floats, consistent, sample
+from rewild4d.datasets.gltf import Document, Floats, consistent
+from rewild4d.datasets.morphs import target_offsets, target_weights
 from rewild4d.datasets.rig import clips, influences, inverse_binds, read_surface
 from rewild4d.errors import UserError
 from rewild4d.meshes import Mesh
@@ -54,19 +55,17 @@ def _parts(document: Document, index: int, times: Floats, world: Floats) -> list
     node = document.tree.nodes[index]
     if node.mesh is None:
         return []
-    found = document.tree.meshes[node.mesh]
     bones = world[:, index, None] if node.skin is None else _bones(document, node.skin, world)
     parts = []
-    for primitive in found.primitives:
+    for primitive in document.tree.meshes[node.mesh].primitives:
         if primitive.mode not in (None, 4, 5, 6):
             continue
         count = document.tree.accessors[primitive.attributes.POSITION].count
         rigid = np.zeros((count, 1), np.int64), np.ones((count, 1))
         bound = rigid if node.skin is None else influences(document, primitive, bones.shape[1])
         surface = read_surface(document, primitive, np.eye(4), *bound)
-        targets = [_offsets(document, target, count) for target in primitive.targets or []]
-        weights = _weights(document, index, len(targets), found.weights, times)
-        offsets = np.einsum("tk,knd->tnd", weights, np.stack(targets)) if targets else np.zeros((len(times), 1, 3))
+        targets = target_offsets(document, primitive)
+        offsets = np.einsum("tk,knd->tnd", target_weights(document, 0, index, len(targets), times), targets)
         shapes = (replace(surface, vertices=surface.vertices + each) for each in offsets)
         parts.append([_mesh(surface, shape.posed(each)) for shape, each in zip(shapes, bones, strict=True)])
     return parts
@@ -75,25 +74,6 @@ def _parts(document: Document, index: int, times: Floats, world: Floats) -> list
 def _bones(document: Document, skin: int, world: Floats) -> Floats:
     """Skinning matrices of a skin, mesh space -> world, [T, joints, 4, 4]."""
     return world[:, document.tree.skins[skin].joints] @ inverse_binds(document, skin)
-
-
-def _offsets(document: Document, target: object, count: int) -> Floats:
-    """Displacements of a morph target, zero where it moves nothing, [n, 3]."""
-    accessor = target.get("POSITION") if isinstance(target, dict) else getattr(target, "POSITION", None)
-    return np.zeros((count, 3)) if accessor is None else document.floats(accessor)
-
-
-def _weights(document: Document, node: int, targets: int, still: list[float] | None, times: Floats) -> Floats:
-    """Weights of the morph targets at given times, [T, targets]."""
-    animation = document.tree.animations[0]
-    for channel in animation.channels:
-        if targets and channel.target.node == node and channel.target.path == "weights":
-            sampler = animation.samplers[channel.sampler]
-            keys = document.floats(sampler.input)[:, 0]
-            values = document.floats(sampler.output).reshape(-1, targets)
-            return sample(keys, values, sampler.interpolation, times, False)
-    own = document.node_weights(node) if targets else None
-    return np.tile(np.array(own or still or [0.0] * targets)[:targets], (len(times), 1))
 
 
 def _mesh(surface: Surface, points: Floats) -> Mesh:

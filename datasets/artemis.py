@@ -5,7 +5,7 @@ plays at 30 frames a second unless its name says otherwise; no world axis is ass
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,15 +17,18 @@ import torch
 from rewild4d.contracts import Finding, Selection
 from rewild4d.datasets.artemis_check import check_animal
 from rewild4d.datasets.artemis_files import (
+    ImagePair,
     frames_per_second,
     list_frames,
     list_images,
     list_motions,
+    motion_folders,
     read_cameras,
     read_intrinsics,
     read_licence,
 )
 from rewild4d.datasets.artemis_rig import read_rig
+from rewild4d.datasets.artemis_views import FRAMED, SOLID, look, strayed, strayed_sentence
 from rewild4d.datasets.artemis_volume import SURFACE_POINTS, MovingSurface, Surface, read_pose, read_surface
 from rewild4d.datasets.artemis_writer import ArtemisWriter
 from rewild4d.datasets.images import Decoded, decode
@@ -66,10 +69,9 @@ class Artemis:
         return "; ".join(sorted({read_licence(folder) for folder in self._animals.values()}))
 
     def cases(self, selection: Selection) -> list[str]:
-        """Names of all cases; reads the text files only, no image.
+        """Names of all cases; reads no image. Of an animal whose motions cannot be told there is one, "(unreadable)".
 
-        Raises:
-            UserError: cameras, intrinsics or the list of motions of an animal cannot be used.
+        Animals are not verified here, so that a faulty one does not stop the others: `load` does that.
         """
         return list(self._table(selection))
 
@@ -79,6 +81,9 @@ class Artemis:
         Raises:
             UserError: no such case, or files of it that cannot be used.
         """
+        if folder := self._animals.get(case.partition("/")[0]):
+            list_motions(folder)
+            read_intrinsics(folder / "Intrinsic.inf", len(read_cameras(folder / "CamPose.inf")))
         known = self._table(selection)
         if case not in known:
             raise unknown_name("case", case, known)
@@ -98,8 +103,7 @@ class Artemis:
         placements = selection.placements if selection.cameras == "fixed" else ()
         table: dict[str, tuple[str, str, str]] = {}
         for animal, folder in self._animals.items():
-            read_intrinsics(folder / "Intrinsic.inf", len(read_cameras(folder / "CamPose.inf")))
-            for motion in list_motions(folder):
+            for motion in _motion_names(folder):
                 for placement in placements or ("",):
                     suffix = f"@{placement}" if placement else ""
                     table[f"{animal}/{motion}{suffix}"] = (animal, motion, placement)
@@ -135,12 +139,13 @@ class _Motion:
         folders = list_frames(self.folder / "img" / self.motion)
         pairs = [list_images(folders[number], views) for number in self.frames]
         decoded = decode(pairs, self.selection, case)
-        for index, view in enumerate(selected):
-            if not decoded.rgba[index, view, ..., 3].any():
-                raise UserError(f"{pairs[index][view].alpha}: expected a matte with an animal in it, got an empty one.")
-        shown = _Frames(decoded, self._cameras(decoded), list(enumerate(selected)), self.fps)
+        _expect_animal(decoded, pairs, selected)
+        cameras = self._cameras(decoded)
+        self._expect_meeting(decoded, cameras)
+        shown = _Frames(decoded, cameras, list(enumerate(selected)), self.fps)
         hidden = _Frames(decoded, shown.cameras, held_out(selected, views), self.fps)
-        clip = Clip(case, species, tuple(shown), self.fps, read_licence(self.folder), shown.digest())
+        notes = tuple(self._notes(decoded, selected))
+        clip = Clip(case, species, tuple(shown), self.fps, read_licence(self.folder), shown.digest(), notes)
         up = torch.from_numpy(up_direction(self.camera_to_world))
         if surface is None:
             return clip, Truth(hidden, None, hidden.digest(), up=up)
@@ -166,6 +171,25 @@ class _Motion:
                 f"{self.folder / 'volumes'}: expected the animal's voxels, which tell its {placement}, got none."
             )
         return placed_view(placement, surface.thinned(SURFACE_POINTS).posed(poses[0]), self.camera_to_world)
+
+    def _expect_meeting(self, decoded: Decoded, cameras: list[Camera]) -> None:
+        """Fail on cameras that do not look at the animal of their own images."""
+        looks = [look(alpha) for alpha in decoded.rgba[0, ..., 3]]
+        wrong, shown = len(strayed(cameras, looks)), sum(found is not None for found in looks)
+        if 2 * wrong > shown:
+            raise UserError(strayed_sentence(self.folder, self.motion, wrong, shown))
+
+    def _notes(self, decoded: Decoded, selected: list[int]) -> Iterator[str]:
+        """What a person should know of this motion before its scores."""
+        looks = [look(decoded.rgba[index, view, ..., 3]) for index, view in enumerate(selected)]
+        framed = sum(found is not None and found.framed > FRAMED for found in looks)
+        if framed and self.selection.framing == "full":
+            yield f"{framed} of {len(looks)} input mattes are animal all along the image's border: are they inverted?"
+        longest = max(decoded.source)
+        if self.selection.framing == "full" and longest < self.selection.size:
+            yield f"images of {longest} pixels are enlarged to the protocol's {self.selection.size}"
+        if len(self.camera_to_world) == 1:
+            yield "one view: none is held out, so that no novel view can be scored"
 
     def _cameras(self, decoded: Decoded) -> list[Camera]:
         """World camera of each view for the decoded images."""
@@ -208,6 +232,28 @@ class _Frames(Sequence[Frame]):
             camera = self.cameras[view]
             parts += [f"{frame} {view}", camera.world_to_camera, camera.intrinsics, self._rgba[frame, view]]
         return digest(*parts)
+
+
+def _expect_animal(decoded: Decoded, pairs: list[list[ImagePair]], selected: list[int]) -> None:
+    """Fail on an empty matte among the inputs, or where all of them are next to empty."""
+    highest = 0
+    for index, view in enumerate(selected):
+        highest = max(highest, peak := int(decoded.rgba[index, view, ..., 3].max()))
+        if not peak:
+            raise UserError(f"{pairs[index][view].alpha}: expected a matte with an animal in it, got an empty one.")
+    if highest < SOLID:
+        raise UserError(
+            f"{pairs[0][selected[0]].alpha}: expected mattes from 0 to 255, but this and all {len(selected)} that "
+            f"belong to inputs end at {highest}."
+        )
+
+
+def _motion_names(folder: Path) -> list[str]:
+    """Motions of an animal; of a faulty one the folders that it has, or a word in their place."""
+    try:
+        return list(list_motions(folder))
+    except UserError:
+        return [path.name for path in motion_folders(folder)] or ["(unreadable)"]
 
 
 def _is_animal(folder: Path) -> bool:

@@ -2,10 +2,12 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, ParamSpec, TypeVar
 
 import numpy as np
+import torch
 from tqdm import tqdm
 
 from rewild4d.contracts import Finding
@@ -15,15 +17,25 @@ from rewild4d.datasets.artemis_files import (
     list_frames,
     list_images,
     list_motions,
+    motion_folders,
     read_cameras,
     read_intrinsics,
     read_licence,
 )
-from rewild4d.datasets.artemis_volume import read_pose, read_skeleton, read_surface
-from rewild4d.datasets.images import read_pair, read_rgb
+from rewild4d.datasets.artemis_views import FRAMED, SOLID, Look, covered, look, strayed, strayed_sentence
+from rewild4d.datasets.artemis_volume import SURFACE_POINTS, Surface, read_pose, read_skeleton, read_surface
+from rewild4d.datasets.images import read_alpha, read_pair, read_rgb
 from rewild4d.datasets.recipe import FILE as RECIPE
 from rewild4d.datasets.recipe import read_recipe
 from rewild4d.errors import UserError
+from rewild4d.types import Camera
+
+WHITE = 250
+"""Of 255: an animal as light as this all over cannot be told from the white that protocols put behind it."""
+COVERED = 0.75
+"""Share of the posed voxels that fall on the mattes, below which they are of another world: 0.9 where all is well."""
+LOOKED_AT = 12
+"""Views whose mattes are held against the voxels."""
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -42,21 +54,24 @@ class _Check:
     def __init__(self, animal: Path) -> None:
         self.animal = animal
         self.findings: list[Finding] = []
+        self.surface: Surface | None = None
 
     def run(self) -> list[Finding]:
-        animal, images = self.animal, self.animal / "img"
+        animal = self.animal
         cameras = self._attempt(read_cameras, animal / "CamPose.inf")
         views = len(cameras) if cameras is not None else 0
         intrinsics = self._attempt(read_intrinsics, animal / "Intrinsic.inf", views) if views else None
         self._attempt(list_motions, animal)
         bones = self._skeleton()
-        motions = sorted(path for path in images.iterdir() if path.is_dir()) if images.is_dir() else []
+        motions = motion_folders(animal)
         for motion in motions:
             frames = self._attempt(list_frames, motion) or []
             for number in range(len(frames) if bones else 0):
                 self._attempt(read_pose, animal, motion.name, number, bones)
-            if views:
-                self._images(motion.name, frames, views, intrinsics)
+            if cameras is not None:
+                self._images(motion.name, frames, cameras, intrinsics)
+        if views == 1:
+            self._add("warning", animal / "CamPose.inf", "one view: none is held out, so no novel view can be scored")
         self._notes()
         if all(finding.level != "error" for finding in self.findings):
             self._add("ok", animal, f"{len(motions)} motions, {views} views, {bones} bones")
@@ -70,33 +85,86 @@ class _Check:
         if not has_voxels and not (self.animal / "bones").is_dir():
             return 0
         bones = self._attempt(read_skeleton, self.animal)
-        self._attempt(read_surface, self.animal)
+        self.surface = self._attempt(read_surface, self.animal)
         return len(bones) if bones is not None else 0
 
-    def _images(self, motion: str, frames: list[Path], views: int, intrinsics: np.ndarray | None) -> None:
+    def _images(
+        self, motion: str, frames: list[Path], camera_to_world: np.ndarray, intrinsics: np.ndarray | None
+    ) -> None:
         """Decode every view of every frame."""
+        views = len(camera_to_world)
         pairs: list[ImagePair] = []
+        whole = True
         for frame in frames:
-            pairs += self._attempt(list_images, frame, views) or []
+            found = self._attempt(list_images, frame, views)
+            pairs += found or []
+            whole = whole and found is not None
         first = self._attempt(read_rgb, pairs[0].rgb) if pairs else None
         source = (first.shape[1], first.shape[0]) if first is not None else None
         title = f"checking {self.animal.name}/{motion}"
         with ThreadPoolExecutor(2) as pool:
-            results = pool.map(_is_seen, pairs, [source] * len(pairs))
-            progress = tqdm(results, total=len(pairs), desc=title, disable=None, leave=False)
-            shown = False
-            for pair, seen in zip(pairs, progress, strict=True):
-                shown = shown or seen is True
-                if isinstance(seen, UserError):
-                    self._fault(seen)
-                elif not seen:
-                    self._add("warning", pair.alpha, "the matte is empty: this image cannot be an input")
-        if pairs and not shown:
-            self._add("error", self.animal / "img" / motion, "no matte shows an animal that could be an input")
+            results = pool.map(_study, pairs, [source] * len(pairs))
+            studies = list(tqdm(results, total=len(pairs), desc=title, disable=None, leave=False))
+        for pair, study in zip(pairs, studies, strict=True):
+            if isinstance(study, UserError):
+                self._fault(study)
+            elif study.look is None:
+                self._add("warning", pair.alpha, "the matte is empty: this image cannot be an input")
+        usable = bool(pairs) and self._mattes(motion, pairs, studies)
         if source and intrinsics is not None:
             self._principal_points(source, intrinsics)
+            first_looks = [None if isinstance(study, UserError) else study.look for study in studies[:views]]
+            if whole and usable:
+                world_to_camera = torch.from_numpy(np.linalg.inv(camera_to_world))
+                matrices = torch.from_numpy(intrinsics)
+                cameras = [Camera(*each, *source) for each in zip(world_to_camera, matrices, strict=True)]
+                self._geometry(motion, cameras, pairs[:views], first_looks)
         if any(pair.rgb.suffix.lower() != ".png" for pair in pairs):
             self._add("warning", self.animal / "img" / motion, "images are JPEG: expect compression at the silhouette")
+
+    def _mattes(self, motion: str, pairs: list[ImagePair], studies: list["_Study | UserError"]) -> bool:
+        """Add what the mattes of a motion have in common; whether they show an animal at all."""
+        place = self.animal / "img" / motion
+        shown = [study for study in studies if not isinstance(study, UserError) and study.look is not None]
+        highest = max((study.look.highest for study in shown if study.look), default=0)
+        if highest < SOLID:
+            said = f": they end at {highest}; are they 0 and 1 in place of 0 and 255?" if highest else ""
+            self._add("error", place, f"no matte shows an animal that could be an input{said}")
+            return False
+        framed = [
+            pair for pair, study in zip(pairs, studies, strict=True)
+            if not isinstance(study, UserError) and study.look and study.look.framed > FRAMED
+        ]  # fmt: skip
+        if framed:
+            told = f"{len(framed)} of {len(pairs)} mattes are animal all along the image's border: are they inverted?"
+            self._add("warning", framed[0].alpha, told)
+        if all(study.darkest >= WHITE for study in shown):
+            self._add("warning", place, "the animal is white all over, as is the background of the protocols")
+        return True
+
+    def _geometry(self, motion: str, cameras: list[Camera], pairs: list[ImagePair], looks: list[Look | None]) -> None:
+        """Hold cameras, mattes and voxels of the first frame against each other."""
+        wrong, shown = strayed(cameras, looks), sum(found is not None for found in looks)
+        if 2 * len(wrong) > shown:
+            self._fault(UserError(strayed_sentence(self.animal, motion, len(wrong), shown)))
+            return
+        if wrong:
+            names = ", ".join(map(str, wrong[:6])) + (", ..." if len(wrong) > 6 else "")
+            told = f"views {names} do not look at the animal where the others see it ('{motion}', first frame)"
+            self._add("warning", self.animal / "CamPose.inf", told)
+        if self.surface is None or not shown:
+            return
+        pose = self._attempt(read_pose, self.animal, motion, 0, len(self.surface.bones_rest))
+        if pose is None:
+            return
+        points = self.surface.thinned(SURFACE_POINTS).posed(pose)
+        views = [view for view, found in enumerate(looks) if found is not None]
+        spread = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, LOOKED_AT).round().astype(int))]
+        share = np.mean([covered(points, cameras[view], read_alpha(pairs[view].alpha)) for view in spread])
+        if share < COVERED:
+            told = f"{share:.0%} of the voxels fall on the mattes of '{motion}', first frame"
+            asked = "other voxels, bones, or order of the views? Geometry scores would be wrong"
+            self._add("warning", self.animal / "volumes", f"{told}: {asked}")
 
     def _principal_points(self, source: tuple[int, int], intrinsics: np.ndarray) -> None:
         """Warn of intrinsics that seem to belong to another image size."""
@@ -143,10 +211,21 @@ class _Check:
         self.findings.append(Finding(level, str(path), message.rstrip(".")))
 
 
-def _is_seen(pair: ImagePair, source: tuple[int, int] | None) -> bool | UserError:
-    """Whether a matte holds anything, or what is wrong with the pair of images."""
+@dataclass(frozen=True)
+class _Study:
+    """What a pair of images holds: the matte's look, and the darkest value of the animal's mean colour."""
+
+    look: Look | None
+    darkest: float
+
+
+def _study(pair: ImagePair, source: tuple[int, int] | None) -> _Study | UserError:
+    """What a pair of images holds, or what is wrong with it."""
     try:
-        _, alpha = read_pair(pair, source)
+        rgb, alpha = read_pair(pair, source)
     except UserError as error:
         return error
-    return bool(alpha.any())
+    found = look(alpha)
+    solid = alpha >= SOLID
+    darkest = float(rgb[solid].mean(axis=0).min()) if found and solid.any() else 0.0
+    return _Study(found, darkest)

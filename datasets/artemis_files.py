@@ -131,7 +131,25 @@ def read_parents(folder: Path) -> np.ndarray:
         raise UserError(f"{path}: expected a NumPy file of integers, got an archive.")
     if parents.ndim != 1 or not np.issubdtype(parents.dtype, np.integer):
         raise UserError(f"{path}: expected a vector of integers, got {parents.dtype} of shape {parents.shape}.")
+    _expect_tree(path, parents)
     return parents.astype(np.int64)
+
+
+def _expect_tree(path: Path, parents: np.ndarray) -> None:
+    """Fail on a parent that does not exist, or on bones that are their own ancestors; row 0 is a root whatever it says.
+
+    Further roots have -1 or their own number.
+    """
+    for bone in range(1, len(parents)):
+        if not -1 <= parents[bone] < len(parents):
+            raise UserError(
+                f"{path}: expected parents from -1 to {len(parents) - 1}, got {parents[bone]} of bone {bone}."
+            )
+        line = [bone]
+        while line[-1] > 0 and (above := int(parents[line[-1]])) not in (-1, line[-1]):
+            if above in line:
+                raise UserError(f"{path}: expected a tree of bones, but bone {above} is its own ancestor.")
+            line.append(above)
 
 
 def read_sequences(path: Path) -> dict[str, int]:
@@ -160,7 +178,7 @@ def list_motions(animal: Path) -> dict[str, int]:
     images = animal / "img"
     if not images.is_dir():
         raise UserError(f"{images}: expected a folder with one folder for each motion, got none.")
-    found = {motion.name: len(list_frames(motion)) for motion in sorted(images.iterdir()) if motion.is_dir()}
+    found = {motion.name: len(list_frames(motion)) for motion in motion_folders(animal)}
     if not found:
         raise UserError(f"{images}: expected one folder for each motion, got none.")
     listing = animal / "sequences"
@@ -180,13 +198,27 @@ def list_motions(animal: Path) -> dict[str, int]:
     return listed
 
 
+def motion_folders(animal: Path) -> list[Path]:
+    """Folders under img/ but those that a program hid there with a dot; none where there is no img/."""
+    images = animal / "img"
+    found = images.iterdir() if images.is_dir() else ()
+    return sorted(path for path in found if path.is_dir() and not path.name.startswith("."))
+
+
 def list_frames(motion: Path) -> list[Path]:
     """Frame folders of a motion in the order of their numbers 0, 1, 2, ...
 
     Raises:
-        UserError: no frame folders, or one is missing.
+        UserError: no frame folders, one is missing, or two have one number.
     """
-    frames = {int(path.name): path for path in motion.iterdir() if path.name.isdecimal() and path.is_dir()}
+    frames: dict[int, Path] = {}
+    for path in sorted(motion.iterdir()):
+        if path.name.isdecimal() and path.is_dir():
+            if (number := int(path.name)) in frames:
+                raise UserError(
+                    f"{path}: expected one folder of frame {number}, but there is {frames[number].name} too."
+                )
+            frames[number] = path
     if not frames:
         raise UserError(f"{motion}: expected frame folders 0, 1, 2, ..., got none.")
     missing = [number for number in range(max(frames) + 1) if number not in frames]
@@ -237,7 +269,7 @@ def read_licence(animal: Path) -> str:
 
 def _lines(path: Path) -> Sequence[str]:
     try:
-        return path.read_text(encoding="utf-8", errors="replace").splitlines()
+        return path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     except OSError as error:
         raise UserError(f"{path}: expected a file that can be read, but: {error.strerror}.") from error
 

@@ -144,14 +144,18 @@ def read_voxels(animal: Path) -> Voxels | None:
         return None
     bones_rest = read_skeleton(animal)
     points, indices, weights = (_tensor(folder / name) for name in FILES)
-    if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
-        raise UserError(f"{folder / FILES[0]}: expected finite points [V, 3], got shape {points.shape}.")
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        raise UserError(f"{folder / FILES[0]}: expected points [V, 3], got shape {points.shape}.")
+    if not np.isfinite(points).all():
+        raise UserError(f"{folder / FILES[0]}: expected finite points, got NaN or infinity in {_unsound(points)}.")
     if indices.ndim != 2 or len(indices) != len(points) or not np.issubdtype(indices.dtype, np.integer):
         raise UserError(
             f"{folder / FILES[1]}: expected integers [{len(points)}, K], got {indices.dtype} of shape {indices.shape}."
         )
-    if weights.shape != indices.shape or not np.isfinite(weights).all():
+    if weights.shape != indices.shape:
         raise UserError(f"{folder / FILES[2]}: expected finite weights {indices.shape}, got shape {weights.shape}.")
+    if not np.isfinite(weights).all():
+        raise UserError(f"{folder / FILES[2]}: expected finite weights, got NaN or infinity in {_unsound(weights)}.")
     used = weights > 0
     outside = indices[used & ((indices < 0) | (indices >= len(bones_rest)))]
     if len(outside):
@@ -173,6 +177,10 @@ def read_voxels(animal: Path) -> Voxels | None:
         bones_rest,
         np.ptp(points, axis=0) / np.maximum(cells.max(axis=0), 1),
     )
+
+
+def _unsound(rows: np.ndarray) -> str:
+    return f"{int((~np.isfinite(rows)).any(axis=1).sum())} of {len(rows)} rows"
 
 
 def lattice(points: np.ndarray) -> tuple[np.ndarray, float]:

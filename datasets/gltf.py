@@ -34,6 +34,7 @@ TYPES: dict[int, type[Any]] = {
 }
 MOST_VALUES = 100_000_000
 """Of an accessor: a file that says more is damaged."""
+INTERPOLATIONS = (None, "LINEAR", "STEP", "CUBICSPLINE")
 READABLE_EXTENSIONS = {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"}
 
 
@@ -80,7 +81,10 @@ class Document:
         """Nodes of the default scene (all nodes where the file has no scene), parents first."""
         if not self.tree.scenes:
             return self.order
-        reached = set(self.tree.scenes[self.tree.scene or 0].nodes or [])
+        number = self.tree.scene or 0
+        if not 0 <= number < len(self.tree.scenes):
+            raise self.error(f"expected a default scene from 0 to {len(self.tree.scenes) - 1}, got {number}")
+        reached = set(self.tree.scenes[number].nodes or [])
         for index in self.order:
             if self.parents[index] in reached:
                 reached.add(index)
@@ -271,9 +275,20 @@ def sample(keys: Floats, values: Floats, interpolation: str | None, times: Float
 
     Returns:
         [t, c].
+
+    Raises:
+        ValueError: another interpolation, key times that fall, no key or one without a value, no quaternions.
     """
+    if interpolation not in INTERPOLATIONS:
+        raise ValueError(f"an animation is interpolated by '{interpolation}', not by {', '.join(INTERPOLATIONS[1:])}")
     cubic = interpolation == "CUBICSPLINE"
     before, points, after = (values[0::3], values[1::3], values[2::3]) if cubic else (values, values, values)
+    if not 0 < len(keys) <= len(after):
+        raise ValueError(f"an animation has {len(keys)} key times and {len(after)} values")
+    if (np.diff(keys) < 0).any():
+        raise ValueError("the key times of an animation fall")
+    if is_rotation and values.shape[1] != 4:
+        raise ValueError(f"a rotation has {values.shape[1]} numbers, not 4")
     left = np.clip(np.searchsorted(keys, times, side="right") - 1, 0, max(len(keys) - 2, 0))
     right = np.minimum(left + 1, len(keys) - 1)
     span = np.maximum(keys[right] - keys[left], 1e-12)

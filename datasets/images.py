@@ -28,7 +28,7 @@ BOX_ALPHA = 25
 CROP_MARGIN = 0.075
 """Free border on each side of a crop as a share of the animal's longer side: 15 % in all."""
 _THREADS = 2
-_CACHE_VERSION = "1"
+_CACHE_VERSION = "2"
 ORIENTATION = 0x0112
 """EXIF tag of how a picture is turned."""
 _FLIPS = {2: (1, -1), 3: (-1, -1), 4: (-1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}
@@ -79,12 +79,19 @@ def read_rgb(path: Path, upright: bool = False) -> np.ndarray:
 
 
 def read_alpha(path: Path) -> np.ndarray:
-    """Matte of any PNG mode as luminance, uint8 [h, w].
+    """Matte of any PNG mode, uint8 [h, w]: the alpha channel where it is not opaque all over, else the luminance.
 
     Raises:
         UserError: the file cannot be read, or is cut off or damaged.
     """
-    return _decode(path, cv2.IMREAD_GRAYSCALE)
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.dtype == np.uint16:
+        image = np.rint(image / 257).astype(np.uint8)
+    if image.ndim == 2:
+        return image
+    if image.shape[2] == 4 and (image[..., 3] < 255).any():
+        return np.ascontiguousarray(image[..., 3])
+    return cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
 
 
 def read_picture(path: Path) -> tuple[np.ndarray, np.ndarray | None]:

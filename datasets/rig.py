@@ -1,7 +1,8 @@
 """A skinned, animated glTF file as an `AnimatedAnimal`.
 
 Read: triangle primitives with skins, flat colours, vertex colours and base colour textures; unskinned meshes that hang
-from a joint, directly or through other nodes; node animation. Not read: morph targets, transparency, static scenery.
+from a joint, directly or through other nodes; node animation; morph targets that keep still. Not read: transparency,
+static scenery.
 """
 
 import re
@@ -14,15 +15,18 @@ from numpy.typing import NDArray
 
 from rewild4d.datasets.animal import AnimatedAnimal, Surface
 from rewild4d.datasets.gltf import Document, Floats, consistent
+from rewild4d.datasets.gltf_colors import base_color, base_texture, linear_to_srgb
+from rewild4d.datasets.morphs import still_offsets
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import digest
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
-MIRRORED, CLAMPED = 33648, 33071
 
 
 def clips(path: Path) -> list[str]:
-    """Names of the animations of a rig file, in the file's order; unnamed ones are called clip_<index>.
+    """Names of the animations of a rig file, in the file's order.
+
+    Unnamed ones are called clip_<index>; one that has the name of an earlier one gets _<index> behind it.
 
     Raises:
         UserError: the file is missing or is no glTF.
@@ -54,7 +58,8 @@ def load_rig(path: Path, clip: str, frames: int = 24, shares: Floats | None = No
         The animal in the file's own world (metres by the specification, +y up).
 
     Raises:
-        UserError: the file is missing or no glTF, contradicts itself, holds no skinned mesh, or has no such clip.
+        UserError: the file is missing or no glTF, contradicts itself, holds no skinned mesh, has no such clip, or the
+            clip changes morph targets.
     """
     shares = np.arange(frames) / frames if shares is None else shares
     with consistent(path):
@@ -82,7 +87,7 @@ def _read_rig(path: Path, clip: str, shares: Floats) -> AnimatedAnimal:
     animation = names.index(clip)
     start, end = document.clip_range(animation)
     times = start + (end - start) * shares
-    skeleton = _Skeleton(document, animation)
+    skeleton = _Skeleton(document, animation, times)
     surfaces = [surface for index in skinned for surface in _skinned_surfaces(document, skeleton, index)]
     for index in visible:
         if document.tree.nodes[index].mesh is not None and document.tree.nodes[index].skin is None:
@@ -106,12 +111,18 @@ def _read_rig(path: Path, clip: str, shares: Floats) -> AnimatedAnimal:
 
 
 def _clip_names(document: Document) -> list[str]:
-    return [clip.name or f"clip_{index}" for index, clip in enumerate(document.tree.animations)]
+    names: list[str] = []
+    for index, clip in enumerate(document.tree.animations):
+        name = clip.name or f"clip_{index}"
+        while name in names:
+            name = f"{name}_{index}"
+        names.append(name)
+    return names
 
 
 def _folder_name(name: str) -> str:
     """The name with everything that a folder or a space-separated list cannot hold replaced."""
-    return re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("._") or "unnamed"
+    return re.sub(r"[^\w.-]+", "_", name).strip("._") or "unnamed"
 
 
 @dataclass
@@ -120,6 +131,7 @@ class _Skeleton:
 
     document: Document
     animation: int
+    times: Floats
     nodes: list[int] = field(default_factory=list)
     rest: list[Floats] = field(default_factory=list)
 
@@ -179,7 +191,8 @@ def _skinned_surfaces(document: Document, skeleton: _Skeleton, node: int) -> lis
     for primitive in document.tree.meshes[document.tree.nodes[node].mesh].primitives:
         if primitive.mode in (None, TRIANGLES, STRIP, FAN):
             indices, weights = influences(document, primitive, len(bones))
-            surfaces.append(read_surface(document, primitive, to_world, bones[indices], weights))
+            offsets = still_offsets(document, skeleton.animation, node, primitive, skeleton.times)
+            surfaces.append(read_surface(document, primitive, to_world, bones[indices], weights, offsets))
     return surfaces
 
 
@@ -218,7 +231,8 @@ def _attached_surfaces(document: Document, skeleton: _Skeleton, node: int) -> li
         if primitive.mode in (None, TRIANGLES, STRIP, FAN):
             count = document.tree.accessors[primitive.attributes.POSITION].count
             indices, weights = np.full((count, 1), bone), np.ones((count, 1))
-            surfaces.append(read_surface(document, primitive, to_world, indices, weights))
+            offsets = still_offsets(document, skeleton.animation, node, primitive, skeleton.times)
+            surfaces.append(read_surface(document, primitive, to_world, indices, weights, offsets))
     return surfaces
 
 
@@ -249,18 +263,23 @@ def influences(document: Document, primitive: pygltflib.Primitive, count: int) -
 
 
 def read_surface(
-    document: Document, primitive: pygltflib.Primitive, to_world: Floats, indices: NDArray[np.int64], weights: Floats
+    document: Document,
+    primitive: pygltflib.Primitive,
+    to_world: Floats,
+    indices: NDArray[np.int64],
+    weights: Floats,
+    offsets: Floats | float = 0.0,
 ) -> Surface:
-    """One primitive with its colours, vertices moved by ``to_world`` and bound as given."""
-    positions = document.floats(primitive.attributes.POSITION)
+    """One primitive with its colours, vertices moved by ``offsets``, then by ``to_world``, and bound as given."""
+    positions = document.floats(primitive.attributes.POSITION) + offsets
     material = document.tree.materials[primitive.material] if primitive.material is not None else None
-    factor, picture = _base_color(material) if material else (None, None)
+    factor, picture = base_color(material) if material else (None, None)
     color = np.tile(np.array(factor or (1.0, 1.0, 1.0, 1.0))[:3], (len(positions), 1))
     if primitive.attributes.COLOR_0 is not None:
         color = color * document.floats(primitive.attributes.COLOR_0)[:, :3]
     uv, texture = None, None
     if picture is not None:
-        uv, texture = _texture(document, primitive, picture)
+        uv, texture = base_texture(document, primitive, picture)
     return Surface(
         vertices=positions @ to_world[:3, :3].T + to_world[:3, 3],
         faces=_faces(document, primitive, len(positions)),
@@ -270,19 +289,6 @@ def read_surface(
         uv=uv,
         texture=texture,
     )
-
-
-def _base_color(material: pygltflib.Material) -> tuple[list[float] | None, pygltflib.TextureInfo | None]:
-    """Factor and texture of a material's colour; older programs write its diffuse colour in an extension."""
-    older = (material.extensions or {}).get("KHR_materials_pbrSpecularGlossiness")
-    if older is not None:  # whoever writes both means the plain block for readers that do not know it
-        info = older.get("diffuseTexture")
-        texture = info and pygltflib.TextureInfo(
-            index=info["index"], texCoord=info.get("texCoord", 0), extensions=info.get("extensions", {})
-        )
-        return older.get("diffuseFactor"), texture
-    pbr = material.pbrMetallicRoughness
-    return (pbr.baseColorFactor, pbr.baseColorTexture) if pbr else (None, None)
 
 
 def _faces(document: Document, primitive: pygltflib.Primitive, count: int) -> NDArray[np.int64]:
@@ -300,37 +306,3 @@ def _faces(document: Document, primitive: pygltflib.Primitive, count: int) -> ND
     if primitive.mode == FAN:
         return np.stack((corners[1:-1], corners[2:], np.full(len(corners) - 2, corners[0])), axis=1)
     return corners[: len(corners) // 3 * 3].reshape(-1, 3)
-
-
-def _texture(
-    document: Document, primitive: pygltflib.Primitive, info: pygltflib.TextureInfo
-) -> tuple[Floats, NDArray[np.uint8]]:
-    """Texture coordinates and an image that may be repeated, whatever the file's wrap modes are."""
-    extension = (info.extensions or {}).get("KHR_texture_transform", {})
-    channel = extension.get("texCoord", info.texCoord or 0)
-    accessor = getattr(primitive.attributes, f"TEXCOORD_{channel}", None)
-    if accessor is None:
-        raise document.error(f"expected TEXCOORD_{channel} in a textured mesh, but a primitive lacks it")
-    angle = extension.get("rotation", 0.0)
-    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    uv = document.floats(accessor) * extension.get("scale", (1.0, 1.0)) @ turn.T + extension.get("offset", (0.0, 0.0))
-    texture = document.tree.textures[info.index]
-    webp = (texture.extensions or {}).get("EXT_texture_webp", {})
-    image = document.image(webp.get("source", texture.source))
-    sampler = document.tree.samplers[texture.sampler] if texture.sampler is not None else None
-    for axis, mode in enumerate((sampler.wrapS, sampler.wrapT) if sampler else ()):
-        if mode == MIRRORED:
-            image = np.concatenate((image, np.flip(image, 1 - axis)), axis=1 - axis)
-            uv[:, axis] /= 2
-        elif mode == CLAMPED:
-            pad = [(0, 0), (0, 0), (0, 0)]
-            pad[1 - axis] = (image.shape[1 - axis],) * 2
-            image = np.pad(image, pad, mode="edge")
-            uv[:, axis] = (np.clip(uv[:, axis], -1.0, 2.0) + 1.0) / 3
-    return uv, np.ascontiguousarray(image)
-
-
-def linear_to_srgb(linear: Floats) -> Floats:
-    """Encode linear light in [0, 1] as sRGB (IEC 61966-2-1)."""
-    linear = np.clip(linear, 0.0, 1.0)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)

@@ -21,13 +21,15 @@ def coverage(clip: Clip, truth: Truth) -> dict[str, float]:
     """Coverage statistics of a case.
 
     Returns:
-        foreground: mean share of a held-out image that the animal fills, in [0, 1].
+        foreground: mean share of a held-out image that the animal fills, in [0, 1]; absent where none is held out.
         seen_surface: mean share of the surface visible in a held-out image that some input image showed, at any
             time, in [0, 1]; absent where the data set has no geometry.
     """
     chosen = [truth.held_out[i] for i in _spread(len(truth.held_out), VIEWS)]
-    result = {"foreground": sum(float(frame.mask.mean()) for frame in chosen) / max(1, len(chosen))}
-    if truth.surface is None or not chosen:
+    if not chosen:
+        return {}
+    result = {"foreground": sum(float(frame.mask.mean()) for frame in chosen) / len(chosen)}
+    if truth.surface is None:
         return result
     points = {time: truth.surface(time) for time in sorted({*clip.times, *(frame.time for frame in chosen)})}
     seen = torch.zeros(len(next(iter(points.values()))), dtype=torch.bool)

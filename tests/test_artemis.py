@@ -13,6 +13,7 @@ from artemis_animals import DOT, FRAMES, HEIGHT, VIEWS, WIDTH, block, dot_image,
 from rewild4d.contracts import Selection
 from rewild4d.datasets.artemis import Artemis
 from rewild4d.datasets.artemis_files import (
+    NO_LICENCE,
     frames_per_second,
     list_motions,
     read_cameras,
@@ -312,6 +313,8 @@ def test_without_volumes_there_is_no_surface(animal: Path) -> None:
 
 def test_check_of_a_sound_folder(animal: Path) -> None:
     findings = Artemis(animal).check()
-    assert [finding.level for finding in findings] == ["warning", "ok"]
+    assert [finding.level for finding in findings] == ["warning", "warning", "ok"]
+    assert "voxels fall on the mattes" in findings[0].message, "the disc is a stand-in for the block"
+    assert findings[1].message == NO_LICENCE
     assert findings[-1].message == "1 motions, 4 views, 2 bones"
     assert read_cameras(animal / "CamPose.inf").shape == (4, 4, 4)

@@ -9,7 +9,8 @@ import pytest
 from external_stub import png
 
 from rewild4d.datasets.gltf import compose, sample
-from rewild4d.datasets.rig import clips, linear_to_srgb, load_rig
+from rewild4d.datasets.gltf_colors import linear_to_srgb
+from rewild4d.datasets.rig import clips, load_rig
 from rewild4d.errors import UserError
 
 HALF_TURN_Z = [0.0, 0.0, 1.0, 0.0]  # xyzw

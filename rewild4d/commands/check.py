@@ -65,6 +65,8 @@ def main(arguments: list[str]) -> int:
 def _check_data(dataset: str, options: Options) -> list[Finding]:
     reader: Any = open_dataset(dataset, options.data, options)[1]
     if not hasattr(reader, "video"):
+        if options.case:
+            raise UserError(f"--case: expected a data set of videos with it; {dataset} is checked whole.")
         return reader.check()
     cases = choose_cases(reader.cases(SPLIT), options.case) if options.case else ()
     return reader.check(cases, options.sheets)

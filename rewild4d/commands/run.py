@@ -10,6 +10,7 @@ import msgspec
 from rewild4d.commands import run_table
 from rewild4d.commands.shared import (
     check_numbers,
+    check_seeds,
     choose_prior,
     exit_code,
     floor_entry,
@@ -128,6 +129,7 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
     check_numbers(options.jobs, options.threads)
     if not options.seeds:
         raise UserError("--seeds: expected at least one number, got none.")
+    check_seeds(options.seeds)
     require_writable(options.out)
     root, reader = open_dataset(options.dataset, options.data, options)
     names = reader.cases(protocol.selection)

@@ -11,6 +11,7 @@ from rewild4d import planning
 from rewild4d.commands.choice import cases_of, chosen
 from rewild4d.commands.shared import (
     check_numbers,
+    check_seeds,
     choose_prior,
     exit_code,
     floor_entry,
@@ -118,6 +119,7 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
         UserError: an unknown name, or a folder that is not there or cannot be written.
     """
     check_numbers(options.jobs, options.threads)
+    check_seeds(options.seeds)
     device = pick_device(options.device)
     rasterizer = pick_rasterizer(options.rasterizer, device)
     load_dataset(spec.dataset)

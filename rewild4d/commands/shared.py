@@ -129,6 +129,13 @@ def check_numbers(jobs: int, threads: int) -> None:
             raise UserError(f"{flag}: expected a number of at least {least}, got {value}.")
 
 
+def check_seeds(seeds: Sequence[int]) -> None:
+    """Fail on a seed that a random generator does not take."""
+    for seed in seeds:
+        if not 0 <= seed < 2**63:
+            raise UserError(f"--seeds: expected numbers from 0 to 2^63 - 1, got {seed}.")
+
+
 def floor_entry(name: str) -> Entry:
     """A floor as a row of a plan: its first preset, one seed."""
     presets = preset_names(name)
