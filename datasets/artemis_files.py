@@ -162,10 +162,10 @@ def read_sequences(path: Path) -> dict[str, int]:
     for number, line in enumerate(_lines(path), start=1):
         if not line.strip():
             continue
-        name, _, count = line.strip().rpartition(" ")
-        if not name or not count.isdecimal():
+        words = line.strip().rsplit(maxsplit=1)
+        if len(words) != 2 or not words[1].isdecimal():
             raise UserError(f"{path}: expected '<motion> <number of frames>' in line {number}, got '{line.strip()}'.")
-        motions[name.strip()] = int(count)
+        motions[words[0]] = int(words[1])
     return motions
 
 

@@ -214,6 +214,7 @@ def test_what_other_programs_leave(animal: Path) -> None:
     for name in ("CamPose.inf", "Intrinsic.inf", "sequences"):
         place = animal / name
         place.write_bytes(b"\xef\xbb\xbf" + place.read_text().replace("\n", "\r\n").encode())
+    (animal / "sequences").write_text("walk\t3\n")
     (animal / "img" / ".cache").mkdir()
     assert Artemis(animal).cases(SWEEP) == ["cat/walk"]
     Artemis(animal).load("cat/walk", SWEEP)
