@@ -91,54 +91,56 @@ class _Check:
     def _images(
         self, motion: str, frames: list[Path], camera_to_world: np.ndarray, intrinsics: np.ndarray | None
     ) -> None:
-        """Decode every view of every frame."""
+        """Decode every view of every frame, and hold what the first one shows against cameras and voxels."""
         views = len(camera_to_world)
-        pairs: list[ImagePair] = []
-        whole = True
-        for frame in frames:
-            found = self._attempt(list_images, frame, views)
-            pairs += found or []
-            whole = whole and found is not None
+        listed = [self._attempt(list_images, frame, views) for frame in frames]
+        pairs = [pair for found in listed for pair in found or []]
         first = self._attempt(read_rgb, pairs[0].rgb) if pairs else None
         source = (first.shape[1], first.shape[0]) if first is not None else None
+        studies = self._studies(motion, pairs, source)
+        usable = bool(pairs) and self._mattes(motion, pairs, studies)
+        if source and intrinsics is not None:
+            self._principal_points(source, intrinsics)
+            if usable and listed[0]:
+                world_to_camera = torch.from_numpy(np.linalg.inv(camera_to_world))
+                cameras = [
+                    Camera(*pair, *source) for pair in zip(world_to_camera, torch.from_numpy(intrinsics), strict=True)
+                ]
+                looks = [study.look if study else None for study in studies[:views]]
+                self._geometry(motion, cameras, pairs[:views], looks)
+        if any(pair.rgb.suffix.lower() != ".png" for pair in pairs):
+            self._add("warning", self.animal / "img" / motion, "images are JPEG: expect compression at the silhouette")
+
+    def _studies(self, motion: str, pairs: list[ImagePair], source: tuple[int, int] | None) -> list["_Study | None"]:
+        """What each pair of images holds, None where it cannot be read."""
         title = f"checking {self.animal.name}/{motion}"
         with ThreadPoolExecutor(2) as pool:
             results = pool.map(_study, pairs, [source] * len(pairs))
-            studies = list(tqdm(results, total=len(pairs), desc=title, disable=None, leave=False))
-        for pair, study in zip(pairs, studies, strict=True):
+            found = list(tqdm(results, total=len(pairs), desc=title, disable=None, leave=False))
+        for pair, study in zip(pairs, found, strict=True):
             if isinstance(study, UserError):
                 self._fault(study)
             elif study.look is None:
                 self._add("warning", pair.alpha, "the matte is empty: this image cannot be an input")
-        usable = bool(pairs) and self._mattes(motion, pairs, studies)
-        if source and intrinsics is not None:
-            self._principal_points(source, intrinsics)
-            first_looks = [None if isinstance(study, UserError) else study.look for study in studies[:views]]
-            if whole and usable:
-                world_to_camera = torch.from_numpy(np.linalg.inv(camera_to_world))
-                matrices = torch.from_numpy(intrinsics)
-                cameras = [Camera(*each, *source) for each in zip(world_to_camera, matrices, strict=True)]
-                self._geometry(motion, cameras, pairs[:views], first_looks)
-        if any(pair.rgb.suffix.lower() != ".png" for pair in pairs):
-            self._add("warning", self.animal / "img" / motion, "images are JPEG: expect compression at the silhouette")
+        return [None if isinstance(study, UserError) else study for study in found]
 
-    def _mattes(self, motion: str, pairs: list[ImagePair], studies: list["_Study | UserError"]) -> bool:
+    def _mattes(self, motion: str, pairs: list[ImagePair], studies: list["_Study | None"]) -> bool:
         """Add what the mattes of a motion have in common; whether they show an animal at all."""
         place = self.animal / "img" / motion
-        shown = [study for study in studies if not isinstance(study, UserError) and study.look is not None]
-        highest = max((study.look.highest for study in shown if study.look), default=0)
+        shown = [
+            (pair, study.look, study.darkest)
+            for pair, study in zip(pairs, studies, strict=True)
+            if study and study.look
+        ]
+        highest = max((found.highest for _, found, _ in shown), default=0)
         if highest < SOLID:
             said = f": they end at {highest}; are they 0 and 1 in place of 0 and 255?" if highest else ""
             self._add("error", place, f"no matte shows an animal that could be an input{said}")
             return False
-        framed = [
-            pair for pair, study in zip(pairs, studies, strict=True)
-            if not isinstance(study, UserError) and study.look and study.look.framed > FRAMED
-        ]  # fmt: skip
-        if framed:
+        if framed := [pair for pair, found, _ in shown if found.framed > FRAMED]:
             told = f"{len(framed)} of {len(pairs)} mattes are animal all along the image's border: are they inverted?"
             self._add("warning", framed[0].alpha, told)
-        if all(study.darkest >= WHITE for study in shown):
+        if all(darkest >= WHITE for _, _, darkest in shown):
             self._add("warning", place, "the animal is white all over, as is the background of the protocols")
         return True
 
