@@ -67,14 +67,14 @@ def test_gradients_to_a_hundred_thousandth(kind: str) -> None:
         assert max(relative.values()) <= 1e-5, (seed, relative)
 
 
-@pytest.mark.parametrize(("width", "limit"), [(256, 3e-5), (1024, 2e-4)])
+@pytest.mark.parametrize("width", [256, 2048])
 @pytest.mark.parametrize("kind", ["plain", "sub-pixel", "needles"])
-def test_gradients_lose_digits_far_from_the_images_corner(kind: str, width: int, limit: float) -> None:
-    """Projected centres are handed on in single precision, whose steps grow with the coordinate."""
+def test_gradients_are_as_exact_far_from_the_images_corner(kind: str, width: int) -> None:
+    """The steps of single precision grow with the coordinate, so a centre is two single numbers."""
     for seed in range(3):
         psnr, relative = compared(kind, seed, 200, width)
         assert psnr >= 100
-        assert max(relative.values()) <= limit, (seed, relative)
+        assert max(relative.values()) <= 1e-5, (seed, relative)
 
 
 @pytest.mark.parametrize("count", [300, 1000, 3000])

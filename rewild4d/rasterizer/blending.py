@@ -42,6 +42,8 @@ from rewild4d.rasterizer.projection import (
     LOG2_MIN_ALPHA,
     LOG_OPACITY,
     RECORD,
+    REST_X,
+    REST_Y,
 )
 
 CONSTANTS = np.array([LOG2_MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, *POWER_TERMS], np.float32)
@@ -55,8 +57,8 @@ def place_in_tile(records: np.ndarray, record: int, tile_left: int, tile_top: in
     left, top = splat(np.float32(tile_left + 0.5)), splat(np.float32(tile_top + 0.5))
     along_x, along_y = broadcast(records, record + ALONG_X), broadcast(records, record + ALONG_Y)
     down = broadcast(records, record + DOWN)
-    dx = columns_of_block() + (left - broadcast(records, record + CENTER_X))
-    dy = rows_of_block() + (top - broadcast(records, record + CENTER_Y))
+    dx = columns_of_block() + (left - broadcast(records, record + CENTER_X) - broadcast(records, record + REST_X))
+    dy = rows_of_block() + (top - broadcast(records, record + CENTER_Y) - broadcast(records, record + REST_Y))
     block = splat(np.float32(BLOCK))
     step_x, step_y = block * columns_of_block(), block * rows_of_block()  # lane i here stands for block i
     store(steps, 0, fma(along_x, step_x, along_y * step_y))

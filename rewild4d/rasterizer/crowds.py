@@ -20,6 +20,8 @@ from rewild4d.rasterizer.projection import (
     LOG2_MIN_ALPHA,
     LOG_OPACITY,
     RECORD,
+    REST_X,
+    REST_Y,
 )
 
 CROWD = 256
@@ -34,7 +36,8 @@ _PIXELS = BLOCK * BLOCK
 @inlined
 def _alpha_at(records: np.ndarray, record: int, x: float, y: float) -> tuple:
     """Alpha of a Gaussian at a point, its log2 before the upper cut, and the point's coordinates t and u in it."""
-    dx, dy = x - records[record + CENTER_X], y - records[record + CENTER_Y]
+    dx = x - records[record + CENTER_X] - records[record + REST_X]
+    dy = y - records[record + CENTER_Y] - records[record + REST_Y]
     t, u = records[record + ALONG_X] * dx + records[record + ALONG_Y] * dy, records[record + DOWN] * dy
     exponent = records[record + LOG_OPACITY] - t * t - u * u
     alpha = min(math.exp(exponent * math.log(2.0)), MAX_ALPHA) if exponent >= LOG2_MIN_ALPHA else 0.0

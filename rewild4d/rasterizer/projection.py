@@ -2,8 +2,9 @@
 
 A record holds, per view and Gaussian, what one pixel's alpha takes: alpha = 2 ** (exponent), with d = pixel - centre,
 exponent = LOG_OPACITY - t^2 - u^2, t = ALONG_X dx + ALONG_Y dy, u = DOWN dy. A sum of squares loses nothing to
-cancellation, as the form's expansion does for needles. Invisible Gaussians have extent 0. projection_backward.py has
-the gradient.
+cancellation, as the form's expansion does for needles. The centre is CENTER + REST, two single numbers, so that far
+from the image's corner it is as exact as near it. The record of an invisible Gaussian is zero. projection_backward.py
+has the gradient.
 """
 
 import math
@@ -16,7 +17,7 @@ from rewild4d.kernels.doubles import WIDTH, any_gt, floor, load_columns, log2, r
 from rewild4d.rasterizer.conventions import FRUSTUM_MARGIN, MIN_ALPHA, MIN_COMPENSATION
 
 # Columns of a record.
-CENTER_X, CENTER_Y, ALONG_X, ALONG_Y, DOWN, LOG_OPACITY, EXTENT_X, EXTENT_Y, RECORD = 0, 1, 2, 3, 4, 5, 6, 7, 8
+CENTER_X, CENTER_Y, ALONG_X, ALONG_Y, DOWN, LOG_OPACITY, REST_X, REST_Y, RECORD = 0, 1, 2, 3, 4, 5, 6, 7, 8
 
 TILE = 16
 """A tile has as many pixels each way."""
@@ -111,6 +112,14 @@ def factor(xx: Any, xy: Any, yy: Any, det: Any) -> tuple:
     """The triangular factor of the inverse covariance, times log2(e) / 2."""
     along_x = root(HALF_LOG2_E * yy / det)
     return along_x, (0.0 - along_x) * xy / yy, root(HALF_LOG2_E / yy)
+
+
+@inlined
+def _in_two(value: Any) -> tuple:
+    """A number that single precision holds, and what the value has beyond it (Dekker 1971)."""
+    shifted = value * 536870913.0  # 2^29 + 1: 53 digits less 24
+    high = shifted - (shifted - value)
+    return high, value - high
 
 
 @inlined
@@ -222,11 +231,13 @@ def project(
                 store_columns(tiles, 4 * row, (left, right, top, bottom))
                 store_columns(radii, row, (where_gt(shown, zero, radius, zero),))
                 store_columns(depths, row, (where_gt(shown, zero, z, zero),))
+                high_u, rest_u = _in_two(where_gt(shown, zero, u, zero))
+                high_v, rest_v = _in_two(where_gt(shown, zero, v, zero))
                 store_columns(records, RECORD * row, (
-                    where_gt(shown, zero, u, zero), where_gt(shown, zero, v, zero),
+                    high_u, high_v,
                     where_gt(shown, zero, along_x, zero), where_gt(shown, zero, along_y, zero),
                     where_gt(shown, zero, down, zero), where_gt(shown, zero, log_opacity, zero),
-                    where_gt(shown, zero, extent_x, zero), where_gt(shown, zero, extent_y, zero),
+                    rest_u, rest_v,
                 ))  # fmt: skip
             else:
                 store_columns(tiles, 4 * row, (zero, zero, zero, zero))
