@@ -28,10 +28,11 @@ from rewild4d.datasets.artemis_files import (
     read_licence,
 )
 from rewild4d.datasets.artemis_rig import read_rig
-from rewild4d.datasets.artemis_views import FRAMED, SOLID, look, strayed, strayed_sentence
+from rewild4d.datasets.artemis_views import SOLID, look, strayed, strayed_sentence
 from rewild4d.datasets.artemis_volume import SURFACE_POINTS, MovingSurface, Surface, read_pose, read_surface
 from rewild4d.datasets.artemis_writer import ArtemisWriter
 from rewild4d.datasets.images import Decoded, decode
+from rewild4d.datasets.masks import FRAMED
 from rewild4d.datasets.recipe import read_recipe
 from rewild4d.datasets.selection import held_out, kept_frames, placed_view, selected_views, up_direction
 from rewild4d.errors import UserError, unknown_name

@@ -22,9 +22,10 @@ from rewild4d.datasets.artemis_files import (
     read_intrinsics,
     read_licence,
 )
-from rewild4d.datasets.artemis_views import FRAMED, SOLID, Look, covered, look, strayed, strayed_sentence
+from rewild4d.datasets.artemis_views import SOLID, Look, covered, look, strayed, strayed_sentence
 from rewild4d.datasets.artemis_volume import SURFACE_POINTS, Surface, read_pose, read_skeleton, read_surface
 from rewild4d.datasets.images import read_alpha, read_pair, read_rgb
+from rewild4d.datasets.masks import FRAMED
 from rewild4d.datasets.recipe import FILE as RECIPE
 from rewild4d.datasets.recipe import read_recipe
 from rewild4d.errors import UserError

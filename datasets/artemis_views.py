@@ -17,8 +17,6 @@ LEAST_SPREAD = 0.01
 """Mean squared sine between the lines of sight and their common direction, below which they meet anywhere."""
 SOLID = 128
 """Matte values from here on are animal."""
-FRAMED = 0.9
-"""Of an image's border that is animal: more, and the matte is inverted or covers everything."""
 
 
 @dataclass(frozen=True)

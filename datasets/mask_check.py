@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from rewild4d.contracts import Finding, Selection
-from rewild4d.datasets.masks import MaskFacts, mask_facts
+from rewild4d.datasets.masks import FRAMED, MaskFacts, mask_facts
 from rewild4d.datasets.wild import LEAST_AREA, TWIN, Video, lay_out
 from rewild4d.errors import UserError
 from rewild4d.files import atomic
@@ -139,9 +139,14 @@ def _jumps(facts: Sequence[MaskFacts | None]) -> list[int]:
     return found
 
 
+def _framed(facts: Sequence[MaskFacts | None]) -> list[int]:
+    return [i for i, fact in enumerate(facts) if fact is not None and fact.framed > FRAMED]
+
+
 _SECOND, _TWO = "a second part beside the animal", "two parts of like size (two animals?)"
 _TESTS: dict[str, Callable[[Sequence[MaskFacts | None]], list[int]]] = {
     "no mask or an empty one": _empty,
+    "animal all along the image's border (is the mask inverted?)": _framed,
     f"holes (or gaps between legs) above {HOLES:.0%} of the animal": _holed,
     _SECOND: _split,
     _TWO: _twins,

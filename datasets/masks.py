@@ -33,6 +33,10 @@ CUT_SHARE = 0.1
 """The animal is cut where it touches the image's border along more than this share of its shorter side."""
 
 
+FRAMED = 0.9
+"""Of an image's border that is animal: more, and the mask is inverted or covers everything."""
+
+
 @dataclass(frozen=True)
 class MaskFacts:
     """What a mask says about the animal in it.
@@ -42,12 +46,14 @@ class MaskFacts:
         is_cut: it reaches over the image's border.
         parts: the area of each connected part in pixels, largest first.
         holes: area enclosed by the animal over the animal's area.
+        framed: share of the image's border that is animal, in [0, 1].
     """
 
     box: tuple[int, int, int, int] | None
     is_cut: bool
     parts: tuple[int, ...]
     holes: float
+    framed: float = 0.0
 
     @property
     def area(self) -> int:
@@ -238,9 +244,11 @@ def mask_facts(mask: np.ndarray) -> MaskFacts:
     upper = (stats[large, :2] + stats[large, 2:4]).max(axis=0)
     edges = (labels[0], labels[-1], labels[:, 0], labels[:, -1])
     contact = max(int(np.isin(edge, large).sum()) for edge in edges)
+    framed = float((np.concatenate(edges) > 0).mean())
     is_cut = contact > CUT_SHARE * int((upper - lower).min())
     box = (int(lower[0]), int(lower[1]), int(upper[0]), int(upper[1]))
-    return MaskFacts(box, is_cut, tuple(sorted(map(int, areas), reverse=True)), _holes(solid) / int(areas.sum()))
+    parts = tuple(sorted(map(int, areas), reverse=True))
+    return MaskFacts(box, is_cut, parts, _holes(solid) / int(areas.sum()), framed)
 
 
 def _holes(solid: np.ndarray) -> int:

@@ -13,7 +13,7 @@ from rewild4d.datasets.aptv2 import AptV2
 from rewild4d.datasets.crops import cut, follow
 from rewild4d.datasets.davis import Davis, known_sequences
 from rewild4d.datasets.keypoints import read_badja
-from rewild4d.datasets.masks import mask_facts, match_masks, open_masks
+from rewild4d.datasets.masks import FRAMED, mask_facts, match_masks, open_masks
 from rewild4d.datasets.online import Online
 from rewild4d.datasets.wild import split_frames
 from rewild4d.errors import UserError
@@ -205,6 +205,7 @@ def test_mask_facts() -> None:
     canvas[10:30, 45:] = 255
     assert mask_facts(canvas).is_cut
     assert mask_facts(canvas * 0).box is None
+    assert mask_facts(canvas).framed < 0.5 < FRAMED < mask_facts(255 - 0 * canvas).framed == 1.0
 
 
 def test_masks_are_matched_by_name_number_or_order(tmp_path: Path) -> None:
