@@ -97,3 +97,18 @@ def test_keypoints_say_nothing_of_another_skeleton(prior: Prior, tmp_path: Path,
         found = make_prior(choice, clip, NOTHING, tmp_path / "no", lambda *_: None)
         assert found.notes == ((ELSEWHERE,) if scored else (ELSEWHERE, OTHER_BONES))
         assert ("pck" in found.quality) == scored
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("coarse:x", r"--prior coarse:x: expected coarse:<number>, got 'x'\."),
+        ("coarse:-1", r"--prior coarse:-1: expected a finite noise of 0 or more, got '-1'\."),
+        ("nowhere.npz", r"nowhere\.npz: expected a prior file, but there is no such file\."),
+    ],
+)
+def test_a_name_that_is_no_prior_is_told_before_anything_is_fitted(name: str, sentence: str) -> None:
+    for sound in ("template", "rig", "coarse", "coarse:0.5"):
+        PriorChoice(sound, STANDARD).require()
+    with pytest.raises(UserError, match=sentence):
+        PriorChoice(name, STANDARD).require()

@@ -66,7 +66,8 @@ def choose_prior(name: str, preset: str, reader: DatasetReader, options: Any = N
         options: of a command, with `keypoints`, `mapping` and `use_keypoints`.
 
     Raises:
-        UserError: a file of keypoints without a mapping, a mapping without keypoints, or one that is not known.
+        UserError: a prior file that cannot be used or a noise that is none; a file of keypoints without a mapping, a
+            mapping without keypoints, or one that is not known.
     """
     file, mapping, use = (getattr(options, flag, None) for flag in ("keypoints", "mapping", "use_keypoints"))
     own = getattr(reader, "keypoint_mapping", None)
@@ -78,7 +79,9 @@ def choose_prior(name: str, preset: str, reader: DatasetReader, options: Any = N
     elif use is not None:
         raise UserError(f"--use-keypoints {use}: expected keypoints, but there are none (--keypoints FILE gives some).")
     default: Use = "all" if file is not None else getattr(reader, "keypoint_use", "none")
-    return PriorChoice(name, PRESETS.get(preset, STANDARD), chosen, use or default)
+    choice = PriorChoice(name, PRESETS.get(preset, STANDARD), chosen, use or default)
+    choice.require()
+    return choice
 
 
 def reader_of(run: Path, record: RunRecord, data: Path | None) -> DatasetReader:

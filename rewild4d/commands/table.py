@@ -60,7 +60,8 @@ def main(arguments: list[str]) -> int:
     if options.pooled and options.against:
         raise UserError("--pooled: expected no --against with it: a pooled distance has no differences case by case.")
     tables = _named(options) if options.name else _everything(options)
-    print("\n\n".join(FORMATS[options.format](table) for table in tables) or "no records")
+    nothing = "no record with features to pool" if options.pooled else "no records"
+    print("\n\n".join(FORMATS[options.format](table) for table in tables) or nothing)
     return 0
 
 

@@ -68,6 +68,15 @@ class PriorChoice:
             raise UserError(f"--prior {self.name}: expected a finite noise of 0 or more, got '{level}'.")
         return noise
 
+    def require(self) -> None:
+        """Fail on a name that cannot be a prior, before anything else is done.
+
+        Raises:
+            UserError: a noise that is no number, or a file that is missing or damaged.
+        """
+        if self.name != "template" and not self.is_from_truth:
+            load_prior(Path(self.name))
+
     @property
     def is_from_truth(self) -> bool:
         """Whether the prior has seen what is held out, and a row that starts from it is a bound."""
