@@ -23,6 +23,8 @@ from rewild4d.rasterizer import backends, pick_rasterizer, reference, set_defaul
 
 WIDTH, HEIGHT = 20, 18
 """Nine tiles, five of them cut by the frame."""
+FAR = 600
+"""Pixels from the corner, where one number in single precision has steps that gradients of 1e-5 feel."""
 KERNELS = ["project", "project_backward", "list_entries", "start_tiles", "gather", "blend", "blend_backward"]
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 needs_triton = pytest.mark.skipif(bool(backends._missing("triton")), reason="triton is not installed here")
@@ -43,6 +45,9 @@ def cases() -> dict[str, Case]:
     plain = scene(40, 3, 2, WIDTH, HEIGHT, seed=4)
     made["no background"] = ({name: plain[name] for name in NAMES[:-1]}, WIDTH, HEIGHT, {})
     made["other options"] = (plain, WIDTH, HEIGHT, {"near": 4.5, "eps2d": 1.5})
+    far = {name: value.float().double() for name, value in hard_scene("sub-pixel", 2, 40, 3, 1, WIDTH, HEIGHT).items()}
+    far["intrinsics"][:, 0, 2] += FAR
+    made["far from the corner"] = (far, WIDTH + FAR, HEIGHT, {})
     made["one pixel"] = (scene(4, 3, 1, 1, 1, seed=0), 1, 1, {})
     return made
 

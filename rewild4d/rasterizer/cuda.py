@@ -69,19 +69,22 @@ def rasterize(
     shades = (features.detach(), background.detach())
     with torch.cuda.device_of(means):
         options = (width, height, eps2d, antialias, near)
-        means2d, records, radii, keys, wides, tiles = _Project.apply(*inputs, shades, options)
+        means2d, rests, records, radii, keys, wides, tiles = _Project.apply(*inputs, shades, options)
         if means2d.requires_grad:
             means2d.retain_grad()
         lists = _list_tiles(keys, wides, tiles, views, across, down)
         if lists is None:
             check_values(named)
             raise ValueError(f"expected fewer than {UNUSABLE} pairs of a Gaussian and a tile that it touches.")
-        image, alpha = _Blend.apply(means2d, records, features, background, lists, width, height)
+        image, alpha = _Blend.apply(means2d, rests, records, features, background, lists, width, height)
     return image, alpha, RasterInfo(radii, means2d)
 
 
 class _Project(torch.autograd.Function):
-    """World to image: centres [V, N, 2] and records [V, N, 4]; without gradients radii, keys, wides, tiles [V, N]."""
+    """World to image: centres [V, N, 2] and records [V, N, 4].
+
+    And without gradients what the centres have beyond single precision [V, N, 2], radii, keys, wides and tiles [V, N].
+    """
 
     @staticmethod
     def forward(
@@ -101,7 +104,8 @@ class _Project(torch.autograd.Function):
         means2d, records = means.new_empty(views, count, 2), means.new_empty(views, count, RECORD)
         radii, keys = means.new_empty(views, count), means.new_empty(views, count, dtype=torch.int64)
         wides, tiles = torch.empty_like(radii, dtype=torch.int32), torch.empty_like(radii, dtype=torch.int32)
-        outputs = (means2d, records, radii, keys, wides, tiles)
+        rests = torch.empty_like(means2d)
+        outputs = (means2d, rests, records, radii, keys, wides, tiles)
         triton_project.project[(triton.cdiv(count, BLOCK), views)](
             *inputs, *shades, *outputs, width, height, -(-width // TILE), -(-height // TILE), count,
             shades[0].shape[1], eps2d, near,
@@ -109,14 +113,14 @@ class _Project(torch.autograd.Function):
         )  # fmt: skip
         ctx.save_for_backward(*inputs, radii)
         ctx.options = options
-        ctx.mark_non_differentiable(*outputs[2:])
+        ctx.mark_non_differentiable(rests, *outputs[3:])
         return outputs
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, g_means2d: Tensor, g_records: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, g_means2d: Tensor, *rest: Tensor) -> tuple[Tensor | None, ...]:
         *inputs, radii = ctx.saved_tensors
-        world_to_camera, intrinsics = inputs[4:]
+        (world_to_camera, intrinsics), g_records = inputs[4:], rest[1]
         (views, count), (width, height, eps2d, antialias, _) = radii.shape, ctx.options
         blocks, with_cameras = triton.cdiv(count, BLOCK), any(ctx.needs_input_grad[4:6])
         gradients = [torch.empty_like(tensor) for tensor in inputs[:4]]
@@ -194,6 +198,7 @@ class _Blend(torch.autograd.Function):
     def forward(
         ctx: Any,
         means2d: Tensor,
+        rests: Tensor,
         records: Tensor,
         features: Tensor,
         background: Tensor,
@@ -205,17 +210,17 @@ class _Blend(torch.autograd.Function):
         image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
         part = min(MOST_CHANNELS, triton.next_power_of_2(channels))
         triton_blend.blend[(len(lists.starts) - 1, triton.cdiv(channels, part))](
-            lists.starts, lists.entries, means2d, records, features, background, image, alpha,
+            lists.starts, lists.entries, means2d, rests, records, features, background, image, alpha,
             width, height, *lists.tiles, count, CHANNELS=channels, PART=part, **LAUNCHES["blend"],
         )  # fmt: skip
-        ctx.save_for_backward(means2d, records, features, image, alpha)
+        ctx.save_for_backward(means2d, rests, records, features, image, alpha)
         ctx.lists = lists
         return image, alpha
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g_image: Tensor, g_alpha: Tensor) -> tuple[Tensor | None, ...]:
-        means2d, records, features, image, alpha = ctx.saved_tensors
+        means2d, rests, records, features, image, alpha = ctx.saved_tensors
         lists: _TileLists = ctx.lists
         views, channels, height, width = image.shape
         count, part = len(features), min(MOST_CHANNELS, triton.next_power_of_2(channels))
@@ -223,7 +228,7 @@ class _Blend(torch.autograd.Function):
         gradients = [torch.empty_like(tensor) for tensor in (means2d, records, features)]
         with torch.cuda.device_of(records):
             triton_blend.blend_backward[(len(lists.starts) - 1,)](
-                lists.starts, lists.entries, lists.slots, means2d, records, features, image, alpha,
+                lists.starts, lists.entries, lists.slots, means2d, rests, records, features, image, alpha,
                 g_image.contiguous(), g_alpha.contiguous(), sums,
                 width, height, *lists.tiles, count, CHANNELS=channels, **LAUNCHES["blend_backward"],
             )  # fmt: skip
@@ -231,5 +236,6 @@ class _Blend(torch.autograd.Function):
                 lists.ends, lists.counts, sums, records, *gradients, views, count,
                 CHANNELS=channels, PART=part, **LAUNCHES["gather"],
             )  # fmt: skip
-        v_background = (g_image * (1 - alpha)).sum(dim=(2, 3)) if ctx.needs_input_grad[3] else None
-        return *gradients, v_background, None, None, None
+        v_background = (g_image * (1 - alpha)).sum(dim=(2, 3)) if ctx.needs_input_grad[4] else None
+        v_means2d, v_records, v_features = gradients
+        return v_means2d, None, v_records, v_features, v_background, None, None, None

@@ -42,6 +42,7 @@ def _alphas(
     first: tl.tensor,
     end: tl.tensor,
     centres: tl.tensor,
+    rests: tl.tensor,
     records: tl.tensor,
     x: tl.tensor,
     y: tl.tensor,
@@ -51,8 +52,9 @@ def _alphas(
     place = first + tl.arange(0, GROUP)
     real = place < end
     n = tl.load(entries + place, real, 0)
-    dx = (x + 0.5)[None, :] - tl.load(centres + n * 2, real, 0.0)[:, None]
+    dx = (x + 0.5)[None, :] - tl.load(centres + n * 2, real, 0.0)[:, None] - tl.load(rests + n * 2, real, 0.0)[:, None]
     dy = (y + 0.5)[None, :] - tl.load(centres + n * 2 + 1, real, 0.0)[:, None]
+    dy -= tl.load(rests + n * 2 + 1, real, 0.0)[:, None]
     along_x = tl.load(records + n * 4, real, 0.0)[:, None]
     along_y = tl.load(records + n * 4 + 1, real, 0.0)[:, None]
     t, u = along_x * dx + along_y * dy, tl.load(records + n * 4 + 2, real, 0.0)[:, None] * dy
@@ -76,6 +78,7 @@ def blend(
     starts: tl.tensor,
     entries: tl.tensor,
     centres: tl.tensor,
+    rests: tl.tensor,
     records: tl.tensor,
     features: tl.tensor,
     background: tl.tensor,
@@ -100,7 +103,7 @@ def blend(
     through = left
     total = tl.zeros((PART, PIXELS), tl.float32)
     while (first < end) & (tl.max(left, 0) > _LEAST_LEFT):
-        n, real, _, _, _, alpha = _alphas(entries, first, end, centres, records, x, y, GROUP)
+        n, real, _, _, _, alpha = _alphas(entries, first, end, centres, rests, records, x, y, GROUP)
         after, weight = _weights(alpha, left)
         place = (n - view * count)[:, None] * CHANNELS + channel[None, :]
         shade = tl.load(features + place, real[:, None] & real_channel[None, :], 0.0)
@@ -123,6 +126,7 @@ def blend_backward(
     entries: tl.tensor,
     slots: tl.tensor,
     centres: tl.tensor,
+    rests: tl.tensor,
     records: tl.tensor,
     features: tl.tensor,
     image: tl.tensor,
@@ -156,7 +160,7 @@ def blend_backward(
         slope = tl.load(g_image + plane + channel * area, inside, 0.0)
         behind += slope * tl.load(image + plane + channel * area, inside, 0.0)
     while (first < end) & (tl.max(left, 0) > _LEAST_LEFT):
-        n, real, t, u, exponent, alpha = _alphas(entries, first, end, centres, records, x, y, GROUP)
+        n, real, t, u, exponent, alpha = _alphas(entries, first, end, centres, rests, records, x, y, GROUP)
         after, weight = _weights(alpha, left)
         row = sums + tl.load(slots + first + tl.arange(0, GROUP), real, 0) * (MOMENTS + CHANNELS)
         shade = features + (n - view * count) * CHANNELS

@@ -115,15 +115,25 @@ def _flaw_of_camera(
     return tl.where(sound, 0.0, float("nan"))
 
 
+@triton.jit
+def _store_in_two(high: tl.tensor, low: tl.tensor, value: tl.tensor, real: tl.tensor) -> None:
+    """Store a number in single precision, and what it has beyond that; nothing where it is beyond single precision."""
+    rounded = value.to(tl.float32)
+    tl.store(high, rounded, real)
+    tl.store(low, tl.where(tl.abs(value) < 1e30, value - rounded.to(tl.float64), 0.0).to(tl.float32), real)
+
+
 @triton.jit(do_not_specialize=[*SIZES, "eps2d", "near"])
 def project(
     means: tl.tensor, quats: tl.tensor, scales: tl.tensor, opacities: tl.tensor, world_to_camera: tl.tensor,
-    intrinsics: tl.tensor, features: tl.tensor, background: tl.tensor, means2d: tl.tensor, records: tl.tensor,
-    radii: tl.tensor, keys: tl.tensor, wides: tl.tensor, tiles: tl.tensor, width: tl.tensor, height: tl.tensor,
-    across: tl.tensor, down: tl.tensor, count: tl.tensor, channels: tl.tensor, eps2d: tl.tensor, near: tl.tensor,
-    ANTIALIAS: tl.constexpr,
+    intrinsics: tl.tensor, features: tl.tensor, background: tl.tensor, means2d: tl.tensor, rests: tl.tensor,
+    records: tl.tensor, radii: tl.tensor, keys: tl.tensor, wides: tl.tensor, tiles: tl.tensor, width: tl.tensor,
+    height: tl.tensor, across: tl.tensor, down: tl.tensor, count: tl.tensor, channels: tl.tensor, eps2d: tl.tensor,
+    near: tl.tensor, ANTIALIAS: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Fill means2d [V, N, 2], records [V, N, 4], radii [V, N] and what lists the tiles; program (block, view).
+    """Fill means2d, rests [V, N, 2], records [V, N, 4], radii [V, N] and what lists the tiles; program (block, view).
+
+    A centre is means2d + rests: the steps of single precision grow with the coordinate.
 
     Keys sort by tile, then depth: those of the first tile of each bounding rectangle, [V, N]. The rectangle is wides
     [V, N] tiles across and has tiles [V, N] in all, 0 where nothing is drawn, `UNUSABLE` where its input is not finite
@@ -178,8 +188,8 @@ def project(
         tl.where(sound, xx, 1.0), tl.where(sound, xy, 0.0), tl.where(sound, yy, 1.0), tl.where(sound, det, 1.0)
     )
     row = view * count + n
-    tl.store(means2d + 2 * row, tl.where(ahead, u, 0.0).to(tl.float32), real)
-    tl.store(means2d + 2 * row + 1, tl.where(ahead, v, 0.0).to(tl.float32), real)
+    _store_in_two(means2d + 2 * row, rests + 2 * row, tl.where(ahead, u, 0.0), real)
+    _store_in_two(means2d + 2 * row + 1, rests + 2 * row + 1, tl.where(ahead, v, 0.0), real)
     tl.store(radii + row, radius.to(tl.float32), real)
     tl.store(records + row * RECORD, along_x.to(tl.float32), real)
     tl.store(records + row * RECORD + 1, along_y.to(tl.float32), real)
