@@ -207,7 +207,9 @@ def test_compactness(power: float) -> None:
     weights[:, 7] = 0  # a part without mass is left out
 
     def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
-        given = leaves(dtype, points=normal(1500, 3, seed=3) * torch.tensor((1.0, 2.0, 3.0)))
-        return [compact_loss(given["points"], weights.to(dtype), opacities.to(dtype), power)[None]], given
+        stretch = torch.tensor((1.0, 2.0, 3.0))
+        given = leaves(dtype, points=normal(1500, 3, seed=3) * stretch, others=normal(1500, 3, seed=4) / stretch)
+        clouds = given["points"], given["others"]
+        return [compact_loss(clouds, weights.to(dtype), opacities.to(dtype), power)[None]], given
 
     check_twins(make)

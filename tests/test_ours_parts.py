@@ -155,7 +155,7 @@ def test_compact_loss_is_the_two_small_eigenvalues() -> None:
     weights, opacities = torch.rand(60, 4, generator=generator()), torch.rand(60, generator=generator())
     weights = weights / weights.sum(-1, keepdim=True)
     weights[:, 3] = 0
-    loss = compact_loss(points, weights, opacities, 2.0)
+    loss = compact_loss([points], weights, opacities, 2.0)
 
     def by_eigenvalues(points: Tensor) -> Tensor:
         total = points.new_zeros(())

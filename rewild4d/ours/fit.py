@@ -173,11 +173,8 @@ class Training:
         losses: dict[str, Tensor] = {}
         if index < config.until * self.config.iterations:
             if config.compact and index % config.compact_every == 0:
-                both = [
-                    compact_loss(points, weights, opacities, config.compact_power)
-                    for points in (own.means, posed.means)
-                ]
-                losses["compact"] = config.compact * config.compact_every * torch.stack(both).mean()
+                both = compact_loss((own.means, posed.means), weights, opacities, config.compact_power)
+                losses["compact"] = config.compact * config.compact_every * both
             if config.smooth and index % config.smooth_every == 0:
                 smooth = smooth_loss(deformed, opacities, config.smooth_size, self.generator)
                 losses["smooth"] = config.smooth * config.smooth_every * smooth

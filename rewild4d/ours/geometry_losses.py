@@ -1,6 +1,7 @@
 """Regularisers: total variation of the skinning field, compact parts, smooth normals, and a skeleton's own."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -34,32 +35,35 @@ def tv_loss(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
     return torch.stack(terms).mean()
 
 
-def compact_loss(points: Tensor, weights: Tensor, opacities: Tensor, power: float) -> Tensor:
-    """L_compact: mean over parts of the two smaller eigenvalues of a part's covariance.
+def compact_loss(clouds: Sequence[Tensor], weights: Tensor, opacities: Tensor, power: float) -> Tensor:
+    """L_compact: mean over clouds and parts of the two smaller eigenvalues of a part's covariance.
 
     They are tr C - v^T C v with v the top eigenvector of the detached C: exactly the eigenvalues' gradient, and defined
     where the two coincide. Parts of mass below 1 are skipped; weights and opacities are taken as given, otherwise the
     weights would move to cut the loss.
 
     Args:
-        points: [n, 3].
+        clouds: places of the same Gaussians, [n, 3] each.
         weights: skinning weights, [n, J].
         opacities: [n].
         power: exponent on the weights.
     """
-    if fits(points):
-        return compactness(points, weights, opacities, power)
+    if all(map(fits, clouds)):
+        return compactness(clouds, weights, opacities, power)
     mass = weights.detach() ** power * opacities.detach()[:, None]
     total = mass.sum(0)
     counted = (total >= 1).to(total)  # a mask would wait for a GPU
     share = mass / torch.where(total >= 1, total, 1.0)
-    center = share.T @ points
-    outer = (points[:, :, None] * points[:, None, :]).flatten(1)
-    covariance = (share.T @ outer).view(-1, 3, 3) - center[:, :, None] * center[:, None, :]
-    top = torch.linalg.eigh(covariance.detach().cpu())[1][..., -1].to(covariance)  # a GPU takes longer for so few
-    trace = covariance.diagonal(dim1=1, dim2=2).sum(-1)
-    rest = trace - torch.einsum("ja,jab,jb->j", top, covariance, top)
-    return (rest * counted).sum() / counted.sum().clamp_min(1)
+    losses = []
+    for points in clouds:
+        center = share.T @ points
+        outer = (points[:, :, None] * points[:, None, :]).flatten(1)
+        covariance = (share.T @ outer).view(-1, 3, 3) - center[:, :, None] * center[:, None, :]
+        top = torch.linalg.eigh(covariance.detach().cpu())[1][..., -1].to(covariance)  # a GPU takes longer for so few
+        trace = covariance.diagonal(dim1=1, dim2=2).sum(-1)
+        rest = trace - torch.einsum("ja,jab,jb->j", top, covariance, top)
+        losses.append((rest * counted).sum() / counted.sum().clamp_min(1))
+    return torch.stack(losses).mean()
 
 
 def smooth_loss(posed: Posed, opacities: Tensor, size: int, generator: torch.Generator) -> Tensor:

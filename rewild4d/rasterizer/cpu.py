@@ -23,8 +23,8 @@ from rewild4d.rasterizer.blending_backward import slot_width
 from rewild4d.rasterizer.conventions import RasterInfo
 from rewild4d.rasterizer.crowds import CROWD, NOWHERE
 from rewild4d.rasterizer.projection import RECORD, TILE
-from rewild4d.rasterizer.projection_backward import CAMERA, CHUNK, project_backward
-from rewild4d.rasterizer.stages import bin_and_blend, blend_back, project_and_sort
+from rewild4d.rasterizer.projection_backward import CAMERA, CHUNK
+from rewild4d.rasterizer.stages import bin_and_blend, blend_back, project_and_sort, project_back
 
 keep_freed_memory()
 
@@ -132,32 +132,24 @@ class _Project(torch.autograd.Function):
         views, count = radii.shape
         room = max(count, WIDTH)
         arrays = tuple(array(_padded(tensor, room)).ravel() for tensor in inputs[:4])
-        cameras = array(world_to_camera.double()), array(intrinsics.double())
+        cameras = array(world_to_camera).astype(np.float64), array(intrinsics).astype(np.float64)
         gradients = [tensor.new_empty(room, *tensor.shape[1:]) for tensor in inputs[:4]]
         outputs = tuple(tensor.numpy().ravel() for tensor in gradients)
         shared = tuple(array(_padded(tensor, room, 1)).ravel() for tensor in (radii, g_means2d, g_records))
-        chunks = spans(room, -(-room // CHUNK))
-        v_cameras = np.zeros((len(chunks), views, CAMERA, WIDTH))
+        bounds = _table(spans(room, -(-room // CHUNK)), 2)
+        v_cameras = np.zeros((len(bounds), views * CAMERA * WIDTH))
         with_cameras = any(ctx.needs_input_grad[4:6])
-
-        def work(first: int, last: int) -> None:
-            for chunk in range(first, last):
-                project_backward(
-                    *chunks[chunk],
-                    *arrays,
-                    *cameras,
-                    *ctx.options[:4],
-                    with_cameras,
-                    *shared,
-                    *outputs,
-                    v_cameras[chunk].ravel(),
-                )
-
-        run(work, spans(len(chunks), thread_count()))
-        totals = torch.from_numpy(v_cameras.sum(axis=(0, 3))).to(world_to_camera)
-        v_world_to_camera, v_intrinsics = torch.zeros_like(world_to_camera), torch.zeros_like(intrinsics)
-        v_world_to_camera[:, :3] = totals[:, :12].view(views, 3, 4)
-        v_intrinsics[:, (0, 1, 0, 1), (0, 1, 2, 2)] = totals[:, 12:].to(intrinsics)
+        call = (
+            np.zeros(1, np.int64), bounds, arrays, *cameras, *ctx.options[:4], with_cameras, *shared, outputs,
+            v_cameras,
+        )  # fmt: skip
+        run(project_back, [call] * min(thread_count(), len(bounds)))
+        v_world_to_camera = v_intrinsics = None
+        if with_cameras:
+            totals = torch.from_numpy(v_cameras.reshape(-1, views, CAMERA, WIDTH).sum(axis=(0, 3)))
+            v_world_to_camera, v_intrinsics = torch.zeros_like(world_to_camera), torch.zeros_like(intrinsics)
+            v_world_to_camera[:, :3] = totals[:, :12].view(views, 3, 4).to(world_to_camera)
+            v_intrinsics[:, (0, 1, 0, 1), (0, 1, 2, 2)] = totals[:, 12:].to(intrinsics)
         return *(gradient[:count] for gradient in gradients), v_world_to_camera, v_intrinsics, None
 
 

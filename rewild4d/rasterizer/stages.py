@@ -4,10 +4,12 @@ import numpy as np
 
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.phases import end_phase, enter_phase, phase_ticket
+from rewild4d.kernels.simd import take_ticket
 from rewild4d.rasterizer.binning import mark_pairs, scatter_pairs, sort_by_depth, start_tiles
 from rewild4d.rasterizer.blending import blend
 from rewild4d.rasterizer.blending_backward import blend_backward, gather_slots
 from rewild4d.rasterizer.projection import project
+from rewild4d.rasterizer.projection_backward import project_backward
 
 
 @kernel
@@ -144,3 +146,30 @@ def blend_back(
                 view, bounds[piece, 0], bounds[piece, 1], slots, pair_bits, records, sums, width, v_means2d, v_records,
                 v_features,
             )  # fmt: skip
+
+
+@kernel
+def project_back(
+    tickets: np.ndarray, bounds: np.ndarray, gaussians: tuple, world_to_camera: np.ndarray, intrinsics: np.ndarray,
+    width: int, height: int, eps2d: float, antialias: bool, with_cameras: bool, radii: np.ndarray,
+    g_means2d: np.ndarray, g_records: np.ndarray, made: tuple, v_cameras: np.ndarray,
+) -> None:  # fmt: skip
+    """The gradient of `project_and_sort`.
+
+    Args:
+        bounds: first and one past the last Gaussian of each piece, [P, 2].
+        gaussians: means, quats, scales and opacities, flat.
+        made: their gradients, set, flat.
+        v_cameras: zero, [P, V 16 8]; all other arguments as in `project_backward`.
+    """
+    means, quats, scales, opacities = gaussians
+    v_means, v_quats, v_scales, v_opacities = made
+    while True:
+        piece = take_ticket(tickets)
+        if piece >= len(bounds):
+            return
+        project_backward(
+            bounds[piece, 0], bounds[piece, 1], means, quats, scales, opacities, world_to_camera, intrinsics, width,
+            height, eps2d, antialias, with_cameras, radii, g_means2d, g_records, v_means, v_quats, v_scales,
+            v_opacities, v_cameras[piece],
+        )  # fmt: skip

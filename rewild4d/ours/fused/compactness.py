@@ -3,6 +3,7 @@
 The twin in plain torch is in ours/geometry_losses.py.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -27,16 +28,18 @@ def _mass(weights: np.ndarray, opacities: np.ndarray, n: int, joint: int, power:
 
 @kernel
 def _moments(
-    tickets: np.ndarray, points: np.ndarray, weights: np.ndarray, opacities: np.ndarray, power: float, sums: np.ndarray
+    tickets: np.ndarray, clouds: tuple, weights: np.ndarray, opacities: np.ndarray, power: float, sums: np.ndarray
 ) -> None:
-    """Add up, chunk by chunk, each part's mass, first and second moments: 10 of 16 numbers, [chunks, J x 16]."""
+    """Add up, by chunks, each part's mass, first and second moments: 10 of 16 numbers, [clouds, chunks, J x 16]."""
     count, joints = weights.shape
+    chunks = sums.shape[1]
     values = np.zeros(LANES, np.float32)
     while True:
-        chunk = take_ticket(tickets)
-        if chunk * CHUNK >= count:
+        unit = take_ticket(tickets)
+        if unit >= len(clouds) * chunks:
             return
-        own = sums[chunk]
+        chunk = unit % chunks
+        own, points = sums[unit // chunks, chunk], clouds[unit // chunks]
         for n in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
             x, y, z = points[n, 0], points[n, 1], points[n, 2]
             values[0], values[1], values[2], values[3] = 1, x, y, z
@@ -50,67 +53,69 @@ def _moments(
 
 @kernel
 def _pull(
-    tickets: np.ndarray, points: np.ndarray, weights: np.ndarray, opacities: np.ndarray, power: float,
-    rows: np.ndarray, on_points: np.ndarray,
+    tickets: np.ndarray, clouds: tuple, weights: np.ndarray, opacities: np.ndarray, power: float, rows: np.ndarray,
+    slopes: tuple,
 ) -> None:  # fmt: skip
-    """Set each point's gradient: the mass-weighted sum of the parts' linear functions, rows [J x 16] of 3 x 4."""
+    """Set the gradients of the points: mass-weighted sums of linear functions, rows [clouds, J x 16] of 3 x 4."""
     count, joints = weights.shape
+    chunks = (count + CHUNK - 1) // CHUNK
     row = np.empty(LANES, np.float32)
     while True:
-        begin = take_ticket(tickets) * CHUNK
-        if begin >= count:
+        unit = take_ticket(tickets)
+        if unit >= len(clouds) * chunks:
             return
+        begin, cloud = unit % chunks * CHUNK, unit // chunks
+        points, on_points = clouds[cloud], slopes[cloud]
         for n in range(begin, min(begin + CHUNK, count)):
             total = splat(np.float32(0))
             for joint in range(joints):
                 mass = splat(np.float32(_mass(weights, opacities, n, joint, power)))
-                total = fma(mass, load(rows, joint * LANES), total)
+                total = fma(mass, load(rows[cloud], joint * LANES), total)
             store(row, 0, total)
             x, y, z = points[n, 0], points[n, 1], points[n, 2]
             for i in range(3):
                 on_points[n, i] = row[4 * i] * x + row[4 * i + 1] * y + row[4 * i + 2] * z + row[4 * i + 3]
 
 
-def compactness(points: Tensor, weights: Tensor, opacities: Tensor, power: float) -> Tensor:
-    """Mean over parts of the two smaller eigenvalues of a part's covariance; float32, CPU.
+def compactness(clouds: Sequence[Tensor], weights: Tensor, opacities: Tensor, power: float) -> Tensor:
+    """Mean over clouds and parts of the two smaller eigenvalues of a part's covariance; float32, CPU.
 
     Args:
-        points: [n, 3]; the only input that gets a gradient.
+        clouds: of the same Gaussians, [n, 3] each; the only inputs that get gradients.
         weights: skinning weights, [n, J].
         opacities: [n].
         power: exponent on the weights.
     """
-    return _Compactness.apply(points, weights, opacities, power)
+    return _Compactness.apply(weights, opacities, power, *clouds)
 
 
 class _Compactness(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, points: Tensor, weights: Tensor, opacities: Tensor, power: float) -> Tensor:
-        given = tuple(map(array, (points, weights, opacities)))
-        joints = weights.shape[1]
-        sums = np.zeros((max(1, -(-len(points) // CHUNK)), joints * LANES), np.float32)
-        run(_moments, [(np.zeros(1, np.int64), *given, power, sums)] * thread_count())
-        total = sums.sum(axis=0, dtype=np.float64).reshape(joints, LANES)
-        used = total[:, 0] >= 1
-        mass = np.where(used, total[:, 0], 1.0)
-        center = total[:, 1:4] / mass[:, None]
-        second = total[:, (4, 5, 6, 5, 7, 8, 6, 8, 9)].reshape(joints, 3, 3) / mass[:, None, None]
-        covariance = second - center[:, :, None] * center[:, None, :]
+    def forward(ctx: Any, weights: Tensor, opacities: Tensor, power: float, *clouds: Tensor) -> Tensor:
+        places, given = tuple(map(array, clouds)), (*map(array, (weights, opacities)), power)
+        joints, chunks = weights.shape[1], max(1, -(-len(weights) // CHUNK))
+        sums = np.zeros((len(clouds), chunks, joints * LANES), np.float32)
+        run(_moments, [(np.zeros(1, np.int64), places, *given, sums)] * thread_count())
+        total = sums.sum(axis=1, dtype=np.float64).reshape(len(clouds), joints, LANES)
+        used = total[..., 0] >= 1
+        mass, parts = np.where(used, total[..., 0], 1.0), np.maximum(1, used.sum(axis=-1, keepdims=True))
+        center = total[..., 1:4] / mass[..., None]
+        second = total[..., (4, 5, 6, 5, 7, 8, 6, 8, 9)].reshape(-1, joints, 3, 3) / mass[..., None, None]
+        covariance = second - center[..., :, None] * center[..., None, :]
         top = np.linalg.eigh(covariance)[1][..., -1]
-        across = np.eye(3) - top[:, :, None] * top[:, None, :]
-        share = used / (mass * max(1, used.sum()))
-        rows = np.zeros((joints, LANES), np.float32)
-        rows[:, :12] = (
-            2 * share[:, None, None] * np.concatenate((across, -(across @ center[:, :, None])), axis=2)
-        ).reshape(joints, 12)
-        ctx.given, ctx.power, ctx.rows = given, power, rows
-        value = (used * (across * covariance).sum((1, 2))).sum() / max(1, used.sum())
+        across = np.eye(3) - top[..., :, None] * top[..., None, :]
+        share = used / (mass * parts * len(clouds))
+        rows = np.zeros((len(clouds), joints, LANES), np.float32)
+        slopes = np.concatenate((across, -(across @ center[..., :, None])), axis=-1)
+        rows[..., :12] = (2 * share[..., None, None] * slopes).reshape(-1, joints, 12)
+        ctx.places, ctx.given, ctx.rows = places, given, rows.reshape(len(clouds), -1)
+        value = (used / parts * (across * covariance).sum(axis=(-1, -2))).sum() / len(clouds)
         return torch.tensor(value, dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
-        on_points = torch.empty(ctx.given[0].shape)
-        rows = (ctx.rows * slope.item()).ravel()
-        run(_pull, [(np.zeros(1, np.int64), *ctx.given, ctx.power, rows, on_points.numpy())] * thread_count())
-        return on_points, None, None, None
+        made = [torch.empty(each.shape) for each in ctx.places]
+        rows, slopes = ctx.rows * slope.item(), tuple(each.numpy() for each in made)
+        run(_pull, [(np.zeros(1, np.int64), ctx.places, *ctx.given, rows, slopes)] * thread_count())
+        return None, None, None, *made

@@ -118,18 +118,24 @@ def _apply_back(
 
 
 @kernel
-def _turn_back(quats: np.ndarray, new_quats: np.ndarray, g_quats: np.ndarray, on_quats: np.ndarray) -> None:
+def _turn_back(
+    tickets: np.ndarray, quats: np.ndarray, new_quats: np.ndarray, g_quats: np.ndarray, on_quats: np.ndarray
+) -> None:
     """From the gradients of the turned orientations to those of the unit quaternions that were turned."""
-    for n in range(len(quats)):
-        a, b, c, d = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
-        e, f, g, h = new_quats[n, 0], new_quats[n, 1], new_quats[n, 2], new_quats[n, 3]
-        w, x = a * e + b * f + c * g + d * h, a * f - b * e - c * h + d * g
-        y, z = a * g + b * h - c * e - d * f, a * h - b * g + c * f - d * e
-        p, q, r, s = g_quats[n, 0], g_quats[n, 1], g_quats[n, 2], g_quats[n, 3]
-        on_quats[n, 0] = p * w + q * x + r * y + s * z
-        on_quats[n, 1] = -p * x + q * w - r * z + s * y
-        on_quats[n, 2] = -p * y + q * z + r * w - s * x
-        on_quats[n, 3] = -p * z - q * y + r * x + s * w
+    while True:
+        begin = take_ticket(tickets) * CHUNK
+        if begin >= len(quats):
+            return
+        for n in range(begin, min(begin + CHUNK, len(quats))):
+            a, b, c, d = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
+            e, f, g, h = new_quats[n, 0], new_quats[n, 1], new_quats[n, 2], new_quats[n, 3]
+            w, x = a * e + b * f + c * g + d * h, a * f - b * e - c * h + d * g
+            y, z = a * g + b * h - c * e - d * f, a * h - b * g + c * f - d * e
+            p, q, r, s = g_quats[n, 0], g_quats[n, 1], g_quats[n, 2], g_quats[n, 3]
+            on_quats[n, 0] = p * w + q * x + r * y + s * z
+            on_quats[n, 1] = -p * x + q * w - r * z + s * y
+            on_quats[n, 2] = -p * y + q * z + r * w - s * x
+            on_quats[n, 3] = -p * z - q * y + r * x + s * w
 
 
 @kernel
@@ -159,10 +165,12 @@ def _forward(
 
 @kernel
 def _backward(
-    tickets: np.ndarray, chunk: int, sizes: Layout, reach: Reach, net: Factors, weights: np.ndarray,
+    turns: tuple, tickets: np.ndarray, chunk: int, sizes: Layout, reach: Reach, net: Factors, weights: np.ndarray,
     anchors: np.ndarray, means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, g_means: np.ndarray,
     g_quats: np.ndarray, g_log_scales: np.ndarray, gradients: np.ndarray, on_anchors: np.ndarray,
 ) -> None:  # fmt: skip
+    """The parameters' gradients from these Gaussians, and ``turns``, the arguments of `_turn_back`, of all."""
+    _turn_back(*turns)
     count, wide = len(means), round_up(sizes.width) * BLOCK
     query = np.empty(round_up(sizes.inputs) * BLOCK, np.float32)
     scores = round_up(sizes.scores) * BLOCK
@@ -253,8 +261,8 @@ class _Deform(torch.autograd.Function):
         _, *given, turned = map(array, ctx.saved_tensors)
         slopes = array(g_means), array(g_quats), array(g_log_scales)
         on_quats = torch.empty(g_quats.shape)
-        _turn_back(given[2], turned, slopes[1], on_quats.numpy())
-        flat, on_anchors = _parameter_gradients(ctx, given, turned, slopes)
+        turns = np.zeros(1, np.int64), given[2], turned, slopes[1], on_quats.numpy()
+        flat, on_anchors = _parameter_gradients(ctx, given, turns, slopes)
         by_anchors = None
         if ctx.anchors is not None:
             summed = on_anchors.reshape(-1, LANES)[:, : ctx.anchors[1]]
@@ -263,18 +271,21 @@ class _Deform(torch.autograd.Function):
 
 
 def _parameter_gradients(
-    ctx: Any, given: list[np.ndarray], turned: np.ndarray, slopes: tuple[np.ndarray, np.ndarray, np.ndarray]
+    ctx: Any, given: list[np.ndarray], turns: tuple[np.ndarray, ...], slopes: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of the flat parameters and of the anchors, summed over the Gaussians or over those that stand for them."""
+    """Of the flat parameters and of the anchors, summed over the Gaussians or over those that stand for them.
+
+    Runs `_turn_back` with ``turns`` meanwhile.
+    """
     sizes, reach, _ = ctx.network
     if 0 < ctx.sampled < len(given[0]):
-        rows, factors = sample_rows(reach.reach, reach.grow, turned, *slopes, ctx.sampled, ctx.offset)
-        given = [each[rows] for each in given]
-        on_means, on_quats, on_scales = (each[rows] * factors[:, None] for each in slopes)
+        rows, factors = sample_rows(reach.reach, reach.grow, turns[2], *slopes, ctx.sampled, ctx.offset)
+        given = [each.take(rows, axis=0) for each in given]
+        on_means, on_quats, on_scales = (each.take(rows, axis=0) * factors[:, None] for each in slopes)
         slopes = on_means, on_quats, on_scales
     chunks = max(1, -(-len(given[0]) // CHUNK))
     gradients, on_anchors = np.zeros((chunks, sizes.total), np.float32), np.zeros((chunks, len(ctx.wide)), np.float32)
     weighed, *moved = given
-    call = (np.zeros(1, np.int64), CHUNK, *ctx.network, weighed, ctx.wide, *moved, *slopes, gradients, on_anchors)
-    run(_backward, [call] * thread_count())
+    network = (np.zeros(1, np.int64), CHUNK, *ctx.network, weighed, ctx.wide)
+    run(_backward, [(turns, *network, *moved, *slopes, gradients, on_anchors)] * thread_count())
     return gradients.sum(axis=0), on_anchors.sum(axis=0)

@@ -10,22 +10,56 @@ import math
 import numpy as np
 
 from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.simd import take_ticket
+from rewild4d.kernels.threads import run, thread_count
 
 ROUNDS = 30
 """Most rounds of finding the limit. After fewer than it needs the draw is smaller than wanted, and as unbiased."""
+CHUNK = 2048
+"""Gaussians a unit of work holds; sums are added over these, whatever the number of threads."""
+
+
+@kernel
+def _weigh(
+    tickets: np.ndarray, far: float, grow: float, quats: np.ndarray, g_means: np.ndarray, g_quats: np.ndarray,
+    g_log_scales: np.ndarray, worth: np.ndarray, totals: np.ndarray,
+) -> None:  # fmt: skip
+    """Set the worth of each Gaussian [n], which is the length of its gradient, and its sum over each chunk."""
+    while True:
+        chunk = take_ticket(tickets)
+        if chunk >= len(totals):
+            return
+        total = 0.0
+        for n in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(worth))):
+            along, square = 0.0, 0.0
+            for i in range(4):
+                along += g_quats[n, i] * quats[n, i]
+            for i in range(4):
+                square += (g_quats[n, i] - along * quats[n, i]) ** 2
+            for i in range(3):
+                square += (far * g_means[n, i]) ** 2 + (grow * g_log_scales[n, i]) ** 2
+            worth[n] = math.sqrt(square)
+            total += worth[n]
+        totals[chunk] = total
 
 
 @kernel
 def _certain_from(worth: np.ndarray, wanted: int) -> float:
     """The worth L from which a Gaussian is certain: the sum of min(1, worth / L) is ``wanted``."""
-    limit = math.inf
+    limit, whole = math.inf, len(worth) // 4 * 4
     for _ in range(ROUNDS):
-        certain, rest = 0, 0.0
-        for value in worth:
-            if value >= limit:
-                certain += 1
-            else:
-                rest += value
+        certain = 0
+        a, b, c, d = 0.0, 0.0, 0.0, 0.0
+        # Four sums at once: one alone would wait for its own last addition.
+        for n in range(0, whole, 4):
+            p, q, r, s = worth[n] >= limit, worth[n + 1] >= limit, worth[n + 2] >= limit, worth[n + 3] >= limit
+            certain += p + q + r + s
+            a, b = a + (0.0 if p else worth[n]), b + (0.0 if q else worth[n + 1])
+            c, d = c + (0.0 if r else worth[n + 2]), d + (0.0 if s else worth[n + 3])
+        for n in range(whole, len(worth)):
+            certain += worth[n] >= limit
+            a += 0.0 if worth[n] >= limit else worth[n]
+        rest = (a + b) + (c + d)
         if certain >= wanted or rest == 0 or rest / (wanted - certain) >= limit:
             break
         limit = rest / (wanted - certain)
@@ -33,30 +67,11 @@ def _certain_from(worth: np.ndarray, wanted: int) -> float:
 
 
 @kernel
-def _draw(
-    far: float, grow: float, quats: np.ndarray, g_means: np.ndarray, g_quats: np.ndarray, g_log_scales: np.ndarray,
-    wanted: int, offset: float, rows: np.ndarray, factors: np.ndarray,
-) -> int:  # fmt: skip
-    count = len(rows)
-    worth = np.empty(count, np.float64)
-    total = 0.0
-    for n in range(count):
-        along, square = 0.0, 0.0
-        for i in range(4):
-            along += g_quats[n, i] * quats[n, i]
-        for i in range(4):
-            square += (g_quats[n, i] - along * quats[n, i]) ** 2
-        for i in range(3):
-            square += (far * g_means[n, i]) ** 2 + (grow * g_log_scales[n, i]) ** 2
-        worth[n] = math.sqrt(square)
-        total += worth[n]
-    if not math.isfinite(total):  # what is wrong has to be seen: every Gaussian counts
-        for n in range(count):
-            rows[n], factors[n] = n, 1
-        return count
+def _draw(worth: np.ndarray, wanted: int, offset: float, rows: np.ndarray, factors: np.ndarray) -> int:
+    """Set the rows that are drawn and what each counts, and give their number."""
     limit = _certain_from(worth, wanted)
     chosen, place = 0, offset
-    for n in range(count):
+    for n in range(len(worth)):
         share = 1.0
         if worth[n] < limit:
             share, before = worth[n] / limit, math.floor(place)
@@ -88,6 +103,12 @@ def sample_rows(
         Rows in rising order, int64 [k], and what each counts, float32 [k]; all rows, counting 1, where a gradient is
         not finite, and none where all are zero.
     """
-    rows, factors = np.empty(len(quats), np.int64), np.empty(len(quats), np.float32)
-    count = _draw(far, grow, quats, g_means, g_quats, g_log_scales, wanted, offset, rows, factors)
-    return rows[:count], factors[:count]
+    count = len(quats)
+    worth, totals = np.empty(count), np.empty(-(-count // CHUNK))
+    call = np.zeros(1, np.int64), far, grow, quats, g_means, g_quats, g_log_scales, worth, totals
+    run(_weigh, [call] * thread_count())
+    if not math.isfinite(totals.sum()):  # what is wrong has to be seen: every Gaussian counts
+        return np.arange(count), np.ones(count, np.float32)
+    rows, factors = np.empty(count, np.int64), np.empty(count, np.float32)
+    chosen = _draw(worth, wanted, offset, rows, factors)
+    return rows[:chosen], factors[:chosen]

@@ -151,7 +151,7 @@ class _Skin(torch.autograd.Function):
         run(_forward, [call] * thread_count())
         ctx.save_for_backward(means, quats, weights)
         ctx.tables = rows, signs
-        return new_means, new_quats, new_means.clone(), new_quats.clone()
+        return new_means, new_quats, new_means.detach(), new_quats.detach()  # the same memory
 
     @staticmethod
     @once_differentiable
