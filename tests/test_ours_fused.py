@@ -132,10 +132,12 @@ def test_sampled_skinning_weights(field: SkinningField) -> None:
     check_twins(make)
 
 
-@pytest.mark.parametrize("isolated", [True, False])
-def test_skinning_of_both_branches(isolated: bool) -> None:
+@pytest.mark.parametrize(("isolated", "spread"), [(True, 1.0), (False, 1.0), (True, 0.2)])
+def test_skinning_of_both_branches(isolated: bool, spread: float) -> None:
     template, count = quadruped(), 1300
-    quats = unit(20, 4, seed=1)
+    # Near the rest pose no rotation is opposed to another, which is a path of its own.
+    quats = torch.nn.functional.normalize(unit(20, 4, seed=1) * spread + torch.eye(4)[0] * (1 - spread), dim=-1)
+    assert bool((quats @ quats.T < 0).any()) == (spread == 1)
     weights = normal(count, 20, seed=3).mul(2).softmax(dim=-1)
 
     def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:

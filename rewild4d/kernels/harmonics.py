@@ -28,7 +28,7 @@ CHUNK = 1024
 
 
 @inlined
-def set_basis(direction: tuple, degree: int, values: np.ndarray) -> None:
+def _set_basis(direction: tuple, degree: int, values: np.ndarray) -> None:
     """Values of the basis functions above degree 0, for a unit direction."""
     x, y, z = direction
     values[0], values[1], values[2] = -C1 * y, C1 * z, -C1 * x
@@ -57,7 +57,7 @@ def _shade(
         for n in range(begin, min(begin + CHUNK, len(means))):
             x, y, z = means[n, 0] - eye[0], means[n, 1] - eye[1], means[n, 2] - eye[2]
             inverse = np.float32(1 / max(math.sqrt(x * x + y * y + z * z), 1e-12))
-            set_basis((x * inverse, y * inverse, z * inverse), degree, values)
+            _set_basis((x * inverse, y * inverse, z * inverse), degree, values)
             row = colors[n]
             red, green, blue = half + constant * row[0, 0], half + constant * row[0, 1], half + constant * row[0, 2]
             for k in range((degree + 1) ** 2 - 1):
@@ -86,30 +86,30 @@ def shade(colors: Tensor, means: Tensor, eye: Tensor) -> Tensor:
 
 
 @kernel
-def _set_band(x: Any, y: Any, z: Any, level: int, values: np.ndarray) -> None:
-    """Rows of values of the functions of one degree, 1 to 3, for sixteen directions."""
+def set_band(x: Any, y: Any, z: Any, level: int, values: np.ndarray, wide: int) -> None:
+    """Rows of values, ``wide`` apart, of the functions of one degree, 1 to 3, for sixteen directions."""
     if level == 1:
         store(values, 0, y * splat(np.float32(-C1)))
-        store(values, LANES, z * splat(np.float32(C1)))
-        store(values, 2 * LANES, x * splat(np.float32(-C1)))
+        store(values, wide, z * splat(np.float32(C1)))
+        store(values, 2 * wide, x * splat(np.float32(-C1)))
         return
     xx, yy, zz = x * x, y * y, z * z
     two, three, four = splat(np.float32(2)), splat(np.float32(3)), splat(np.float32(4))
     if level == 2:
         store(values, 0, x * y * splat(np.float32(C2[0])))
-        store(values, LANES, y * z * splat(np.float32(C2[1])))
-        store(values, 2 * LANES, (two * zz - xx - yy) * splat(np.float32(C2[2])))
-        store(values, 3 * LANES, x * z * splat(np.float32(C2[3])))
-        store(values, 4 * LANES, (xx - yy) * splat(np.float32(C2[4])))
+        store(values, wide, y * z * splat(np.float32(C2[1])))
+        store(values, 2 * wide, (two * zz - xx - yy) * splat(np.float32(C2[2])))
+        store(values, 3 * wide, x * z * splat(np.float32(C2[3])))
+        store(values, 4 * wide, (xx - yy) * splat(np.float32(C2[4])))
         return
     across = four * zz - xx - yy
     store(values, 0, y * (three * xx - yy) * splat(np.float32(C3[0])))
-    store(values, LANES, x * y * z * splat(np.float32(C3[1])))
-    store(values, 2 * LANES, y * across * splat(np.float32(C3[2])))
-    store(values, 3 * LANES, z * (two * zz - three * (xx + yy)) * splat(np.float32(C3[3])))
-    store(values, 4 * LANES, x * across * splat(np.float32(C3[4])))
-    store(values, 5 * LANES, z * (xx - yy) * splat(np.float32(C3[5])))
-    store(values, 6 * LANES, x * (xx - three * yy) * splat(np.float32(C3[6])))
+    store(values, wide, x * y * z * splat(np.float32(C3[1])))
+    store(values, 2 * wide, y * across * splat(np.float32(C3[2])))
+    store(values, 3 * wide, z * (two * zz - three * (xx + yy)) * splat(np.float32(C3[3])))
+    store(values, 4 * wide, x * across * splat(np.float32(C3[4])))
+    store(values, 5 * wide, z * (xx - yy) * splat(np.float32(C3[5])))
+    store(values, 6 * wide, x * (xx - three * yy) * splat(np.float32(C3[6])))
 
 
 @kernel
@@ -124,7 +124,7 @@ def _turn_band(
         x = fma(a, load(rotation, 0), fma(b, load(rotation, 3 * LANES), c * load(rotation, 6 * LANES)))
         y = fma(a, load(rotation, LANES), fma(b, load(rotation, 4 * LANES), c * load(rotation, 7 * LANES)))
         z = fma(a, load(rotation, 2 * LANES), fma(b, load(rotation, 5 * LANES), c * load(rotation, 8 * LANES)))
-        _set_band(x, y, z, level, values)
+        set_band(x, y, z, level, values, LANES)
         for channel in range(begin, begin + 3):
             seen = splat(np.float32(0))
             for k in range(size):

@@ -3,7 +3,6 @@
 The twin in plain torch is `Gaussians.seen_rgb` (ours/canonical.py).
 """
 
-import math
 from typing import Any
 
 import numpy as np
@@ -12,10 +11,17 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
+from rewild4d.kernels.columns import read_columns, write_columns
 from rewild4d.kernels.compiling import inlined, kernel
-from rewild4d.kernels.harmonics import CHUNK, set_basis
-from rewild4d.kernels.simd import take_ticket
+from rewild4d.kernels.harmonics import set_band
+from rewild4d.kernels.simd import LANES, divide, fma, load, maximum, select_gt, splat, square_root, store, take_ticket
 from rewild4d.kernels.threads import run, thread_count
+from rewild4d.ours.fused.quaternions import dot, times_back
+
+BLOCK = 64
+"""Gaussians side by side."""
+CHUNK = 8 * BLOCK
+"""Gaussians a unit of work holds."""
 
 
 @inlined
@@ -24,19 +30,23 @@ def _cross(a: tuple, b: tuple) -> tuple:
 
 
 @inlined
-def _direction(means: np.ndarray, quats: np.ndarray, rest: np.ndarray, n: int, eye: np.ndarray) -> tuple:
-    """Unit direction from the eye to a Gaussian, as the Gaussian saw it at rest."""
-    x, y, z = means[n, 0] - eye[0], means[n, 1] - eye[1], means[n, 2] - eye[2]
-    inverse = 1 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
-    p, s = quats[n], rest[n]
+def _column(rows: np.ndarray, lane: int) -> tuple:
+    return load(rows, lane), load(rows, BLOCK + lane), load(rows, 2 * BLOCK + lane), load(rows, 3 * BLOCK + lane)
+
+
+@inlined
+def _direction(means: np.ndarray, quats: np.ndarray, rest: np.ndarray, lane: int, eye: np.ndarray) -> tuple:
+    """Unit directions from the eye to sixteen Gaussians, as these saw it at rest."""
+    one, two, least = splat(np.float32(1)), splat(np.float32(2)), splat(np.float32(1e-24))
+    x, y = load(means, lane) - splat(eye[0]), load(means, BLOCK + lane) - splat(eye[1])
+    z = load(means, 2 * BLOCK + lane) - splat(eye[2])
+    # In this order of the limits a NaN stays one.
+    inverse = divide(one, square_root(maximum(least, x * x + y * y + z * z)))
+    p, s = _column(quats, lane), _column(rest, lane)
     # The quaternion rest conj(posed) turns back; it may have any length.
-    w = s[0] * p[0] + s[1] * p[1] + s[2] * p[2] + s[3] * p[3]
-    axis = (
-        -s[0] * p[1] + s[1] * p[0] - s[2] * p[3] + s[3] * p[2],
-        -s[0] * p[2] + s[1] * p[3] + s[2] * p[0] - s[3] * p[1],
-        -s[0] * p[3] - s[1] * p[2] + s[2] * p[1] + s[3] * p[0],
-    )
-    scale = 2 / max(w * w + axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2], 1e-24)
+    turn = times_back(s, p)
+    w, axis = turn[0], (turn[1], turn[2], turn[3])
+    scale = divide(two, maximum(least, dot(turn, turn)))
     once = _cross(axis, (x, y, z))
     twice = _cross(axis, once)
     return (
@@ -47,23 +57,52 @@ def _direction(means: np.ndarray, quats: np.ndarray, rest: np.ndarray, n: int, e
 
 
 @kernel
+def _set_block(
+    begin: int, end: int, means: np.ndarray, quats: np.ndarray, rest: np.ndarray, eye: np.ndarray, degree: int,
+    rows: tuple, values: np.ndarray,
+) -> None:  # fmt: skip
+    """Set the values of the basis functions above degree 0, [15, BLOCK]; ``rows`` is scratch."""
+    places, turns, rests = rows
+    read_columns(means, begin, end, places, BLOCK)
+    read_columns(quats, begin, end, turns, BLOCK)
+    read_columns(rest, begin, end, rests, BLOCK)
+    for lane in range(0, BLOCK, LANES):
+        x, y, z = _direction(places, turns, rests, lane, eye)
+        for level in range(1, degree + 1):
+            set_band(x, y, z, level, values[(level * level - 1) * BLOCK + lane :], BLOCK)
+
+
+@kernel
+def _scratch() -> tuple:
+    size = LANES * BLOCK
+    return np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
+
+
+@kernel
 def _forward(
     tickets: np.ndarray, colors: np.ndarray, means: np.ndarray, quats: np.ndarray, rest: np.ndarray, eye: np.ndarray,
     degree: int, gain: float, seen: np.ndarray,
 ) -> None:  # fmt: skip
-    values = np.empty(15, np.float32)
-    count = (degree + 1) ** 2 - 1
+    values, rows = np.empty(15 * BLOCK, np.float32), _scratch()
+    columns, made = np.empty((colors.shape[1] + 15) // 16 * 16 * BLOCK, np.float32), np.zeros(LANES * BLOCK, np.float32)
+    count, share, zero = (degree + 1) ** 2 - 1, splat(np.float32(1 / gain)), splat(np.float32(0))
     while True:
-        begin = take_ticket(tickets) * CHUNK
-        if begin >= len(means):
+        chunk = take_ticket(tickets) * CHUNK
+        if chunk >= len(means):
             return
-        for n in range(begin, min(begin + CHUNK, len(means))):
-            set_basis(_direction(means, quats, rest, n, eye), degree, values)
-            for channel in range(3):
-                total = np.float32(0)
-                for k in range(count):
-                    total += values[k] * colors[n, k + 1, channel]
-                seen[n, channel] = max(colors[n, 0, channel] + total / np.float32(gain), np.float32(0))
+        for begin in range(chunk, min(chunk + CHUNK, len(means)), BLOCK):
+            end = min(begin + BLOCK, len(means))
+            _set_block(begin, end, means, quats, rest, eye, degree, rows, values)
+            read_columns(colors, begin, end, columns, BLOCK)
+            for lane in range(0, BLOCK, LANES):
+                for channel in range(3):
+                    total = zero
+                    for k in range(count):
+                        coefficient = load(columns, (3 * k + 3 + channel) * BLOCK + lane)
+                        total = fma(load(values, k * BLOCK + lane), coefficient, total)
+                    color = fma(total, share, load(columns, channel * BLOCK + lane))
+                    store(made, channel * BLOCK + lane, maximum(zero, color))  # in this order a NaN stays one
+            write_columns(made, BLOCK, seen, begin, end)
 
 
 @kernel
@@ -71,27 +110,28 @@ def _backward(
     tickets: np.ndarray, means: np.ndarray, quats: np.ndarray, rest: np.ndarray, eye: np.ndarray, degree: int,
     gain: float, seen: np.ndarray, slope: np.ndarray, on_colors: np.ndarray,
 ) -> None:  # fmt: skip
-    values = np.empty(15, np.float32)
-    count = (degree + 1) ** 2 - 1
-    zero, share_of_one = np.float32(0), np.float32(1 / gain)
+    values, rows = np.empty(15 * BLOCK, np.float32), _scratch()
+    shown, slopes = np.empty(LANES * BLOCK, np.float32), np.empty(LANES * BLOCK, np.float32)
+    columns = np.zeros((on_colors.shape[1] + 15) // 16 * 16 * BLOCK, np.float32)
+    count, share, zero = (degree + 1) ** 2 - 1, splat(np.float32(1 / gain)), splat(np.float32(0))
     while True:
-        begin = take_ticket(tickets) * CHUNK
-        if begin >= len(means):
+        chunk = take_ticket(tickets) * CHUNK
+        if chunk >= len(means):
             return
-        for n in range(begin, min(begin + CHUNK, len(means))):
-            set_basis(_direction(means, quats, rest, n, eye), degree, values)
-            on_colors[n] = 0
-            red, green, blue = (
-                slope[n, 0] if seen[n, 0] > 0 else zero,
-                slope[n, 1] if seen[n, 1] > 0 else zero,
-                slope[n, 2] if seen[n, 2] > 0 else zero,
-            )
-            on_colors[n, 0, 0], on_colors[n, 0, 1], on_colors[n, 0, 2] = red, green, blue
-            for k in range(count):
-                share = values[k] * share_of_one
-                on_colors[n, k + 1, 0] = share * red
-                on_colors[n, k + 1, 1] = share * green
-                on_colors[n, k + 1, 2] = share * blue
+        for begin in range(chunk, min(chunk + CHUNK, len(means)), BLOCK):
+            end = min(begin + BLOCK, len(means))
+            _set_block(begin, end, means, quats, rest, eye, degree, rows, values)
+            read_columns(seen, begin, end, shown, BLOCK)
+            read_columns(slope, begin, end, slopes, BLOCK)
+            for lane in range(0, BLOCK, LANES):
+                for channel in range(3):
+                    place = channel * BLOCK + lane
+                    own = select_gt(load(shown, place), zero, load(slopes, place), zero)
+                    store(columns, place, own)
+                    own = own * share
+                    for k in range(count):
+                        store(columns, (3 * k + 3) * BLOCK + place, load(values, k * BLOCK + lane) * own)
+            write_columns(columns, BLOCK, on_colors, begin, end)
 
 
 def seen_rgb(
@@ -123,7 +163,8 @@ class _Seen(torch.autograd.Function):
     ) -> Tensor:
         seen = torch.empty_like(means)
         given = *map(array, (means, quats, rest, eye.float())), degree, gain
-        run(_forward, [(np.zeros(1, np.int64), array(colors), *given, seen.numpy())] * thread_count())
+        flat = array(colors).reshape(len(colors), -1)
+        run(_forward, [(np.zeros(1, np.int64), flat, *given, seen.numpy())] * thread_count())
         ctx.given, ctx.seen, ctx.shape = given, seen.numpy(), colors.shape
         return seen
 
@@ -131,6 +172,7 @@ class _Seen(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
         on_colors = torch.empty(ctx.shape)
-        call = np.zeros(1, np.int64), *ctx.given, ctx.seen, array(slope), on_colors.numpy()
+        flat = on_colors.numpy().reshape(len(slope), -1)
+        call = np.zeros(1, np.int64), *ctx.given, ctx.seen, array(slope), flat
         run(_backward, [call] * thread_count())
         return on_colors, None, None, None, None, None, None

@@ -1,10 +1,14 @@
-"""Quaternions, wxyz, inside kernels: tuples (or rows of an array) of four numbers; a unit one carries a fifth."""
+"""Quaternions, wxyz, inside kernels: tuples (or rows of an array) of four numbers; a unit one carries a fifth.
+
+A number is a float, or sixteen of them side by side (`simd.Lanes`) but for `side`, `unit` and `unit_row`.
+"""
 
 import math
 
 import numpy as np
 
 from rewild4d.kernels.compiling import inlined
+from rewild4d.kernels.simd import divide, maximum, splat, square_root
 
 SHORTEST = 1e-12
 """Lengths below count as this one, as in torch's `normalize`."""
@@ -34,9 +38,25 @@ def times(p: tuple, q: tuple) -> tuple:
 
 
 @inlined
-def conjugate(q: tuple) -> tuple:
-    """The rotation back."""
-    return q[0], -q[1], -q[2], -q[3]
+def times_back(p: tuple, q: tuple) -> tuple:
+    """The rotation back of q, then p."""
+    return (
+        dot(p, q),
+        p[1] * q[0] - p[0] * q[1] - p[2] * q[3] + p[3] * q[2],
+        p[2] * q[0] - p[0] * q[2] + p[1] * q[3] - p[3] * q[1],
+        p[3] * q[0] - p[0] * q[3] - p[1] * q[2] + p[2] * q[1],
+    )
+
+
+@inlined
+def back_times(p: tuple, q: tuple) -> tuple:
+    """Rotation q, then that of p back."""
+    return (
+        dot(p, q),
+        p[0] * q[1] - p[1] * q[0] - p[2] * q[3] + p[3] * q[2],
+        p[0] * q[2] + p[1] * q[3] - p[2] * q[0] - p[3] * q[1],
+        p[0] * q[3] - p[1] * q[2] + p[2] * q[1] - p[3] * q[0],
+    )
 
 
 @inlined
@@ -52,6 +72,14 @@ def unit_row(quats: np.ndarray, n: int) -> tuple:
     a, b, c, d = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
     inverse = np.float32(1 / max(math.sqrt(a * a + b * b + c * c + d * d), SHORTEST))
     return a * inverse, b * inverse, c * inverse, d * inverse, inverse
+
+
+@inlined
+def unit_lanes(q: tuple) -> tuple:
+    """`unit` of sixteen side by side, in single precision."""
+    # In this order of the limit a NaN stays one.
+    inverse = divide(splat(np.float32(1)), maximum(splat(np.float32(SHORTEST)), square_root(dot(q, q))))
+    return q[0] * inverse, q[1] * inverse, q[2] * inverse, q[3] * inverse, inverse
 
 
 @inlined

@@ -1,0 +1,48 @@
+"""Rows of memory as columns of lanes and back: each number of many Gaussians side by side."""
+
+import numpy as np
+
+from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.matrix import transpose_tile
+from rewild4d.kernels.simd import LANES, load
+from rewild4d.kernels.tails import store_first
+
+
+@kernel
+def read_columns(rows: np.ndarray, begin: int, end: int, columns: np.ndarray, wide: int) -> None:
+    """Set columns [numbers, wide] to the rows [n, numbers] from begin to end; lanes behind them get zeros.
+
+    Args:
+        rows: C-contiguous.
+        begin: first row.
+        end: one past the last; at most ``wide`` rows, a multiple of sixteen.
+        columns: flat, with room for a multiple of sixteen numbers, of which those behind the rows' own are not set to
+            anything that means something.
+        wide: lanes.
+    """
+    numbers = rows.shape[1]
+    flat, length = rows.reshape(-1), rows.size
+    for lane in range(0, wide, LANES):
+        first = (begin + lane) * numbers
+        for number in range(0, numbers, LANES):
+            reach = first + (LANES - 1) * numbers + number + LANES
+            if begin + lane + LANES <= end and reach <= length:
+                transpose_tile(flat, first + number, numbers, columns, number * wide + lane, wide)
+                continue
+            for i in range(number, min(number + LANES, numbers)):
+                for j in range(LANES):
+                    inside = begin + lane + j < end
+                    columns[i * wide + lane + j] = flat[first + j * numbers + i] if inside else np.float32(0)
+
+
+@kernel
+def write_columns(columns: np.ndarray, wide: int, rows: np.ndarray, begin: int, end: int) -> None:
+    """Set the rows [n, numbers] from begin to end to columns [numbers, wide]; arguments as in `read_columns`."""
+    numbers = rows.shape[1]
+    flat, tile = rows.reshape(-1), np.empty(LANES * LANES, np.float32)
+    for first in range(begin, end, LANES):
+        for number in range(0, numbers, LANES):
+            transpose_tile(columns, number * wide + first - begin, wide, tile, 0, LANES)
+            for j in range(min(LANES, end - first)):
+                place = (first + j) * numbers + number
+                store_first(flat, place, numbers - number, load(tile, j * LANES))
