@@ -1,4 +1,4 @@
-"""Compactness of the parts.
+"""Compactness of the parts: small matrix products of the Gaussians' masses in them, sixty-four side by side.
 
 The twin in plain torch is in ours/geometry_losses.py.
 """
@@ -12,43 +12,68 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
+from rewild4d.kernels.columns import read_columns, write_columns
 from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.matrix import add_product, transpose
 from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
 from rewild4d.kernels.threads import run, thread_count
 
-CHUNK = 1024
+BLOCK = 64
+"""Gaussians side by side."""
+CHUNK = 16 * BLOCK
 """Gaussians a unit of work holds; sums are added over these, whatever the number of threads."""
 
 
 @kernel
-def _mass(weights: np.ndarray, opacities: np.ndarray, n: int, joint: int, power: float) -> float:
-    weight = weights[n, joint]
-    return (weight * weight if power == 2 else weight**power) * opacities[n]
+def _mass_block(
+    begin: int, end: int, weights: np.ndarray, opacities: np.ndarray, power: float, mass: np.ndarray
+) -> None:
+    """Set the Gaussians' masses in the parts, [J, BLOCK]."""
+    joints = weights.shape[1]
+    read_columns(weights, begin, end, mass, BLOCK)
+    if power != 2:
+        for i in range(joints * BLOCK):
+            mass[i] = mass[i] ** power
+    opaque = np.zeros(BLOCK, np.float32)
+    opaque[: end - begin] = opacities[begin:end]
+    for joint in range(joints):
+        for place in range(joint * BLOCK, (joint + 1) * BLOCK, LANES):
+            weight, opacity = load(mass, place), load(opaque, place - joint * BLOCK)
+            store(mass, place, weight * weight * opacity if power == 2 else weight * opacity)
+
+
+@kernel
+def _scratch(joints: int) -> tuple:
+    """Room for masses, and for places and their moments by columns and by rows."""
+    room, size = (joints + LANES - 1) // LANES * LANES * BLOCK, LANES * BLOCK
+    mass, places, moments = np.zeros(room, np.float32), np.zeros(size, np.float32), np.zeros(size, np.float32)
+    return mass, places, moments, np.empty(size, np.float32)
 
 
 @kernel
 def _moments(
     tickets: np.ndarray, clouds: tuple, weights: np.ndarray, opacities: np.ndarray, power: float, sums: np.ndarray
 ) -> None:
-    """Add up, by chunks, each part's mass, first and second moments: 10 of 16 numbers, [clouds, chunks, J x 16]."""
+    """Add up, by chunks, each part's mass, first and second moments: 10 of 16 numbers, [clouds, chunks, J.. x 16]."""
     count, joints = weights.shape
-    chunks = sums.shape[1]
-    values = np.zeros(LANES, np.float32)
+    mass, places, moments, turned = _scratch(joints)
     while True:
-        unit = take_ticket(tickets)
-        if unit >= len(clouds) * chunks:
+        chunk = take_ticket(tickets)
+        if chunk >= sums.shape[1]:
             return
-        chunk = unit % chunks
-        own, points = sums[unit // chunks, chunk], clouds[unit // chunks]
-        for n in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
-            x, y, z = points[n, 0], points[n, 1], points[n, 2]
-            values[0], values[1], values[2], values[3] = 1, x, y, z
-            values[4], values[5], values[6] = x * x, x * y, x * z
-            values[7], values[8], values[9] = y * y, y * z, z * z
-            moment = load(values, 0)
-            for joint in range(joints):
-                mass = splat(np.float32(_mass(weights, opacities, n, joint, power)))
-                store(own, joint * LANES, fma(mass, moment, load(own, joint * LANES)))
+        for begin in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count), BLOCK):
+            end = min(begin + BLOCK, count)
+            _mass_block(begin, end, weights, opacities, power, mass)
+            for cloud in range(len(clouds)):
+                read_columns(clouds[cloud], begin, end, places, BLOCK)
+                for lane in range(0, BLOCK, LANES):
+                    x, y, z = load(places, lane), load(places, BLOCK + lane), load(places, 2 * BLOCK + lane)
+                    own = splat(np.float32(1)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z
+                    for i in range(len(own)):
+                        store(moments, i * BLOCK + lane, own[i])
+                transpose(moments, LANES, BLOCK, turned)
+                rows = (joints + 7) // 8 * 8
+                add_product(mass, 0, BLOCK, 1, turned, 0, LANES, BLOCK, sums[cloud, chunk], 0, LANES, rows, LANES)
 
 
 @kernel
@@ -58,23 +83,25 @@ def _pull(
 ) -> None:  # fmt: skip
     """Set the gradients of the points: mass-weighted sums of linear functions, rows [clouds, J x 16] of 3 x 4."""
     count, joints = weights.shape
-    chunks = (count + CHUNK - 1) // CHUNK
-    row = np.empty(LANES, np.float32)
+    mass, places, made, own = _scratch(joints)
     while True:
-        unit = take_ticket(tickets)
-        if unit >= len(clouds) * chunks:
+        begin = take_ticket(tickets) * BLOCK
+        if begin >= count:
             return
-        begin, cloud = unit % chunks * CHUNK, unit // chunks
-        points, on_points = clouds[cloud], slopes[cloud]
-        for n in range(begin, min(begin + CHUNK, count)):
-            total = splat(np.float32(0))
-            for joint in range(joints):
-                mass = splat(np.float32(_mass(weights, opacities, n, joint, power)))
-                total = fma(mass, load(rows[cloud], joint * LANES), total)
-            store(row, 0, total)
-            x, y, z = points[n, 0], points[n, 1], points[n, 2]
-            for i in range(3):
-                on_points[n, i] = row[4 * i] * x + row[4 * i + 1] * y + row[4 * i + 2] * z + row[4 * i + 3]
+        end = min(begin + BLOCK, count)
+        _mass_block(begin, end, weights, opacities, power, mass)
+        for cloud in range(len(clouds)):
+            read_columns(clouds[cloud], begin, end, places, BLOCK)
+            own[:] = 0
+            add_product(rows[cloud], 0, 1, LANES, mass, 0, BLOCK, joints, own, 0, BLOCK, LANES, BLOCK)
+            for lane in range(0, BLOCK, LANES):
+                x, y, z = load(places, lane), load(places, BLOCK + lane), load(places, 2 * BLOCK + lane)
+                for i in range(3):
+                    first = 4 * i * BLOCK + lane
+                    a, b = load(own, first), load(own, first + BLOCK)
+                    c, d = load(own, first + 2 * BLOCK), load(own, first + 3 * BLOCK)
+                    store(made, i * BLOCK + lane, fma(a, x, fma(b, y, fma(c, z, d))))
+            write_columns(made, BLOCK, slopes[cloud], begin, end)
 
 
 def compactness(clouds: Sequence[Tensor], weights: Tensor, opacities: Tensor, power: float) -> Tensor:
@@ -94,9 +121,10 @@ class _Compactness(torch.autograd.Function):
     def forward(ctx: Any, weights: Tensor, opacities: Tensor, power: float, *clouds: Tensor) -> Tensor:
         places, given = tuple(map(array, clouds)), (*map(array, (weights, opacities)), power)
         joints, chunks = weights.shape[1], max(1, -(-len(weights) // CHUNK))
-        sums = np.zeros((len(clouds), chunks, joints * LANES), np.float32)
+        room = -(-joints // LANES) * LANES
+        sums = np.zeros((len(clouds), chunks, room * LANES), np.float32)
         run(_moments, [(np.zeros(1, np.int64), places, *given, sums)] * thread_count())
-        total = sums.sum(axis=1, dtype=np.float64).reshape(len(clouds), joints, LANES)
+        total = sums.sum(axis=1, dtype=np.float64).reshape(len(clouds), room, LANES)[:, :joints]
         used = total[..., 0] >= 1
         mass, parts = np.where(used, total[..., 0], 1.0), np.maximum(1, used.sum(axis=-1, keepdims=True))
         center = total[..., 1:4] / mass[..., None]
