@@ -10,6 +10,8 @@ from typing import Any
 
 import torch
 
+from rewild4d.kernels.openmp import let_idle_threads_go
+
 _Job = tuple[Callable[..., Any], tuple[Any, ...], "_Outcome"] | None
 """None ends the worker that takes it."""
 
@@ -111,6 +113,8 @@ def run(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> None:
             while len(_workers) < len(calls) - 1:
                 _workers.append(threading.Thread(target=_work, args=(_jobs,), daemon=True, name="rewild4d-raster"))
                 _workers[-1].start()
+    if len(calls) > 1:
+        let_idle_threads_go()
     outcomes = [_Outcome() for _ in calls[1:]]
     for args, outcome in zip(calls[1:], outcomes, strict=True):
         _jobs.put((function, args, outcome))

@@ -88,7 +88,15 @@ def _check_range(named: dict[str, Tensor]) -> None:
     """Channels whose products with each other's derivatives would overflow, and leave NaN in a gradient."""
     for name in ("features", "background"):
         values = named[name].detach() if name in named else torch.empty(0)
-        if values.numel() and float(torch.maximum(values.max(), -values.min())) > MOST_FEATURE:
+        if values.numel() and _largest(values) > MOST_FEATURE:
             index = tuple((values.abs() > MOST_FEATURE).nonzero()[0].tolist())
             found = f"{values[index].item():g} at index {list(index)}"
             raise ValueError(f"{name}: expected magnitudes up to {MOST_FEATURE:.2g}, got {found}.")
+
+
+def _largest(values: Tensor) -> float:
+    """The largest magnitude, of at least one finite value."""
+    if values.device.type == "cpu":  # see `_check_finite`
+        numbers = values.numpy()
+        return float(max(numbers.max(), -numbers.min()))
+    return float(torch.maximum(values.max(), -values.min()))
