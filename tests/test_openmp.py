@@ -2,6 +2,8 @@
 
 import multiprocessing
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 
@@ -16,7 +18,8 @@ LARGE = torch.ones(1_000_000)
 
 
 @pytest.fixture(autouse=True)
-def two_threads() -> Iterator[None]:
+def two_threads_that_spin(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     yield
@@ -60,6 +63,23 @@ def test_a_kernel_on_two_threads_lets_them_go_and_one_on_one_thread_does_not(thr
     assert threads() == before + 1
     run(lambda: None, [()] * 2)
     assert settles(threads, before)
+
+
+def test_threads_that_do_not_spin_stay(threads: Callable[[], int], monkeypatch: pytest.MonkeyPatch) -> None:
+    LARGE + 1
+    before = threads()
+    monkeypatch.setenv("OMP_WAIT_POLICY", "passive")
+    openmp.let_idle_threads_go()
+    time.sleep(0.2)
+    assert threads() == before
+
+
+@pytest.mark.parametrize(("first", "policy"), [("rewild4d", "PASSIVE"), ("torch", "None")])
+def test_the_policy_is_set_where_the_runtime_hears_it(first: str, policy: str) -> None:
+    code = f"import {first}, rewild4d, os; print(os.environ.get('OMP_WAIT_POLICY'))"
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    made = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert made.stdout.strip() == policy
 
 
 def _in_child(queue: "multiprocessing.Queue[int]") -> None:

@@ -33,12 +33,12 @@ def _pause() -> Callable[[int], int] | None:
 def let_idle_threads_go() -> None:
     """End the threads that torch keeps for the caller's parallel operations; the next of them starts new ones.
 
-    After an operation GNU's runtime spins for some 7 ms. A kernel that starts then shares its cores: a forward and
-    backward pass of 30,000 Gaussians at 512² with a loss in torch took 14.5 ms on two cores, and takes 8.9 without
-    them. Ending and starting them costs some 50 µs. Nothing happens where torch computes on one thread, as in
-    `threads.torch_on_one`, nor in a forked process.
+    After an operation GNU's runtime spins for milliseconds, and a kernel that starts then shares its cores. Nothing
+    happens where they do not spin (OMP_WAIT_POLICY=PASSIVE, see `rewild4d/__init__.py`), where torch computes on one
+    thread, as in `threads.torch_on_one`, nor in a forked process.
     """
-    if _forked or torch.get_num_threads() == 1:
+    passive = os.environ.get("OMP_WAIT_POLICY", "").upper() == "PASSIVE"
+    if passive or _forked or torch.get_num_threads() == 1:
         return
     pause = _pause()
     if pause is not None:
