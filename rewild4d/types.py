@@ -11,7 +11,6 @@ Two frames of reference:
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -36,7 +35,7 @@ class Camera:
     width: int
     height: int
 
-    @cached_property
+    @property
     def center(self) -> Tensor:
         """Camera centre in the world, [3]."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numba.core.errors import TypingError
 
 from rewild4d.kernels.columns import read_columns, write_columns
 
@@ -22,3 +23,10 @@ def test_columns_are_the_transposed_rows(numbers: int, begin: int, end: int) -> 
     assert (written[begin:end] == rows[begin:end]).all()
     written[begin:end] = 0
     assert (written == 0).all(), "no other row is touched"
+
+
+def test_other_numbers_than_single_precision_are_an_error() -> None:
+    with pytest.raises(TypingError):
+        read_columns(np.zeros((4, 3)), 0, 4, np.zeros(16 * WIDE, np.float32), WIDE)
+    with pytest.raises(TypingError):
+        write_columns(np.zeros(16 * WIDE, np.float32), WIDE, np.zeros((4, 3)), 0, 4)

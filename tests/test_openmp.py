@@ -82,19 +82,20 @@ def test_the_policy_is_set_where_the_runtime_hears_it(first: str, policy: str) -
     assert made.stdout.strip() == policy
 
 
-def _in_child(queue: "multiprocessing.Queue[int]") -> None:
+def _in_child(queue: "multiprocessing.Queue[bool]") -> None:
     run(lambda: None, [()] * 2)
-    queue.put(1)
+    queue.put(openmp._forked and openmp._was_forked() == os.path.exists("/proc/self/stat"))
 
 
 def test_a_forked_child_does_not_wait_for_threads_that_it_has_not() -> None:
+    assert not openmp._was_forked()
     LARGE + 1
     context = multiprocessing.get_context("fork")
     queue = context.Queue()
     child = context.Process(target=_in_child, args=(queue,))
     child.start()
     try:
-        assert queue.get(timeout=30) == 1
+        assert queue.get(timeout=30)
     finally:
         child.kill()
         child.join()

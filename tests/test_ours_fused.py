@@ -9,6 +9,7 @@ from rewild4d.kernels.halves import AVAILABLE
 from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.config import Config, Deform, Loss, Skinning
 from rewild4d.ours.deform import DeformNetwork, Posed
+from rewild4d.ours.fused.harmonics import seen_rgb
 from rewild4d.ours.fused.skinning import skin_both
 from rewild4d.ours.geometry_losses import compact_loss
 from rewild4d.ours.losses import colour_losses, silhouette_loss, union_window
@@ -190,6 +191,29 @@ def test_seen_colours(degree: int) -> None:
         return [own.seen_rgb(means, quats, eye, degree)], {"colors": own.colors}
 
     check_twins(make)
+
+
+def test_seen_colours_of_no_gaussians_and_of_too_few_coefficients() -> None:
+    none = [torch.zeros(0, *shape, requires_grad=True) for shape in ((16, 3), (3,), (4,), (4,))]
+    seen = seen_rgb(*none, torch.zeros(3), 3, 1.0)
+    seen.sum().backward()
+    assert seen.shape == (0, 3)
+    assert none[0].grad is not None
+    with pytest.raises(ValueError, match="expected 16 coefficients for degree 3, got 9"):
+        seen_rgb(torch.zeros(2, 9, 3), *none[1:], torch.zeros(3), 3, 1.0)
+
+
+def test_rows_in_any_order_of_memory() -> None:
+    means, quats = normal(3, 70, seed=1).float(), unit(70, 4, seed=2).float()
+    colors, eye = normal(70, 4, 3, seed=3).float(), torch.tensor((0.0, 0, 9))
+    joints = normal(5, 4, 4, seed=4).float(), unit(5, 4, seed=5).float()
+    weights = normal(70, 5, seed=6).softmax(dim=-1).float()
+    turned = quats.T.contiguous().T
+    made = skin_both(means.T, turned, weights, *joints)
+    for a, b in zip(made, skin_both(means.T.contiguous(), quats, weights, *joints), strict=True):
+        assert torch.equal(a, b)
+    expected = seen_rgb(colors, means.T.contiguous(), quats, quats, eye, 1, 1.0)
+    assert torch.equal(seen_rgb(colors, means.T, turned, turned, eye, 1, 1.0), expected)
 
 
 def test_sampled_weights_with_the_total_variation(field: SkinningField) -> None:

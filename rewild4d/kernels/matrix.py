@@ -156,7 +156,9 @@ def add_product(
 
 @intrinsic
 def transpose_tile(typing: Any, source: Any, first: Any, row: Any, target: Any, place: Any, step: Any) -> Any:
-    """Write the transpose of the 16 x 16 tile of ``source`` at ``first`` (rows ``row`` apart) to ``target``."""
+    """Write the transpose of the 16 x 16 tile of a float32 ``source`` at ``first``, rows ``row`` apart, to ``target``."""
+    if not source.dtype == target.dtype == types.float32:
+        return None
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         given, made = _data(context, builder, sig.args[0], args[0]), _data(context, builder, sig.args[3], args[3])

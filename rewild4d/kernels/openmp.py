@@ -9,7 +9,21 @@ import torch
 
 _SOFT = 1
 """omp_pause_soft: threads end, settings stay, and the next parallel operation starts threads anew."""
-_forked = False
+_FORK_WITHOUT_EXEC = 0x40
+"""Linux's PF_FORKNOEXEC."""
+
+
+def _was_forked() -> bool:
+    """Whether this process began as a fork, as far as that can be seen: `fork` may come before this module's import."""
+    try:
+        with open("/proc/self/stat") as stat:
+            flags = int(stat.read().rpartition(")")[2].split()[6])
+    except OSError:
+        return False
+    return bool(flags & _FORK_WITHOUT_EXEC)
+
+
+_forked = _was_forked()
 
 
 def _mark_fork() -> None:

@@ -39,7 +39,9 @@ def load_first(typing: Any, array: Any, index: Any, count: Any, rest: Any) -> An
 
 @intrinsic
 def store_first(typing: Any, array: Any, index: Any, count: Any, value: Any) -> Any:
-    """Write the first ``count`` of sixteen consecutive numbers."""
+    """Write the first ``count`` of sixteen consecutive numbers of a float32 array."""
+    if array.dtype != types.float32:
+        return None
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         place = _pointer(context, builder, sig.args[0], *args[:2])

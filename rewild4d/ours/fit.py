@@ -115,7 +115,7 @@ class Training:
         offset = float(torch.rand((), generator=self.generator)) if config.deform.sampled else 0.0
         deformed = model.deformed(pose, weights, posed, strength, offset)
         degree = min(config.canonical.sh_degree, int(progress / config.canonical.sh_every))
-        colors = model.gaussians.seen_rgb(deformed.means, deformed.quats, target.camera.center, degree)
+        colors = model.gaussians.seen_rgb(deformed.means, deformed.quats, target.eye, degree)
         rgb, alpha, info = self._render(deformed, opacities, colors, target)
 
         losses = self._image_losses(pose_alpha, rgb, alpha, target)

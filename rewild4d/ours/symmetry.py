@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -41,6 +42,11 @@ class Target:
     mask: Tensor
     camera: Camera
     side: float
+
+    @cached_property
+    def eye(self) -> Tensor:
+        """The camera's centre, [3]."""
+        return self.camera.center
 
 
 class Supervision:

@@ -143,7 +143,7 @@ class _Compactness(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
-        made = [torch.empty(each.shape) for each in ctx.places]
+        made = [torch.empty(each.shape, dtype=torch.float32) for each in ctx.places]
         rows, slopes = ctx.rows * slope.item(), tuple(each.numpy() for each in made)
         run(_pull, [(np.zeros(1, np.int64), ctx.places, *ctx.given, rows, slopes)] * thread_count())
         return None, None, None, *made

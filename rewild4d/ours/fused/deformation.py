@@ -260,7 +260,7 @@ class _Deform(torch.autograd.Function):
     def backward(ctx: Any, g_means: Tensor, g_quats: Tensor, g_log_scales: Tensor) -> tuple[Tensor | None, ...]:
         _, *given, turned = map(array, ctx.saved_tensors)
         slopes = array(g_means), array(g_quats), array(g_log_scales)
-        on_quats = torch.empty(g_quats.shape)
+        on_quats = torch.empty(g_quats.shape, dtype=torch.float32)
         turns = np.zeros(1, np.int64), given[2], turned, slopes[1], on_quats.numpy()
         flat, on_anchors = _parameter_gradients(ctx, given, turns, slopes)
         by_anchors = None

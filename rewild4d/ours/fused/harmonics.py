@@ -153,6 +153,8 @@ def seen_rgb(
     """
     if not 1 <= degree <= 3:
         raise ValueError(f"expected a degree from 1 to 3, got {degree}")
+    if colors.shape[1] < (degree + 1) ** 2:
+        raise ValueError(f"expected {(degree + 1) ** 2} coefficients for degree {degree}, got {colors.shape[1]}")
     return _Seen.apply(colors, means, quats, rest, eye, degree, gain)
 
 
@@ -161,9 +163,9 @@ class _Seen(torch.autograd.Function):
     def forward(
         ctx: Any, colors: Tensor, means: Tensor, quats: Tensor, rest: Tensor, eye: Tensor, degree: int, gain: float
     ) -> Tensor:
-        seen = torch.empty_like(means)
+        seen = torch.empty(means.shape, dtype=torch.float32)
         given = *map(array, (means, quats, rest, eye.float())), degree, gain
-        flat = array(colors).reshape(len(colors), -1)
+        flat = array(colors).reshape(len(colors), 3 * colors.shape[1])
         run(_forward, [(np.zeros(1, np.int64), flat, *given, seen.numpy())] * thread_count())
         ctx.given, ctx.seen, ctx.shape = given, seen.numpy(), colors.shape
         return seen
@@ -171,8 +173,8 @@ class _Seen(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
-        on_colors = torch.empty(ctx.shape)
-        flat = on_colors.numpy().reshape(len(slope), -1)
+        on_colors = torch.empty(ctx.shape, dtype=torch.float32)
+        flat = on_colors.numpy().reshape(len(slope), 3 * ctx.shape[1])
         call = np.zeros(1, np.int64), *ctx.given, ctx.seen, array(slope), flat
         run(_backward, [call] * thread_count())
         return on_colors, None, None, None, None, None, None

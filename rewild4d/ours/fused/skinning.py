@@ -236,7 +236,8 @@ def skin_both(
         joint_quats: their rotations, [J, 4].
 
     Returns:
-        Means [n, 3] and unit quats [n, 4] whose gradients reach the joints, then two whose gradients do not.
+        Means [n, 3] and unit quats [n, 4] whose gradients reach the joints, then two whose gradients do not, in the
+        same memory: none may be changed in place.
     """
     return _Skin.apply(means, quats, weights, transforms, joint_quats)
 
@@ -247,7 +248,7 @@ class _Skin(torch.autograd.Function):
         ctx: Any, means: Tensor, quats: Tensor, weights: Tensor, transforms: Tensor, joint_quats: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         ctx.joints = _tables(transforms, joint_quats)
-        new_means, new_quats = torch.empty_like(means), torch.empty_like(quats)
+        new_means, new_quats = (torch.empty(each.shape, dtype=torch.float32) for each in (means, quats))
         given = tuple(map(array, (means, quats, weights)))
         call = np.zeros(1, np.int64), *given, ctx.joints, new_means.numpy(), new_quats.numpy()
         run(_forward, [call] * thread_count())
@@ -258,7 +259,7 @@ class _Skin(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor, ...]:
         given = tuple(map(array, ctx.saved_tensors))
-        made = tuple(torch.empty(each.shape) for each in given)
+        made = tuple(torch.empty(each.shape, dtype=torch.float32) for each in given)
         joints, chunks = given[2].shape[1], max(1, -(-len(given[0]) // CHUNK))
         on_rows = np.zeros((chunks, len(ctx.joints.rows)), np.float32)
         call = (
