@@ -156,7 +156,7 @@ def add_product(
 
 @intrinsic
 def transpose_tile(typing: Any, source: Any, first: Any, row: Any, target: Any, place: Any, step: Any) -> Any:
-    """Write the transpose of the 16 x 16 tile of a float32 ``source`` at ``first``, rows ``row`` apart, to ``target``."""
+    """Write the transpose of the 16 x 16 tile of a float32 ``source`` at ``first``, rows ``row`` apart."""
     if not source.dtype == target.dtype == types.float32:
         return None
 
