@@ -129,9 +129,12 @@ def batch_of_poses(dtype: torch.dtype, batch: int) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize(("batch", "rows"), [(1, [0]), (3, [1]), (6, [0, 4]), (2, [])])
-@pytest.mark.parametrize("only", ["limit", "attach", "temporal", "still", None, ""])
+@pytest.mark.parametrize(
+    "only", ["limit", "attach", "temporal", "still", "limb_plane", "body_plane", "sideways", None, ""]
+)
 def test_stance(batch: int, rows: list[int], only: str | None) -> None:
     weights = {"limit": 3.0, "attach": 20.0, "temporal": 10.0, "still": 2.0}
+    weights |= {"limb_plane": 40.0, "body_plane": 30.0, "sideways": 50.0}
     if only is not None:
         weights = {name: value * (name == only) for name, value in weights.items()}
     config = Geometry(**weights)
@@ -209,6 +212,33 @@ def test_a_bone_beyond_its_limit() -> None:
     bones = sum(parent >= 0 for parent in PARENTS)
     expected = (math.cos(math.radians(30)) - math.cos(half)) ** 2 / bones
     assert float(stance(own, pose, [0], config)[2]) == pytest.approx(expected, rel=1e-4)
+
+
+def test_what_leaves_the_planes_along_the_body() -> None:
+    own, rest, flat = model(), torch.tensor((1.0, 0, 0, 0)), Geometry(limit=0.0, attach=0.0, temporal=0.0)
+    limbs = sum(other != joint for joint, other in enumerate(MIRROR))
+    half = math.radians(20) / 2
+    foot, head = 8, 0
+
+    def cost(joint: int, axis: int, **weights: float) -> float:
+        """Of a bone that turns by 20 degrees about an axis, and its joint shifts by .5 along it."""
+        quats, shifts = rest.repeat(1, 20, 1), torch.zeros(1, 20, 3)
+        quats[0, joint, 0], quats[0, joint, 1 + axis], shifts[0, joint, axis] = math.cos(half), math.sin(half), 0.5
+        pose = Pose(-quats, shifts, torch.zeros(1, 20, 4))  # the same rotations
+        return float(stance(own, pose, [0], msgspec.structs.replace(flat, **weights))[2])
+
+    out = math.sin(half) ** 2
+    assert [cost(foot, axis, limb_plane=3.0) for axis in range(3)] == pytest.approx(
+        [0, 3 * out / limbs, 3 * out / limbs]
+    )
+    assert [cost(foot, axis, sideways=3.0) for axis in range(3)] == pytest.approx([3 * 0.1**2 / limbs, 0, 0])
+    assert [cost(head, axis, body_plane=3.0) for axis in range(3)] == pytest.approx([0, 3 * out / 8, 3 * out / 8])
+    assert cost(head, 1, limb_plane=3.0, sideways=3.0) == cost(foot, 1, body_plane=3.0) == 0
+    # What turns with its parent has not left its plane.
+    turned = torch.tensor((math.cos(half), 0, math.sin(half), 0)).repeat(1, 20, 1)
+    pose = Pose(turned, torch.zeros(1, 20, 3), torch.zeros(1, 20, 4))
+    held = msgspec.structs.replace(flat, limb_plane=3.0)
+    assert float(stance(own, pose, [0], held)[2]) == pytest.approx(0, abs=1e-12)
 
 
 @pytest.mark.parametrize("weight", [0.3, 1.0])

@@ -76,8 +76,7 @@ class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """Frames of a clip that `frequencies` octaves are for; one octave more for each doubling; 0 leaves it at them. Six
     for four: camel (72 training frames) 24.98 for 24.90 dB, cows (83) 23.45 for 23.26 (8: 23.36), one seed each."""
     encoding: Literal["group", "view"] = "group"
-    """Sign that turns time in the code: the group's m, or the image's v (the paper's "w/o Symm. Enc.", emb(t v) + v:
-    both groups share one code). Without effect where `tied`: poses are then mirrored, not coded."""
+    """Sign that turns time in the code: the group's m, or the image's v ("w/o Symm. Enc."); of no use where `tied`."""
     explicit_group: bool = False
     """Append the group sign m to the code."""
     width: Count = 128
@@ -219,17 +218,18 @@ class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """Wider than any joint of a quadruped needs between two bones of the template."""
     attach: Weight = 20.0
     """Pose: squared gap between a joint and its parent there, over the squared diagonal; not measured alone."""
+    limb_plane: Weight = 0.0
+    """Pose: squared turn of a limb's bone against its parent out of the plane along the body (half radians)."""
+    body_plane: Weight = 0.0
+    """Pose: the same of the other bones."""
+    sideways: Weight = 0.0
+    """Pose: squared shift of a limb's joints across the body (diagonals)."""
     temporal: Weight = 10.0
     """Pose: squared second difference over neighbouring frames; not measured alone."""
     still: Weight = 0.0
-    """Pose: steps between neighbouring frames, as Geman and McClure weigh them: what drifts slowly, where the one
-    camera cannot see it, is held still; what moves is left alone. See `still_step` for how much."""
+    """Pose: steps between neighbouring frames as Geman and McClure weigh them: what drifts slowly is held still."""
     still_step: Positive = 1e-3
-    """Step of a rotation (half radians) or of a joint (diagonals) that divides drift from motion. Held-out PSNR of the
-    rigged cow, which stands, the rigged horse, the built-in giraffe and the rigged wolf, which walk and run (sweeping
-    camera, standard, seed 0), by weight and step: none 27.0 25.3 30.1 22.5; 3 and 1e-3 27.5 25.2 30.2 22.8; 10 and
-    1e-3 27.6 25.1; 3 and 2e-3 27.8 25.0; 10 and 3e-3 28.8 24.6 28.1 23.2. The last for those joints alone that hardly
-    move in the prior (standard deviation below .03): 27.6 25.1."""
+    """Step of a rotation (half radians) or joint (diagonals) between drift and motion; tried: leaderboard/results."""
     rigid: Weight = 1.0
     """Deformed branch: change of distance between canonical neighbours; +0.3 dB on one horse (and fewer Gaussians)."""
     rigid_neighbours: Count = 5

@@ -145,6 +145,30 @@ def attach_loss(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
     return (own - above).square().sum((-1, -2)).mean() / OBJECT_DIAGONAL**2
 
 
+def sagittal_losses(pose: Pose, parents: Tensor, mirror: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """How far bones turn out of the planes along the body, and how far limbs move sideways: means over what they count.
+
+    A turn against the parent within such a plane is about x. Limbs are the bones that have another on the other side.
+
+    Args:
+        pose: unit quaternions.
+        parents: -1 for a root, [J].
+        mirror: bone on the other side, [J].
+
+    Returns:
+        Squares of the y and z of the quaternion against the parent, of limbs and of other bones; and the squared x of
+        the limbs' shifts over the squared diagonal.
+    """
+    limbs = (mirror != torch.arange(len(mirror), device=mirror.device)).to(pose.quats)
+    rest = pose.quats.new_tensor((1.0, 0, 0, 0))
+    above = torch.where((parents >= 0)[:, None], pose.quats[:, parents.clamp_min(0)], rest)
+    local = quat_multiply(above * above.new_tensor((1.0, -1.0, -1.0, -1.0)), pose.quats)
+    out = local[..., 2:].square().sum(-1)
+    sideways = (pose.shifts[..., 0] / OBJECT_DIAGONAL).square()
+    of_limbs, others = limbs / limbs.sum().clamp_min(1), (1 - limbs) / (1 - limbs).sum().clamp_min(1)
+    return tuple((each @ share).mean() for each, share in ((out, of_limbs), (out, others), (sideways, of_limbs)))
+
+
 def temporal_loss(pose: Pose) -> Tensor:
     """Mean squared second difference of rotations and shifts over triples of neighbouring frames, B = 3 k."""
     quats, shifts = pose.quats.unflatten(0, (-1, 3)), pose.shifts.unflatten(0, (-1, 3))

@@ -7,7 +7,7 @@ from torch import Tensor
 from rewild4d.kernels.arrays import fits
 from rewild4d.ours.config import Geometry
 from rewild4d.ours.fused.skeleton import Weights, stand
-from rewild4d.ours.geometry_losses import attach_loss, limit_loss, still_loss, temporal_loss
+from rewild4d.ours.geometry_losses import attach_loss, limit_loss, sagittal_losses, still_loss, temporal_loss
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import Pose
 from rewild4d.ours.symmetry import Key
@@ -41,14 +41,15 @@ def stance(model: Model, poses: Pose, rows: list[int], config: Geometry) -> tupl
         model: gives the skeleton.
         poses: [B, J, ...]; where B = 3 k, triples of neighbouring frames as `neighbour_keys` makes them.
         rows: which are chosen, k of them.
-        config: the weights of joint limits, attachment and (over triples) temporal smoothness and stillness.
+        config: the weights of joint limits, attachment, planes and (over triples) temporal smoothness and stillness.
 
     Returns:
         Poses [k, J, ...], transforms [k, J, 4, 4] and the weighted sum, scalar.
     """
     triples = len(poses.quats) == 3 * len(rows)
+    skeleton = model.pivots, model.parents, model.mirror
     if fits(poses.quats):
-        *own, transforms, total = stand(*poses, rows, model.pivots, model.parents, _weights(config, triples))
+        *own, transforms, total = stand(*poses, rows, *skeleton, _weights(config, triples))
         return Pose(*own), transforms, total
     transforms = model.transforms(poses)
     total = skeleton_losses(model, poses, transforms, config, triples)
@@ -56,7 +57,7 @@ def stance(model: Model, poses: Pose, rows: list[int], config: Geometry) -> tupl
 
 
 def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geometry, triples: bool) -> Tensor:
-    """Weighted sum of joint limits, attachment and (over triples) temporal smoothness and stillness, scalar.
+    """Weighted sum of joint limits, attachment, planes and (over triples) smoothness and stillness, scalar.
 
     Args:
         model: gives the skeleton.
@@ -66,12 +67,15 @@ def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geomet
         triples: whether the poses are those of triples of neighbouring frames; of others no step is known.
     """
     if fits(pose.quats):
-        return stand(*pose, [], model.pivots, model.parents, _weights(config, triples))[-1]
+        return stand(*pose, [], model.pivots, model.parents, model.mirror, _weights(config, triples))[-1]
     total = pose.shifts.sum() * 0.0
     if config.limit:
         total = total + config.limit * limit_loss(pose, model.parents, config.limit_degrees)
     if config.attach:
         total = total + config.attach * attach_loss(transforms, model.pivots, model.parents)
+    planes = config.limb_plane, config.body_plane, config.sideways
+    for weight, loss in zip(planes, sagittal_losses(pose, model.parents, model.mirror), strict=True):
+        total = total + weight * loss
     if config.temporal and triples:
         total = total + config.temporal * temporal_loss(pose)
     if config.still and triples:
@@ -82,4 +86,5 @@ def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geomet
 def _weights(config: Geometry, triples: bool) -> Weights:
     cosine = math.cos(math.radians(config.limit_degrees) / 2)
     temporal, still = (config.temporal, config.still) if triples else (0.0, 0.0)
-    return Weights(config.limit, cosine, config.attach, temporal, still, config.still_step, OBJECT_DIAGONAL)
+    planes = config.limb_plane, config.body_plane, config.sideways
+    return Weights(config.limit, *planes, cosine, config.attach, temporal, still, config.still_step, OBJECT_DIAGONAL)

@@ -21,6 +21,9 @@ class Weights(NamedTuple):
 
     Attributes:
         limit: of the joint limits.
+        limb_plane: of limbs' turns out of the planes along the body.
+        body_plane: of the other bones'.
+        sideways: of limbs' shifts across the body.
         cosine: of half the angle at which they begin.
         attach: of the gaps between a joint and its parent.
         temporal: of second differences over triples; 0 where the poses are none.
@@ -30,6 +33,9 @@ class Weights(NamedTuple):
     """
 
     limit: float
+    limb_plane: float
+    body_plane: float
+    sideways: float
     cosine: float
     attach: float
     temporal: float
@@ -106,6 +112,41 @@ def _gaps(
 
 
 @kernel
+def _out_of_plane(
+    quats: np.ndarray, shifts: np.ndarray, parents: np.ndarray, mirror: np.ndarray, weights: Weights,
+    on_quats: np.ndarray, on_shifts: np.ndarray,
+) -> float:  # fmt: skip
+    """Mean squared y and z of the turns against the parent, and x of the limbs' shifts, weighted; and the gradient."""
+    limbs = (mirror != np.arange(len(mirror))).sum()
+    of_limb = weights.limb_plane / (len(quats) * max(1, limbs))
+    of_body = weights.body_plane / (len(quats) * max(1, len(mirror) - limbs))
+    of_shift = weights.sideways / (len(quats) * max(1, limbs) * weights.unit * weights.unit)
+    total = 0.0
+    for item in range(len(quats)):
+        for joint in range(len(parents)):
+            above, limb = parents[joint], mirror[joint] != joint
+            share = of_limb if limb else of_body
+            a, b, c, d = _quat(quats, item, joint)
+            w, x, y, z = _quat(quats, item, above) if above >= 0 else (1.0, 0.0, 0.0, 0.0)
+            # y and z of conj(above) times own
+            p, q = w * c - y * a - z * b + x * d, w * d - z * a - x * c + y * b
+            total += share * (p * p + q * q)
+            _add(_combined(2 * share * p, (-y, -z, w, x), 2 * share * q, (-z, y, -x, w)), on_quats[item, joint])
+            if above >= 0:
+                _add(_combined(2 * share * p, (c, d, -a, -b), 2 * share * q, (d, -c, b, -a)), on_quats[item, above])
+            if limb:
+                moved = np.float64(shifts[item, joint, 0])
+                total += of_shift * moved * moved
+                on_shifts[item, joint, 0] += 2 * of_shift * moved
+    return total
+
+
+@inlined
+def _combined(p: float, a: tuple, q: float, b: tuple) -> tuple:
+    return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2], p * a[3] + q * b[3]
+
+
+@kernel
 def _second_differences(
     quats: np.ndarray, shifts: np.ndarray, weight: float, unit: float, on_quats: np.ndarray, on_shifts: np.ndarray
 ) -> float:
@@ -169,8 +210,8 @@ def _steps(
 
 @kernel
 def _regularise(
-    quats: np.ndarray, shifts: np.ndarray, pivots: np.ndarray, parents: np.ndarray, weights: Weights,
-    on_quats: np.ndarray, on_shifts: np.ndarray,
+    quats: np.ndarray, shifts: np.ndarray, pivots: np.ndarray, parents: np.ndarray, mirror: np.ndarray,
+    weights: Weights, on_quats: np.ndarray, on_shifts: np.ndarray,
 ) -> float:  # fmt: skip
     """The weighted sum of all; adds its gradients."""
     total = 0.0
@@ -179,6 +220,8 @@ def _regularise(
     if weights.attach:
         weight = weights.attach / (weights.unit * weights.unit)
         total += _gaps(quats, shifts, pivots, parents, weight, on_quats, on_shifts)
+    if weights.limb_plane or weights.body_plane or weights.sideways:
+        total += _out_of_plane(quats, shifts, parents, mirror, weights, on_quats, on_shifts)
     if weights.temporal:
         total += _second_differences(quats, shifts, weights.temporal, weights.unit, on_quats, on_shifts)
     if weights.still:
@@ -228,7 +271,14 @@ def _stand_back(
 
 
 def stand(
-    quats: Tensor, shifts: Tensor, features: Tensor, rows: list[int], pivots: Tensor, parents: Tensor, weights: Weights
+    quats: Tensor,
+    shifts: Tensor,
+    features: Tensor,
+    rows: list[int],
+    pivots: Tensor,
+    parents: Tensor,
+    mirror: Tensor,
+    weights: Weights,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Rows of a batch of poses, their transforms, and the weighted regularisers of all; float32 on the CPU.
 
@@ -239,19 +289,20 @@ def stand(
         rows: which poses, k of them.
         pivots: [J, 3].
         parents: -1 for a root, [J].
+        mirror: bone on the other side, [J].
         weights: of the regularisers.
 
     Returns:
         Quats, shifts and features of the rows [k, J, ...], transforms [k, J, 4, 4], and the sum, scalar.
     """
-    return _Stand.apply(quats, shifts, features, rows, pivots, parents, weights)
+    return _Stand.apply(quats, shifts, features, rows, pivots, parents, mirror, weights)
 
 
 class _Stand(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, quats: Tensor, shifts: Tensor, features: Tensor, rows: list[int], pivots: Tensor, parents: Tensor,
-        weights: Weights,
+        mirror: Tensor, weights: Weights,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         joints, chosen = len(pivots), np.array(rows, np.int64)
         turns, moves, centers = array(quats), array(shifts), pivots.numpy()
@@ -259,7 +310,7 @@ class _Stand(torch.autograd.Function):
         made = tuple(np.empty((len(rows), joints, *size), np.float32) for size in sizes)
         _stand(turns, moves, array(features), chosen, centers, *made)
         slopes = np.zeros(turns.shape), np.zeros(moves.shape)
-        total = _regularise(turns, moves, centers, parents.numpy(), weights, *slopes)
+        total = _regularise(turns, moves, centers, parents.numpy(), mirror.numpy(), weights, *slopes)
         ctx.given, ctx.slopes, ctx.size = (turns, chosen, centers), slopes, features.shape
         return tuple(map(torch.from_numpy, (*made, np.array(total, np.float32))))
 
@@ -270,4 +321,4 @@ class _Stand(torch.autograd.Function):
         on_quats, on_shifts = (slope * scale for slope in ctx.slopes)
         _stand_back(*ctx.given, *map(array, slopes[:4]), on_quats, on_shifts, on_features)
         made = (on_quats.astype(np.float32), on_shifts.astype(np.float32), on_features)
-        return *map(torch.from_numpy, made), None, None, None, None
+        return *map(torch.from_numpy, made), *[None] * 5
