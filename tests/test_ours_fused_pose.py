@@ -221,7 +221,7 @@ def test_what_leaves_the_planes_along_the_body() -> None:
     foot, head = 8, 0
 
     def cost(joint: int, axis: int, **weights: float) -> float:
-        """Of a bone that turns by 20 degrees about an axis, and its joint shifts by .5 along it."""
+        """Of a bone that turns by 20 degrees about an axis, and whose joint is .5 along it from its parent's."""
         quats, shifts = rest.repeat(1, 20, 1), torch.zeros(1, 20, 3)
         quats[0, joint, 0], quats[0, joint, 1 + axis], shifts[0, joint, axis] = math.cos(half), math.sin(half), 0.5
         pose = Pose(-quats, shifts, torch.zeros(1, 20, 4))  # the same rotations

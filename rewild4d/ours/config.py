@@ -223,7 +223,7 @@ class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     body_plane: Weight = 0.0
     """Pose: the same of the other bones."""
     sideways: Weight = 0.0
-    """Pose: squared shift of a limb's joints across the body (diagonals)."""
+    """Pose: squared gap of a limb's joint and its parent across the body (diagonals), beside `attach`."""
     temporal: Weight = 10.0
     """Pose: squared second difference over neighbouring frames; not measured alone."""
     still: Weight = 0.0

@@ -130,41 +130,50 @@ def limit_loss(pose: Pose, parents: Tensor, degrees: float) -> Tensor:
 
 
 def attach_loss(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
-    """Mean squared gap between a joint and its parent's copy of it, over the squared diagonal.
+    """Mean squared gap between a joint and its parent's copy of it, over the squared diagonal."""
+    has_parent = parents >= 0
+    if not bool(has_parent.any()):
+        return transforms.sum() * 0.0
+    return joint_gaps(transforms, pivots, parents)[:, has_parent].square().sum(-1).mean() / OBJECT_DIAGONAL**2
+
+
+def joint_gaps(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
+    """From each joint's place as its parent carries it to its own, zero for a root, [B, J, 3].
 
     Args:
         transforms: rest -> posed, [B, J, 4, 4].
         pivots: [J, 3].
         parents: -1 for a root, [J].
     """
-    has_parent = parents >= 0
-    if not bool(has_parent.any()):
-        return transforms.sum() * 0.0
-    pivot = torch.nn.functional.pad(pivots[has_parent], (0, 1), value=1.0)[..., None]
-    own, above = transforms[:, has_parent] @ pivot, transforms[:, parents[has_parent]] @ pivot
-    return (own - above).square().sum((-1, -2)).mean() / OBJECT_DIAGONAL**2
+    carrier = torch.where(parents >= 0, parents, torch.arange(len(parents), device=parents.device))
+    pivot = torch.nn.functional.pad(pivots, (0, 1), value=1.0)[..., None]
+    return ((transforms - transforms[:, carrier]) @ pivot)[..., :3, 0]
 
 
-def sagittal_losses(pose: Pose, parents: Tensor, mirror: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """How far bones turn out of the planes along the body, and how far limbs move sideways: means over what they count.
+def sagittal_losses(
+    pose: Pose, transforms: Tensor, pivots: Tensor, parents: Tensor, mirror: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """How far bones turn out of the planes along the body, and how far limbs gape sideways: means over what they count.
 
     A turn against the parent within such a plane is about x. Limbs are the bones that have another on the other side.
 
     Args:
         pose: unit quaternions.
+        transforms: of the same poses, rest -> posed, [B, J, 4, 4].
+        pivots: [J, 3].
         parents: -1 for a root, [J].
         mirror: bone on the other side, [J].
 
     Returns:
         Squares of the y and z of the quaternion against the parent, of limbs and of other bones; and the squared x of
-        the limbs' shifts over the squared diagonal.
+        the limbs' gaps (`joint_gaps`) over the squared diagonal.
     """
     limbs = (mirror != torch.arange(len(mirror), device=mirror.device)).to(pose.quats)
     rest = pose.quats.new_tensor((1.0, 0, 0, 0))
     above = torch.where((parents >= 0)[:, None], pose.quats[:, parents.clamp_min(0)], rest)
     local = quat_multiply(above * above.new_tensor((1.0, -1.0, -1.0, -1.0)), pose.quats)
     out = local[..., 2:].square().sum(-1)
-    sideways = (pose.shifts[..., 0] / OBJECT_DIAGONAL).square()
+    sideways = (joint_gaps(transforms, pivots, parents)[..., 0] / OBJECT_DIAGONAL).square()
     of_limbs, others = limbs / limbs.sum().clamp_min(1), (1 - limbs) / (1 - limbs).sum().clamp_min(1)
     return tuple((each @ share).mean() for each, share in ((out, of_limbs), (out, others), (sideways, of_limbs)))
 

@@ -23,7 +23,7 @@ class Weights(NamedTuple):
         limit: of the joint limits.
         limb_plane: of limbs' turns out of the planes along the body.
         body_plane: of the other bones'.
-        sideways: of limbs' shifts across the body.
+        sideways: of the gaps of limbs across the body.
         cosine: of half the angle at which they begin.
         attach: of the gaps between a joint and its parent.
         temporal: of second differences over triples; 0 where the poses are none.
@@ -80,11 +80,14 @@ def _limits(quats: np.ndarray, parents: np.ndarray, weight: float, cosine: float
 
 @kernel
 def _gaps(
-    quats: np.ndarray, shifts: np.ndarray, pivots: np.ndarray, parents: np.ndarray, weight: float, on_quats: np.ndarray,
-    on_shifts: np.ndarray,
+    quats: np.ndarray, shifts: np.ndarray, pivots: np.ndarray, parents: np.ndarray, mirror: np.ndarray,
+    weights: Weights, on_quats: np.ndarray, on_shifts: np.ndarray,
 ) -> float:  # fmt: skip
-    """Mean squared gap between a joint, pivot plus shift, and its parent's copy of it; and its gradient."""
-    count = len(quats) * max(1, (parents >= 0).sum())
+    """Mean squared gap between a joint, pivot plus shift, and its parent's copy of it, and mean squared x of the limbs'
+    gaps, weighted; and the gradient."""
+    limbs, square = (mirror != np.arange(len(mirror))).sum(), weights.unit * weights.unit
+    share = weights.attach / (len(quats) * max(1, (parents >= 0).sum()) * square)
+    sideways = weights.sideways / (len(quats) * max(1, limbs) * square)
     total, on_matrix = 0.0, np.empty((3, 3))
     for item in range(len(quats)):
         for joint in range(len(parents)):
@@ -101,31 +104,29 @@ def _gaps(
                 row = rows[i]
                 moved = row[0] * arm[0] + row[1] * arm[1] + row[2] * arm[2]
                 gap = arm[i] + np.float64(shifts[item, joint, i]) - shifts[item, above, i] - moved
-                total += gap * gap
-                slope = 2 * weight / count * gap
+                weight = share + (sideways if i == 0 and mirror[joint] != joint else 0.0)
+                total += weight * gap * gap
+                slope = 2 * weight * gap
                 on_shifts[item, joint, i] += slope
                 on_shifts[item, above, i] -= slope
                 for j in range(3):
                     on_matrix[i, j] = -slope * arm[j]
             _add(unit_slope(turn, rotation_slope(turn, on_matrix)), on_quats[item, above])
-    return weight * total / count
+    return total
 
 
 @kernel
 def _out_of_plane(
-    quats: np.ndarray, shifts: np.ndarray, parents: np.ndarray, mirror: np.ndarray, weights: Weights,
-    on_quats: np.ndarray, on_shifts: np.ndarray,
-) -> float:  # fmt: skip
-    """Mean squared y and z of the turns against the parent, and x of the limbs' shifts, weighted; and the gradient."""
+    quats: np.ndarray, parents: np.ndarray, mirror: np.ndarray, weights: Weights, on_quats: np.ndarray
+) -> float:
+    """Mean squared y and z of the turns against the parent, of limbs and of other bones, weighted; and the gradient."""
     limbs = (mirror != np.arange(len(mirror))).sum()
     of_limb = weights.limb_plane / (len(quats) * max(1, limbs))
     of_body = weights.body_plane / (len(quats) * max(1, len(mirror) - limbs))
-    of_shift = weights.sideways / (len(quats) * max(1, limbs) * weights.unit * weights.unit)
     total = 0.0
     for item in range(len(quats)):
         for joint in range(len(parents)):
-            above, limb = parents[joint], mirror[joint] != joint
-            share = of_limb if limb else of_body
+            above, share = parents[joint], of_limb if mirror[joint] != joint else of_body
             a, b, c, d = _quat(quats, item, joint)
             w, x, y, z = _quat(quats, item, above) if above >= 0 else (1.0, 0.0, 0.0, 0.0)
             # y and z of conj(above) times own
@@ -134,10 +135,6 @@ def _out_of_plane(
             _add(_combined(2 * share * p, (-y, -z, w, x), 2 * share * q, (-z, y, -x, w)), on_quats[item, joint])
             if above >= 0:
                 _add(_combined(2 * share * p, (c, d, -a, -b), 2 * share * q, (d, -c, b, -a)), on_quats[item, above])
-            if limb:
-                moved = np.float64(shifts[item, joint, 0])
-                total += of_shift * moved * moved
-                on_shifts[item, joint, 0] += 2 * of_shift * moved
     return total
 
 
@@ -217,11 +214,10 @@ def _regularise(
     total = 0.0
     if weights.limit:
         total += _limits(quats, parents, weights.limit, weights.cosine, on_quats)
-    if weights.attach:
-        weight = weights.attach / (weights.unit * weights.unit)
-        total += _gaps(quats, shifts, pivots, parents, weight, on_quats, on_shifts)
-    if weights.limb_plane or weights.body_plane or weights.sideways:
-        total += _out_of_plane(quats, shifts, parents, mirror, weights, on_quats, on_shifts)
+    if weights.attach or weights.sideways:
+        total += _gaps(quats, shifts, pivots, parents, mirror, weights, on_quats, on_shifts)
+    if weights.limb_plane or weights.body_plane:
+        total += _out_of_plane(quats, parents, mirror, weights, on_quats)
     if weights.temporal:
         total += _second_differences(quats, shifts, weights.temporal, weights.unit, on_quats, on_shifts)
     if weights.still:
