@@ -175,7 +175,7 @@ def sagittal_losses(
     out = local[..., 2:].square().sum(-1)
     sideways = (joint_gaps(transforms, pivots, parents)[..., 0] / OBJECT_DIAGONAL).square()
     of_limbs, others = limbs / limbs.sum().clamp_min(1), (1 - limbs) / (1 - limbs).sum().clamp_min(1)
-    return tuple((each @ share).mean() for each, share in ((out, of_limbs), (out, others), (sideways, of_limbs)))
+    return (out @ of_limbs).mean(), (out @ others).mean(), (sideways @ of_limbs).mean()
 
 
 def temporal_loss(pose: Pose) -> Tensor:
