@@ -1,11 +1,26 @@
 """Rows of memory as columns of lanes and back: each number of many Gaussians side by side."""
 
+from typing import Any
+
 import numpy as np
 
-from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.matrix import transpose_tile
 from rewild4d.kernels.simd import LANES, load
 from rewild4d.kernels.tails import store_first
+
+BLOCK = 64
+"""Gaussians side by side in the kernels that compute so."""
+
+
+@inlined
+def four_rows(columns: np.ndarray, first: int, lane: int) -> tuple[Any, Any, Any, Any]:
+    """Four numbers, from the first on, of sixteen Gaussians of a block."""
+    place = first * BLOCK + lane
+    return (
+        load(columns, place), load(columns, place + BLOCK), load(columns, place + 2 * BLOCK),
+        load(columns, place + 3 * BLOCK),
+    )  # fmt: skip
 
 
 @kernel

@@ -12,14 +12,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
-from rewild4d.kernels.columns import read_columns, write_columns
+from rewild4d.kernels.columns import BLOCK, four_rows, read_columns, write_columns
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.matrix import add_product, transpose
 from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
 from rewild4d.kernels.threads import run, thread_count
 
-BLOCK = 64
-"""Gaussians side by side."""
 CHUNK = 16 * BLOCK
 """Gaussians a unit of work holds; sums are added over these, whatever the number of threads."""
 
@@ -97,9 +95,7 @@ def _pull(
             for lane in range(0, BLOCK, LANES):
                 x, y, z = load(places, lane), load(places, BLOCK + lane), load(places, 2 * BLOCK + lane)
                 for i in range(3):
-                    first = 4 * i * BLOCK + lane
-                    a, b = load(own, first), load(own, first + BLOCK)
-                    c, d = load(own, first + 2 * BLOCK), load(own, first + 3 * BLOCK)
+                    a, b, c, d = four_rows(own, 4 * i, lane)
                     store(made, i * BLOCK + lane, fma(a, x, fma(b, y, fma(c, z, d))))
             write_columns(made, BLOCK, slopes[cloud], begin, end)
 

@@ -11,15 +11,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
-from rewild4d.kernels.columns import read_columns, write_columns
+from rewild4d.kernels.columns import BLOCK, four_rows, read_columns, write_columns
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.harmonics import set_band
 from rewild4d.kernels.simd import LANES, divide, fma, load, maximum, select_gt, splat, square_root, store, take_ticket
 from rewild4d.kernels.threads import run, thread_count
 from rewild4d.ours.fused.quaternions import dot, times_back
 
-BLOCK = 64
-"""Gaussians side by side."""
 CHUNK = 8 * BLOCK
 """Gaussians a unit of work holds."""
 
@@ -30,11 +28,6 @@ def _cross(a: tuple, b: tuple) -> tuple:
 
 
 @inlined
-def _column(rows: np.ndarray, lane: int) -> tuple:
-    return load(rows, lane), load(rows, BLOCK + lane), load(rows, 2 * BLOCK + lane), load(rows, 3 * BLOCK + lane)
-
-
-@inlined
 def _direction(means: np.ndarray, quats: np.ndarray, rest: np.ndarray, lane: int, eye: np.ndarray) -> tuple:
     """Unit directions from the eye to sixteen Gaussians, as these saw it at rest."""
     one, two, least = splat(np.float32(1)), splat(np.float32(2)), splat(np.float32(1e-24))
@@ -42,7 +35,7 @@ def _direction(means: np.ndarray, quats: np.ndarray, rest: np.ndarray, lane: int
     z = load(means, 2 * BLOCK + lane) - splat(eye[2])
     # In this order of the limits a NaN stays one.
     inverse = divide(one, square_root(maximum(least, x * x + y * y + z * z)))
-    p, s = _column(quats, lane), _column(rest, lane)
+    p, s = four_rows(quats, 0, lane), four_rows(rest, 0, lane)
     # The quaternion rest conj(posed) turns back; it may have any length.
     turn = times_back(s, p)
     w, axis = turn[0], (turn[1], turn[2], turn[3])

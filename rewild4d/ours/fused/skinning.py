@@ -12,15 +12,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
-from rewild4d.kernels.columns import read_columns, write_columns
+from rewild4d.kernels.columns import BLOCK, four_rows, read_columns, write_columns
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.matrix import add_product, transpose
 from rewild4d.kernels.simd import LANES, fma, load, store, take_ticket
 from rewild4d.kernels.threads import run, thread_count
 from rewild4d.ours.fused.quaternions import back_times, times, times_back, unit_lanes, unit_slope
 
-BLOCK = 64
-"""Gaussians side by side."""
 CHUNK = 16 * BLOCK
 """Gaussians a unit of work holds; gradients of the joints are summed over these, whatever the number of threads."""
 QUAT = 12
@@ -80,13 +78,6 @@ def _blend_block(
 
 
 @inlined
-def _column(rows: np.ndarray, first: int, lane: int) -> tuple:
-    """Four rows at sixteen lanes."""
-    place = first * BLOCK + lane
-    return load(rows, place), load(rows, place + BLOCK), load(rows, place + 2 * BLOCK), load(rows, place + 3 * BLOCK)
-
-
-@inlined
 def _store_column(rows: np.ndarray, first: int, lane: int, column: tuple) -> None:
     for i in range(4):
         store(rows, (first + i) * BLOCK + lane, column[i])
@@ -113,9 +104,9 @@ def _forward(
         for lane in range(0, BLOCK, LANES):
             x, y, z = load(place, lane), load(place, BLOCK + lane), load(place, 2 * BLOCK + lane)
             for i in range(3):
-                a, b, c, d = _column(blended, 4 * i, lane)
+                a, b, c, d = four_rows(blended, 4 * i, lane)
                 store(place, i * BLOCK + lane, fma(a, x, fma(b, y, fma(c, z, d))))
-            turned = times(unit_lanes(_column(blended, QUAT, lane)), unit_lanes(_column(turn, 0, lane)))
+            turned = times(unit_lanes(four_rows(blended, QUAT, lane)), unit_lanes(four_rows(turn, 0, lane)))
             _store_column(turn, 0, lane, turned)
         write_columns(place, BLOCK, new_means, begin, end)
         write_columns(turn, BLOCK, new_quats, begin, end)
@@ -128,8 +119,8 @@ def _slopes(
 ) -> None:  # fmt: skip
     """Gradients of the blended numbers, from the live branch alone and from both, [16, BLOCK]; and those of the rest
     positions and orientations in place of them."""
-    unit, rest = unit_lanes(_column(blended, QUAT, lane)), unit_lanes(_column(turn, 0, lane))
-    g, h = _column(g_live_quats, 0, lane), _column(g_still_quats, 0, lane)
+    unit, rest = unit_lanes(four_rows(blended, QUAT, lane)), unit_lanes(four_rows(turn, 0, lane))
+    g, h = four_rows(g_live_quats, 0, lane), four_rows(g_still_quats, 0, lane)
     both = g[0] + h[0], g[1] + h[1], g[2] + h[2], g[3] + h[3]
     _store_column(live, QUAT, lane, unit_slope(unit, times_back(g, rest)))
     _store_column(slope, QUAT, lane, unit_slope(unit, times_back(both, rest)))
@@ -139,7 +130,7 @@ def _slopes(
     for i in range(3):
         one = load(g_live, i * BLOCK + lane)
         other = one + load(g_still, i * BLOCK + lane)
-        a, b, c, _ = _column(blended, 4 * i, lane)
+        a, b, c, _ = four_rows(blended, 4 * i, lane)
         on_x, on_y, on_z = fma(other, a, on_x), fma(other, b, on_y), fma(other, c, on_z)
         _store_column(live, 4 * i, lane, (one * x, one * y, one * z, one))
         _store_column(slope, 4 * i, lane, (other * x, other * y, other * z, other))
