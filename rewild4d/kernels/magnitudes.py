@@ -1,0 +1,48 @@
+"""Whether all numbers of several tensors are finite and not too large, in one call."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from torch import Tensor
+
+from rewild4d.kernels.arrays import fits
+from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.pointers import floats_at
+from rewild4d.kernels.simd import LANES, absolute, bits_gt, load, splat
+
+_SIDE_BY_SIDE = 4
+_STEP = _SIDE_BY_SIDE * LANES
+_ALL = (1 << LANES) - 1
+
+
+@kernel
+def _all_below(addresses: np.ndarray, counts: np.ndarray, bound: float) -> bool:
+    """Whether every float32 number at these addresses is below the bound in magnitude; NaN is not."""
+    limit, inside = splat(np.float32(bound)), _ALL
+    for run in range(len(addresses)):
+        values = floats_at(addresses[run], counts[run])
+        whole = counts[run] // _STEP * _STEP
+        for i in range(0, whole, _STEP):
+            inside &= (
+                bits_gt(limit, absolute(load(values, i)))
+                & bits_gt(limit, absolute(load(values, i + LANES)))
+                & bits_gt(limit, absolute(load(values, i + 2 * LANES)))
+                & bits_gt(limit, absolute(load(values, i + 3 * LANES)))
+            )
+        for i in range(whole, counts[run]):
+            if not abs(values[i]) < bound:
+                inside = 0
+    return inside == _ALL
+
+
+def all_below(tensors: Iterable[Tensor], bound: float) -> bool:
+    """Whether every number is below the bound in magnitude, NaN is not; wakes no thread of torch's.
+
+    Args:
+        tensors: float32 on the CPU, of any shape.
+        bound: positive.
+    """
+    packed = [tensor if tensor.is_contiguous() else tensor.contiguous() for tensor in tensors]
+    assert all(map(fits, packed))
+    places = np.array([(tensor.data_ptr(), tensor.numel()) for tensor in packed], np.int64).reshape(-1, 2)
+    return _all_below(places[:, 0], places[:, 1], bound)
