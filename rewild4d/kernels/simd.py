@@ -137,43 +137,6 @@ def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
     return signature(types.void, array, types.intp, lanes_type), generate
 
 
-def _row_pointer(context: Any, builder: Any, sig: Any, args: Any, row: int) -> Any:
-    start = builder.add(args[1], builder.mul(args[2], ir.Constant(args[2].type, row)))
-    array = context.make_array(sig.args[0])(context, builder, args[0])
-    return builder.bitcast(builder.gep(array.data, [start]), ir.VectorType(_FLOAT, 4).as_pointer())
-
-
-@intrinsic
-def load_block(typing: Any, array: Any, index: Any, stride: Any) -> Any:
-    """Four rows of four numbers, ``stride`` apart: the 4 x 4 block of an image whose corner is at ``index``."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        rows = [builder.load(_row_pointer(context, builder, sig, args, row), align=4) for row in range(4)]
-        halves = [_join(builder, rows[0], rows[1]), _join(builder, rows[2], rows[3])]
-        return _join(builder, *halves)
-
-    return signature(lanes_type, array, types.intp, types.intp), generate
-
-
-def _join(builder: Any, first: Any, second: Any) -> Any:
-    order = ir.Constant(ir.VectorType(_INT, 2 * first.type.count), list(range(2 * first.type.count)))
-    return builder.shuffle_vector(first, second, order)
-
-
-@intrinsic
-def store_block(typing: Any, array: Any, index: Any, stride: Any, value: Any) -> Any:
-    """Write a 4 x 4 block of an image, see `load_block`."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        for row in range(4):
-            lanes = ir.Constant(ir.VectorType(_INT, 4), list(range(4 * row, 4 * row + 4)))
-            part = builder.shuffle_vector(args[3], args[3], lanes)
-            builder.store(part, _row_pointer(context, builder, sig, args, row), align=4)
-        return context.get_dummy_value()
-
-    return signature(types.void, array, types.intp, types.intp, lanes_type), generate
-
-
 def llvm_call(builder: Any, name: str, args: Any, result: Any = VECTOR) -> Any:
     """A call of one of LLVM's own functions, while code is generated."""
     function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(result, [arg.type for arg in args]), name)

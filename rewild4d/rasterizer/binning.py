@@ -176,6 +176,7 @@ def scatter_pairs(
     cursor: np.ndarray,
     entry_gaussian: np.ndarray,
     entry_slot: np.ndarray,
+    entry_bits: np.ndarray,
 ) -> None:
     """Write the pairs of sorted Gaussians begin..end into their tiles' lists, in depth order."""
     for k in range(begin, end):
@@ -186,3 +187,4 @@ def scatter_pairs(
                 cursor[pair_tile[slot]] = place + 1
                 entry_gaussian[place] = n
                 entry_slot[place] = slot
+                entry_bits[place] = pair_bits[slot]

@@ -28,10 +28,10 @@ from rewild4d.kernels.simd import (
     select_gt,
     splat,
     store,
-    store_block,
     take_ticket,
 )
 from rewild4d.rasterizer.binning import BLOCK, BLOCKS, TILE
+from rewild4d.rasterizer.blocks import store_blocks
 from rewild4d.rasterizer.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
 from rewild4d.rasterizer.projection import (
     ALONG_X,
@@ -51,9 +51,15 @@ CONSTANTS = np.array([LOG2_MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, *POWER_TERMS
 WEAKEST, STRONGEST_ALPHA, LEAST_LEFT, TERMS = range(4)
 
 
+AHEAD, PLACED = 16, 4 * LANES
+"""Gaussians whose places in a tile are computed together, so that nothing waits for one of them; numbers of a place."""
+
+
 @inlined
-def place_in_tile(records: np.ndarray, record: int, tile_left: int, tile_top: int, steps: np.ndarray) -> tuple:
-    """The coordinates t and u of the pixels in a tile's first block; fill ``steps`` [32] with what each block adds."""
+def place_in_tile(
+    records: np.ndarray, record: int, tile_left: int, tile_top: int, placed: np.ndarray, place: int
+) -> None:
+    """Fill four vectors: t and u of the pixels in a tile's first block, and what each block adds to them."""
     left, top = splat(np.float32(tile_left + 0.5)), splat(np.float32(tile_top + 0.5))
     along_x, along_y = broadcast(records, record + ALONG_X), broadcast(records, record + ALONG_Y)
     down = broadcast(records, record + DOWN)
@@ -61,9 +67,10 @@ def place_in_tile(records: np.ndarray, record: int, tile_left: int, tile_top: in
     dy = rows_of_block() + (top - broadcast(records, record + CENTER_Y) - broadcast(records, record + REST_Y))
     block = splat(np.float32(BLOCK))
     step_x, step_y = block * columns_of_block(), block * rows_of_block()  # lane i here stands for block i
-    store(steps, 0, fma(along_x, step_x, along_y * step_y))
-    store(steps, LANES, down * step_y)
-    return fma(along_x, dx, along_y * dy), down * dy
+    store(placed, place, fma(along_x, dx, along_y * dy))
+    store(placed, place + LANES, down * dy)
+    store(placed, place + 2 * LANES, fma(along_x, step_x, along_y * step_y))
+    store(placed, place + 3 * LANES, down * step_y)
 
 
 @inlined
@@ -100,6 +107,7 @@ def blend(
     starts: np.ndarray,
     entry_gaussian: np.ndarray,
     entry_slot: np.ndarray,
+    entry_bits: np.ndarray,
     pair_bits: np.ndarray,
     records: np.ndarray,
     features: np.ndarray,
@@ -110,12 +118,16 @@ def blend(
 ) -> None:
     """Blend tiles until no ticket is left: fill image [V, C, h, w], alpha [V, 1, h, w] and ``through``, 1 - alpha.
 
-    ``records`` and ``features`` are flat. ``pair_bits`` shrinks to the blocks where a pair really contributed.
+    ``records`` and ``features`` are flat. ``entry_bits`` shrinks to the blocks where an entry really contributed;
+    ``pair_bits`` becomes 0 where it did nowhere, and only there: slots of a Gaussian share a cache line, its tiles have
+    different threads.
     ``through`` is flat and keeps the digits that alpha has lost near 1; empty where nobody needs them.
+    Blocks without an open pixel are passed over from the next `AHEAD` Gaussians on: who looked for them after each one
+    would wait for its whole arithmetic.
     """
     views, channels, height, width = image.shape
     count = len(records) // (RECORD * views)
-    left, steps = np.empty(BLOCKS * LANES, np.float32), np.empty(2 * LANES, np.float32)
+    left, placed = np.empty(BLOCKS * LANES, np.float32), np.empty(AHEAD * PLACED, np.float32)
     colors = np.empty(BLOCKS * channels * LANES, np.float32)
     while True:
         tile = take_ticket(tickets)
@@ -124,19 +136,26 @@ def blend(
         view, tile_top, tile_left = tile_place(tile, tiles_x, tiles_y)
         live = open_tile(tile_left, tile_top, width, height, left)
         colors[:] = 0
-        for entry in range(starts[tile], starts[tile + 1]):
-            slot = entry_slot[entry]
-            bits = np.int64(pair_bits[slot]) & live
-            if bits != 0:
-                n = entry_gaussian[entry]
-                touched, closed = _blend_entry(
-                    bits, constants, records, (view * count + n) * RECORD, features, n * channels, channels, tile_left,
-                    tile_top, steps, left, colors,
-                )  # fmt: skip
-                pair_bits[slot] = touched
-                live &= ~closed
-            else:
-                pair_bits[slot] = 0
+        for first in range(starts[tile], starts[tile + 1], AHEAD):
+            last = min(first + AHEAD, starts[tile + 1])
+            seen = live
+            if seen != 0:
+                for entry in range(first, last):
+                    record = (view * count + entry_gaussian[entry]) * RECORD
+                    place_in_tile(records, record, tile_left, tile_top, placed, (entry - first) * PLACED)
+            for entry in range(first, last):
+                bits, touched = np.int64(entry_bits[entry]) & seen, 0
+                if bits != 0:
+                    n = entry_gaussian[entry]
+                    log_opacity = broadcast(records, (view * count + n) * RECORD + LOG_OPACITY)
+                    touched, closed = _blend_entry(
+                        bits, constants, log_opacity, features, n * channels, channels, placed,
+                        (entry - first) * PLACED, left, colors,
+                    )  # fmt: skip
+                    live &= ~closed
+                entry_bits[entry] = touched
+                if touched == 0:
+                    pair_bits[entry_slot[entry]] = 0
         _write_tile(view, tile_left, tile_top, left, colors, background, image, alpha, through)
 
 
@@ -155,27 +174,25 @@ def _add_channel(weight: Any, features: np.ndarray, feature: int, colors: np.nda
 def _blend_entry(
     bits: int,
     constants: np.ndarray,
-    records: np.ndarray,
-    record: int,
+    log_opacity: Any,
     features: np.ndarray,
     feature: int,
     channels: int,
-    tile_left: int,
-    tile_top: int,
-    steps: np.ndarray,
+    placed: np.ndarray,
+    place: int,
     left: np.ndarray,
     colors: np.ndarray,
 ) -> tuple:
     """Blend one Gaussian into the blocks of ``bits``; give the blocks that it touched and those that are now closed."""
     zero, least, weakest = splat(np.float32(0)), broadcast(constants, LEAST_LEFT), broadcast(constants, WEAKEST)
     strongest, terms = broadcast(constants, STRONGEST_ALPHA), load_terms(constants, TERMS)
-    log_opacity = broadcast(records, record + LOG_OPACITY)
-    first_t, first_u = place_in_tile(records, record, tile_left, tile_top, steps)
+    first_t, first_u = load(placed, place), load(placed, place + LANES)
+    step_t, step_u = place + 2 * LANES, place + 3 * LANES
     touched, closed = 0, 0
     while bits != 0:
         block = lowest_bit(bits)
         bits &= bits - 1
-        t, u = first_t + broadcast(steps, block), first_u + broadcast(steps, LANES + block)
+        t, u = first_t + broadcast(placed, step_t + block), first_u + broadcast(placed, step_u + block)
         alpha, exponent = alpha_at(log_opacity, t, u, strongest, terms)
         before = load(left, block * LANES)
         weight = keep_where_ge(alpha, exponent, weakest) * before
@@ -185,14 +202,14 @@ def _blend_entry(
         open_lanes = bits_gt(after, least)
         touched |= (open_lanes & bits_gt(exponent, weakest) != 0) << block
         closed |= (open_lanes == 0) << block
-        place = block * channels * LANES
+        color = block * channels * LANES
         if channels == 3:  # the usual case without a loop
-            _add_channel(weight, features, feature, colors, place)
-            _add_channel(weight, features, feature + 1, colors, place + LANES)
-            _add_channel(weight, features, feature + 2, colors, place + 2 * LANES)
+            _add_channel(weight, features, feature, colors, color)
+            _add_channel(weight, features, feature + 1, colors, color + LANES)
+            _add_channel(weight, features, feature + 2, colors, color + 2 * LANES)
         else:
             for channel in range(channels):
-                _add_channel(weight, features, feature + channel, colors, place + channel * LANES)
+                _add_channel(weight, features, feature + channel, colors, color + channel * LANES)
     return touched, closed
 
 
@@ -209,28 +226,25 @@ def _write_tile(
     through: np.ndarray,
 ) -> None:
     _, channels, height, width = image.shape
-    pixels, mattes = image.reshape(-1), alpha.reshape(-1)
-    for block in range(BLOCKS):
-        x, y = tile_left + BLOCK * (block % 4), tile_top + BLOCK * (block // 4)
-        passed = absolute(load(left, block * LANES))
-        _write_block(mattes, view * height, x, y, width, height, splat(np.float32(1)) - passed)
+    pixels, mattes, one = image.reshape(-1), alpha.reshape(-1), splat(np.float32(1))
+    for block in range(0, BLOCKS, 4):
+        x, y = tile_left, tile_top + block
+        a, b, c, d = _four(left, block * LANES, LANES)
+        a, b, c, d = absolute(a), absolute(b), absolute(c), absolute(d)
+        store_blocks(mattes, view * height, x, y, width, height, (one - a, one - b, one - c, one - d))
         if len(through) > 0:
-            _write_block(through, view * height, x, y, width, height, passed)
+            store_blocks(through, view * height, x, y, width, height, (a, b, c, d))
         for channel in range(channels):
-            color = load(colors, (block * channels + channel) * LANES)
-            color = fma(passed, splat(background[view, channel]), color)
-            _write_block(pixels, (view * channels + channel) * height, x, y, width, height, color)
+            e, f, g, h = _four(colors, (block * channels + channel) * LANES, channels * LANES)
+            behind = splat(background[view, channel])
+            composed = fma(a, behind, e), fma(b, behind, f), fma(c, behind, g), fma(d, behind, h)
+            store_blocks(pixels, (view * channels + channel) * height, x, y, width, height, composed)
 
 
 @inlined
-def _write_block(plane: np.ndarray, first_row: int, x: int, y: int, width: int, height: int, value: Any) -> None:
-    """Store the part of a block that lies in the image."""
-    corner = (first_row + y) * width + x
-    if x + BLOCK <= width and y + BLOCK <= height:
-        store_block(plane, corner, width, value)
-    elif x < width and y < height:
-        lanes = np.empty(LANES, np.float32)
-        store(lanes, 0, value)
-        for row in range(min(BLOCK, height - y)):
-            for column in range(min(BLOCK, width - x)):
-                plane[corner + row * width + column] = lanes[row * BLOCK + column]
+def _four(numbers: np.ndarray, first: int, step: int) -> tuple:
+    """Four vectors, ``step`` apart."""
+    return (
+        load(numbers, first), load(numbers, first + step), load(numbers, first + 2 * step),
+        load(numbers, first + 3 * step),
+    )  # fmt: skip

@@ -24,7 +24,6 @@ from rewild4d.kernels.simd import (
     fold8,
     keep_where_ge,
     load,
-    load_block,
     lowest_bit,
     minimum,
     select_gt,
@@ -32,12 +31,9 @@ from rewild4d.kernels.simd import (
     store,
     take_ticket,
 )
-from rewild4d.rasterizer.binning import BLOCK, BLOCKS
-from rewild4d.rasterizer.blending import (
-    open_tile,
-    place_in_tile,
-    tile_place,
-)
+from rewild4d.rasterizer.binning import BLOCKS
+from rewild4d.rasterizer.blending import AHEAD, PLACED, open_tile, place_in_tile, tile_place
+from rewild4d.rasterizer.blocks import load_blocks
 from rewild4d.rasterizer.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
 from rewild4d.rasterizer.crowds import crowd_backward
 from rewild4d.rasterizer.projection import ALONG_X, ALONG_Y, DOWN, LOG2_MIN_ALPHA, LOG_OPACITY, RECORD
@@ -68,19 +64,6 @@ def _first_channel(channels: int) -> int:
 _slot_width = kernel(slot_width)
 
 
-@inlined
-def _read_block(plane: np.ndarray, first_row: int, x: int, y: int, width: int, height: int) -> Any:
-    """Load a block, zero where it leaves the image."""
-    corner = (first_row + y) * width + x
-    if x + BLOCK <= width and y + BLOCK <= height:
-        return load_block(plane, corner, width)
-    lanes = np.zeros(LANES, np.float32)
-    for row in range(min(BLOCK, height - y)):
-        for column in range(min(BLOCK, width - x)):
-            lanes[row * BLOCK + column] = plane[corner + row * width + column]
-    return load(lanes, 0)
-
-
 @kernel
 def blend_backward(
     tickets: np.ndarray,
@@ -89,7 +72,7 @@ def blend_backward(
     starts: np.ndarray,
     entry_gaussian: np.ndarray,
     entry_slot: np.ndarray,
-    pair_bits: np.ndarray,
+    entry_bits: np.ndarray,
     records: np.ndarray,
     features: np.ndarray,
     background: np.ndarray,
@@ -109,7 +92,7 @@ def blend_backward(
     views, channels, height, width = image.shape
     count = len(records) // (RECORD * views)
     left, behind = np.empty(BLOCKS * LANES, np.float32), np.empty(BLOCKS * LANES, np.float32)
-    steps = np.empty(2 * LANES, np.float32)
+    placed = np.empty(AHEAD * PLACED, np.float32)
     gradients = np.zeros(BLOCKS * max(channels, FEW) * LANES, np.float32)
     row_length = _slot_width(channels)
     rows = np.empty(row_length * LANES, np.float32)
@@ -123,22 +106,28 @@ def blend_backward(
         first, last = starts[tile], starts[tile + 1]
         if geometry and last - first > crowd:
             crowd_backward(
-                view, tile_left, tile_top, entry_slot[first:last], entry_gaussian[first:last], pair_bits, records,
+                view, tile_left, tile_top, entry_slot[first:last], entry_gaussian[first:last], entry_bits[first:last],
+                records,
                 features, background, g_image, g_alpha, _first_channel(channels), row_length, sums,
             )  # fmt: skip
             continue
         open_tile(tile_left, tile_top, width, height, left)
         _read_tile(view, tile_left, tile_top, image, alpha, g_image, g_alpha, behind, gradients)
-        for entry in range(first, last):
-            slot = entry_slot[entry]
-            bits = np.int64(pair_bits[slot])
-            if bits != 0:
-                n = entry_gaussian[entry]
-                _entry_backward(
-                    bits, records, (view * count + n) * RECORD, features, n * channels, channels, tile_left,
-                    tile_top,
-                    geometry, steps, left, behind, gradients, rows, sums, slot * row_length,
-                )  # fmt: skip
+        for begin in range(first, last, AHEAD):
+            end = min(begin + AHEAD, last)
+            for entry in range(begin, end):
+                record = (view * count + entry_gaussian[entry]) * RECORD
+                place_in_tile(records, record, tile_left, tile_top, placed, (entry - begin) * PLACED)
+            for entry in range(begin, end):
+                bits = np.int64(entry_bits[entry])
+                if bits != 0:
+                    n = entry_gaussian[entry]
+                    log_opacity = broadcast(records, (view * count + n) * RECORD + LOG_OPACITY)
+                    _entry_backward(
+                        bits, log_opacity, features, n * channels, channels, geometry, placed,
+                        (entry - begin) * PLACED, left, behind, gradients, rows, sums,
+                        entry_slot[entry] * row_length,
+                    )  # fmt: skip
 
 
 @inlined
@@ -156,44 +145,51 @@ def _read_tile(
     """Load dL/dimage per block, and the loss's linear share of everything blended: sum of g.out minus T dL/dalpha."""
     _, channels, height, width = image.shape
     pixels, mattes, g_pixels, g_mattes = image.reshape(-1), alpha.reshape(-1), g_image.reshape(-1), g_alpha.reshape(-1)
-    one = splat(np.float32(1))
-    for block in range(BLOCKS):
-        x, y = tile_left + BLOCK * (block % 4), tile_top + BLOCK * (block // 4)
-        through = one - _read_block(mattes, view * height, x, y, width, height)
-        total = splat(np.float32(0)) - through * _read_block(g_mattes, view * height, x, y, width, height)
+    one, zero, step = splat(np.float32(1)), splat(np.float32(0)), max(channels, FEW) * LANES
+    for block in range(0, BLOCKS, 4):
+        x, y = tile_left, tile_top + block
+        a, b, c, d = load_blocks(mattes, view * height, x, y, width, height)
+        p, q, r, s = load_blocks(g_mattes, view * height, x, y, width, height)
+        p, q, r, s = zero - (one - a) * p, zero - (one - b) * q, zero - (one - c) * r, zero - (one - d) * s
         for channel in range(channels):
             first_row = (view * channels + channel) * height
-            slope = _read_block(g_pixels, first_row, x, y, width, height)
-            store(gradients, (block * max(channels, FEW) + channel) * LANES, slope)
-            total = fma(slope, _read_block(pixels, first_row, x, y, width, height), total)
-        store(behind, block * LANES, total)
+            a, b, c, d = load_blocks(g_pixels, first_row, x, y, width, height)
+            place = block * step + channel * LANES
+            store(gradients, place, a)
+            store(gradients, place + step, b)
+            store(gradients, place + 2 * step, c)
+            store(gradients, place + 3 * step, d)
+            e, f, g, h = load_blocks(pixels, first_row, x, y, width, height)
+            p, q, r, s = fma(a, e, p), fma(b, f, q), fma(c, g, r), fma(d, h, s)
+        store(behind, block * LANES, p)
+        store(behind, (block + 1) * LANES, q)
+        store(behind, (block + 2) * LANES, r)
+        store(behind, (block + 3) * LANES, s)
 
 
 @inlined
 def _entry_backward(
     bits: int,
-    records: np.ndarray,
-    record: int,
+    log_opacity: Any,
     features: np.ndarray,
     feature: int,
     channels: int,
-    tile_left: int,
-    tile_top: int,
     geometry: bool,
-    steps: np.ndarray,
+    placed: np.ndarray,
+    place: int,
     left: np.ndarray,
     behind: np.ndarray,
     gradients: np.ndarray,
     rows: np.ndarray,
     sums: np.ndarray,
-    place: int,
+    row: int,
 ) -> None:
-    """Sum one Gaussian's six moments and channel gradients over the blocks of ``bits`` into sums[place:]."""
+    """Sum one Gaussian's six moments and channel gradients over the blocks of ``bits`` into sums[row:]."""
     # Its constants are literals: the sums leave no registers for them.
     zero, one, least = splat(np.float32(0)), splat(np.float32(1)), splat(_LEAST_LEFT)
     strongest, weakest = splat(_STRONGEST_ALPHA), splat(_WEAKEST)
-    log_opacity = broadcast(records, record + LOG_OPACITY)
-    first_t, first_u = place_in_tile(records, record, tile_left, tile_top, steps)
+    first_t, first_u = load(placed, place), load(placed, place + LANES)
+    step_t, step_u = place + 2 * LANES, place + 3 * LANES
     red, green, blue, on_red, on_green, on_blue = zero, zero, zero, zero, zero, zero
     if channels <= FEW:
         red = broadcast(features, feature)
@@ -206,7 +202,7 @@ def _entry_backward(
     while bits != 0:
         block = lowest_bit(bits)
         bits &= bits - 1
-        t, u = first_t + broadcast(steps, block), first_u + broadcast(steps, LANES + block)
+        t, u = first_t + broadcast(placed, step_t + block), first_u + broadcast(placed, step_u + block)
         exponent = fnma(t, t, fnma(u, u, log_opacity))
         alpha = minimum(exp2(exponent), strongest)
         before = load(left, block * LANES)
@@ -242,8 +238,8 @@ def _entry_backward(
         mt, mu = mt + pull_t, mu + pull_u
         mtt, mtu, muu = fma(pull_t, t, mtt), fma(pull_t, u, mtu), fma(pull_u, u, muu)
     near = fold4(fold2(fold1(m, mt), fold1(mu, mtt)), fold2(fold1(mtu, muu), fold1(on_red, on_green)))
-    store(sums, place, fold8(near, fold4(fold2(fold1(on_blue, zero), zero), zero)))
-    sum_rows(rows, 0 if channels <= FEW else channels, sums, place + LANES)
+    store(sums, row, fold8(near, fold4(fold2(fold1(on_blue, zero), zero), zero)))
+    sum_rows(rows, 0 if channels <= FEW else channels, sums, row + LANES)
 
 
 @kernel

@@ -163,6 +163,7 @@ class _Lists:
     starts: np.ndarray
     entry_gaussian: np.ndarray
     entry_slot: np.ndarray
+    entry_bits: np.ndarray
 
 
 class _Blend(torch.autograd.Function):
@@ -191,7 +192,7 @@ class _Blend(torch.autograd.Function):
         pairs = int(numbers[-1, -1])
         lists = _Lists(
             (tiles_x, tiles_y), numbers, np.empty(pairs, np.uint16), np.empty(views * tiles_x * tiles_y + 1, np.int64),
-            np.empty(pairs, np.int32), np.empty(pairs, np.int32),
+            np.empty(pairs, np.int32), np.empty(pairs, np.int32), np.empty(pairs, np.uint16),
         )  # fmt: skip
         image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
         through = np.empty(alpha.numel() if ctx.needs_input_grad[3] else 0, np.float32)
@@ -199,8 +200,8 @@ class _Blend(torch.autograd.Function):
             phase_counters(3), np.zeros(1, np.int64), _table(pieces, 3), order.numpy(),
             tiles.numpy(), numbers, tiles_x, tiles_y, BLOCK_LEFT, BLOCK_TOP, np.empty(pairs, np.int32),
             lists.pair_bits, np.zeros((len(pieces), views * tiles_x * tiles_y), np.int32), lists.starts,
-            lists.entry_gaussian, lists.entry_slot, CONSTANTS, records.numpy(), array(features).ravel(),
-            array(background), image.numpy(), alpha.numpy(), through,
+            lists.entry_gaussian, lists.entry_slot, lists.entry_bits, CONSTANTS, records.numpy(),
+            array(features).ravel(), array(background), image.numpy(), alpha.numpy(), through,
         )  # fmt: skip
         run(bin_and_blend, [call] * threads)
         ctx.save_for_backward(records, features, background, image, alpha)
@@ -214,16 +215,16 @@ class _Blend(torch.autograd.Function):
         lists: _Lists = ctx.lists
         channels = features.shape[1]
         width = slot_width(channels)
-        sums = np.empty(len(lists.pair_bits) * width, np.float32)
+        sums = records.new_empty(len(lists.pair_bits) * width).numpy()  # torch's memory begins with a cache line
         v_means2d, v_records = _zeros(*records.shape[:2], 2), _zeros(*records.shape)
         v_features = _zeros(*features.shape)
         threads = _blend_threads(lists)
         call = (
             phase_counters(2), np.zeros(1, np.int64), _table(spans(records.shape[1], threads), 2),
-            *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.pair_bits, records.numpy(),
-            array(features).ravel(), array(background), image.numpy(), alpha.numpy(), array(g_image), array(g_alpha),
-            any(ctx.needs_input_grad[:2]), ctx.crowd, sums, lists.slots,
-            width, v_means2d.numpy(), v_records.numpy(), v_features.numpy(),
+            *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.entry_bits, lists.pair_bits,
+            records.numpy(), array(features).ravel(), array(background), image.numpy(), alpha.numpy(), array(g_image),
+            array(g_alpha), any(ctx.needs_input_grad[:2]), ctx.crowd, sums, lists.slots, width,
+            v_means2d.numpy(), v_records.numpy(), v_features.numpy(),
         )  # fmt: skip
         run(blend_back, [call] * threads)
         v_background = None

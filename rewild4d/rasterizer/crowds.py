@@ -88,7 +88,7 @@ def _open(
 
 @kernel
 def crowd_backward(
-    view: int, tile_left: int, tile_top: int, slots: np.ndarray, gaussians: np.ndarray, pair_bits: np.ndarray,
+    view: int, tile_left: int, tile_top: int, slots: np.ndarray, gaussians: np.ndarray, listed_bits: np.ndarray,
     records: np.ndarray, features: np.ndarray, background: np.ndarray, g_image: np.ndarray, g_alpha: np.ndarray,
     first_channel: int, row_length: int, sums: np.ndarray,
 ) -> None:  # fmt: skip
@@ -100,7 +100,7 @@ def crowd_backward(
         tile_top: its first row.
         slots: of its list, front to back.
         gaussians: of its list.
-        pair_bits: the blocks of the tile where a pair contributes, by slot.
+        listed_bits: the blocks of the tile where each contributes.
         records: flat.
         features: flat.
         background: [V, C].
@@ -117,7 +117,7 @@ def crowd_backward(
     for again in range(2):  # the pixels' totals come first
         _open(view, tile_left, tile_top, g_image, left, gradients)
         for entry in range(len(slots)):
-            bits, n = np.int64(pair_bits[slots[entry]]), gaussians[entry]
+            bits, n = np.int64(listed_bits[entry]), gaussians[entry]
             record = (view * count + n) * RECORD
             row[:] = 0
             for block in range(BLOCKS):

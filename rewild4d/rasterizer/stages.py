@@ -70,8 +70,9 @@ def bin_and_blend(
     counters: np.ndarray, tickets: np.ndarray, pieces: np.ndarray, order: np.ndarray, tiles: np.ndarray,
     slots: np.ndarray, tiles_x: int, tiles_y: int, block_left: np.ndarray, block_top: np.ndarray,
     pair_tile: np.ndarray, pair_bits: np.ndarray, histograms: np.ndarray, starts: np.ndarray,
-    entry_gaussian: np.ndarray, entry_slot: np.ndarray, constants: np.ndarray, records: np.ndarray,
-    features: np.ndarray, background: np.ndarray, image: np.ndarray, alpha: np.ndarray, through: np.ndarray,
+    entry_gaussian: np.ndarray, entry_slot: np.ndarray, entry_bits: np.ndarray, constants: np.ndarray,
+    records: np.ndarray, features: np.ndarray, background: np.ndarray, image: np.ndarray, alpha: np.ndarray,
+    through: np.ndarray,
 ) -> None:  # fmt: skip
     """Make the tiles' lists and blend them.
 
@@ -104,22 +105,23 @@ def bin_and_blend(
             break
         view, begin, end = pieces[piece]
         scatter_pairs(
-            view, begin, end, order, slots, pair_tile, pair_bits, histograms[piece], entry_gaussian, entry_slot
-        )
+            view, begin, end, order, slots, pair_tile, pair_bits, histograms[piece], entry_gaussian, entry_slot,
+            entry_bits,
+        )  # fmt: skip
     end_phase(counters, 2)
     blend(
-        tickets, constants, tiles_x, tiles_y, starts, entry_gaussian, entry_slot, pair_bits, records.reshape(-1),
-        features, background, image, alpha, through,
+        tickets, constants, tiles_x, tiles_y, starts, entry_gaussian, entry_slot, entry_bits, pair_bits,
+        records.reshape(-1), features, background, image, alpha, through,
     )  # fmt: skip
 
 
 @kernel
 def blend_back(
     counters: np.ndarray, tickets: np.ndarray, bounds: np.ndarray, tiles_x: int, tiles_y: int,
-    starts: np.ndarray, entry_gaussian: np.ndarray, entry_slot: np.ndarray, pair_bits: np.ndarray,
-    records: np.ndarray, features: np.ndarray, background: np.ndarray, image: np.ndarray, alpha: np.ndarray,
-    g_image: np.ndarray, g_alpha: np.ndarray, geometry: bool, crowd: int, sums: np.ndarray, slots: np.ndarray,
-    width: int, v_means2d: np.ndarray, v_records: np.ndarray, v_features: np.ndarray,
+    starts: np.ndarray, entry_gaussian: np.ndarray, entry_slot: np.ndarray, entry_bits: np.ndarray,
+    pair_bits: np.ndarray, records: np.ndarray, features: np.ndarray, background: np.ndarray, image: np.ndarray,
+    alpha: np.ndarray, g_image: np.ndarray, g_alpha: np.ndarray, geometry: bool, crowd: int, sums: np.ndarray,
+    slots: np.ndarray, width: int, v_means2d: np.ndarray, v_records: np.ndarray, v_features: np.ndarray,
 ) -> None:  # fmt: skip
     """The gradient of `bin_and_blend`: slots of all tiles, then their sums for each Gaussian.
 
@@ -133,7 +135,7 @@ def blend_back(
     """
     enter_phase(counters, 0)
     blend_backward(
-        tickets, tiles_x, tiles_y, starts, entry_gaussian, entry_slot, pair_bits, records.reshape(-1),
+        tickets, tiles_x, tiles_y, starts, entry_gaussian, entry_slot, entry_bits, records.reshape(-1),
         features, background, image, alpha, g_image, g_alpha, geometry, crowd, sums,
     )  # fmt: skip
     end_phase(counters, 0)
