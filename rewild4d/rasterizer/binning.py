@@ -97,94 +97,125 @@ def _squares(a: float, b: float, c: float, x: Any, y: Any) -> Any:
 
 
 @inlined
-def _reached_blocks(
-    records: np.ndarray, view: int, n: int, left: int, top: int, block_left: np.ndarray, block_top: np.ndarray
-) -> int:
+def _shape(records: np.ndarray, view: int, n: int) -> tuple:
+    """Of one Gaussian: ALONG_X, ALONG_Y, DOWN, where along one side of a block the exponent is largest, its reach."""
+    a, b, c = records[view, n, ALONG_X], records[view, n, ALONG_Y], records[view, n, DOWN]
+    reach = records[view, n, LOG_OPACITY] - np.float32(LOG2_MIN_ALPHA)
+    return a, b, c, -a * b / (b * b + c * c), -b / a, reach * np.float32(1.0001) + SLACK
+
+
+@inlined
+def _reached_blocks(shape: tuple, left: float, top: float, block_left: np.ndarray, block_top: np.ndarray) -> int:
     """Bits of the blocks in which the exponent at some point between pixel centres exceeds log2(1/255).
 
     The maximum over a rectangle lies on one of the two sides that face the centre, at the clamped one-dimensional
-    optimum; all sixteen blocks are tested at once.
+    optimum; all sixteen blocks are tested at once. ``left`` and ``top`` are the tile's first pixel less the centre.
     """
+    a, b, c, slope_y, slope_x, reach = shape
     zero, span = splat(np.float32(0)), splat(np.float32(BLOCK - 1))
-    a, b, c = records[view, n, ALONG_X], records[view, n, ALONG_Y], records[view, n, DOWN]
-    low_x = load(block_left, 0) + splat(np.float32(left + 0.5 - records[view, n, CENTER_X]))
-    low_y = load(block_top, 0) + splat(np.float32(top + 0.5 - records[view, n, CENTER_Y]))
+    low_x, low_y = load(block_left, 0) + splat(np.float32(left)), load(block_top, 0) + splat(np.float32(top))
     high_x, high_y = low_x + span, low_y + span
     near_x, near_y = minimum(maximum(zero, low_x), high_x), minimum(maximum(zero, low_y), high_y)
-    best_y = minimum(maximum(near_x * splat(-a * b / (b * b + c * c)), low_y), high_y)
-    best_x = minimum(maximum(near_y * splat(-b / a), low_x), high_x)
+    best_y = minimum(maximum(near_x * splat(slope_y), low_y), high_y)
+    best_x = minimum(maximum(near_y * splat(slope_x), low_x), high_x)
     least = minimum(_squares(a, b, c, near_x, best_y), _squares(a, b, c, best_x, near_y))
-    reach = records[view, n, LOG_OPACITY] - np.float32(LOG2_MIN_ALPHA)
-    return bits_gt(splat(reach * np.float32(1.0001) + SLACK), least)
+    return bits_gt(splat(reach), least)
+
+
+@inlined
+def _is_before(depths: np.ndarray, view: int, first: int, second: int) -> bool:
+    """Whether one Gaussian comes before another front to back."""
+    here, there = depths[view, first], depths[view, second]
+    return here < there or (here == there and first < second)
 
 
 @kernel
 def mark_pairs(
-    view: int,
-    begin: int,
-    end: int,
-    order: np.ndarray,
-    records: np.ndarray,
-    tiles: np.ndarray,
-    slots: np.ndarray,
-    tiles_x: int,
-    tiles_y: int,
-    block_left: np.ndarray,
-    block_top: np.ndarray,
-    pair_tile: np.ndarray,
-    pair_bits: np.ndarray,
-    histogram: np.ndarray,
-) -> None:
-    """Fill tile and block bits of the pairs of sorted Gaussians begin..end, and count them per tile."""
-    for k in range(begin, end):
-        n = order[view, k]
-        slot = slots[view, n]
+    view: int, begin: int, end: int, firsts: np.ndarray, depths: np.ndarray, records: np.ndarray, tiles: np.ndarray,
+    slots: np.ndarray, tiles_x: int, tiles_y: int, block_left: np.ndarray, block_top: np.ndarray, pair_tile: np.ndarray,
+    pair_bits: np.ndarray, histograms: np.ndarray,
+) -> None:  # fmt: skip
+    """Fill tile and block bits of the pairs of Gaussians begin..end, and count them by piece and tile.
+
+    They are taken as they are numbered, not front to back: so their slots are neighbours, which no other thread writes.
+
+    Args:
+        view: theirs.
+        begin: the first of them.
+        end: one past the last.
+        firsts: the foremost Gaussian of each piece that `scatter_pairs` takes, front to back, [P].
+        depths: [V, N].
+        records: [V, N, 8].
+        tiles: first and one past the last, x then y, [V, N, 4].
+        slots: [V, N + 1].
+        tiles_x: tiles of a row.
+        tiles_y: rows.
+        block_left: `BLOCK_LEFT`.
+        block_top: `BLOCK_TOP`.
+        pair_tile: set, by slot.
+        pair_bits: set, by slot.
+        histograms: added to, [P, tiles of all views].
+    """
+    for n in range(begin, end):
+        slot, piece = slots[view, n], 0
+        if slot == slots[view, n + 1]:
+            continue
+        while piece + 1 < len(firsts) and not _is_before(depths, view, n, firsts[piece + 1]):
+            piece += 1
+        shape, x, y = _shape(records, view, n), records[view, n, CENTER_X], records[view, n, CENTER_Y]
         for tile_y in range(np.int64(tiles[view, n, 2]), np.int64(tiles[view, n, 3])):
             for tile_x in range(np.int64(tiles[view, n, 0]), np.int64(tiles[view, n, 1])):
-                bits = _reached_blocks(records, view, n, tile_x * TILE, tile_y * TILE, block_left, block_top)
+                left, top = tile_x * TILE + 0.5 - x, tile_y * TILE + 0.5 - y
+                bits = _reached_blocks(shape, left, top, block_left, block_top)
                 tile = (view * tiles_y + tile_y) * tiles_x + tile_x
-                pair_tile[slot] = tile
-                pair_bits[slot] = bits
-                histogram[tile] += bits != 0
+                pair_tile[slot], pair_bits[slot] = tile, bits
+                histograms[piece, tile] += bits != 0
                 slot += 1
 
 
 @kernel
-def start_tiles(histograms: np.ndarray, starts: np.ndarray) -> int:
-    """Turn per-chunk counts [chunks, tiles] into where each chunk writes; starts [tiles + 1]; give the longest list."""
-    total, longest = 0, 0
-    for tile in range(histograms.shape[1]):
+def start_tiles(histograms: np.ndarray, starts: np.ndarray) -> None:
+    """Turn counts by who marked, piece and tile, [M, P, tiles], into where each piece writes, [0, P, tiles].
+
+    ``starts`` [tiles + 1] is set to where the tiles' lists begin.
+    """
+    markers, pieces, tiles = histograms.shape
+    total = 0
+    for tile in range(tiles):
         starts[tile] = total
-        for chunk in range(histograms.shape[0]):
-            here = histograms[chunk, tile]
-            histograms[chunk, tile] = total
+        for piece in range(pieces):
+            here = 0
+            for marker in range(markers):
+                here += histograms[marker, piece, tile]
+            histograms[0, piece, tile] = total
             total += here
-        longest = max(longest, total - starts[tile])
-    starts[histograms.shape[1]] = total
-    return longest
+    starts[tiles] = total
 
 
 @kernel
 def scatter_pairs(
-    view: int,
-    begin: int,
-    end: int,
-    order: np.ndarray,
-    slots: np.ndarray,
-    pair_tile: np.ndarray,
-    pair_bits: np.ndarray,
-    cursor: np.ndarray,
-    entry_gaussian: np.ndarray,
-    entry_slot: np.ndarray,
-    entry_bits: np.ndarray,
-) -> None:
-    """Write the pairs of sorted Gaussians begin..end into their tiles' lists, in depth order."""
+    view: int, begin: int, end: int, order: np.ndarray, slots: np.ndarray, pair_tile: np.ndarray, pair_bits: np.ndarray,
+    cursor: np.ndarray, entry_gaussian: np.ndarray, entry_slot: np.ndarray, entry_bits: np.ndarray,
+) -> None:  # fmt: skip
+    """Write the pairs of sorted Gaussians begin..end into their tiles' lists, in depth order.
+
+    Args:
+        view: theirs.
+        begin: the first of them.
+        end: one past the last.
+        order: front to back, [V, N].
+        slots: [V, N + 1].
+        pair_tile: by slot.
+        pair_bits: by slot.
+        cursor: where the next entry of each tile goes, counted up, [tiles of all views].
+        entry_gaussian: set.
+        entry_slot: set.
+        entry_bits: set.
+    """
     for k in range(begin, end):
         n = order[view, k]
         for slot in range(slots[view, n], slots[view, n + 1]):
             if pair_bits[slot] != 0:
                 place = cursor[pair_tile[slot]]
                 cursor[pair_tile[slot]] = place + 1
-                entry_gaussian[place] = n
-                entry_slot[place] = slot
-                entry_bits[place] = pair_bits[slot]
+                entry_gaussian[place], entry_slot[place], entry_bits[place] = n, slot, pair_bits[slot]

@@ -31,6 +31,10 @@ keep_freed_memory()
 SERIAL_BELOW = 512
 """Gaussians for which waking a second thread costs more than it saves."""
 
+MOST_PARTS = 8
+"""Into which a view's Gaussians are cut to be listed: their counts, the square of it for each tile, are added up by one
+thread."""
+
 
 def rasterize(
     means: Tensor,
@@ -83,7 +87,7 @@ def _table(rows: Sequence[tuple[int, ...]], columns: int) -> np.ndarray:
 class _Project(torch.autograd.Function):
     """World to image: centres [V, N, 2] and records [V, N, 8].
 
-    And without gradients radii and order [V, N], tiles [V, N, 4], slots [V, N + 1] and counts [V], see
+    And without gradients radii, depths and order [V, N], tiles [V, N, 4], slots [V, N + 1] and counts [V], see
     `project_and_sort`.
     """
 
@@ -102,6 +106,7 @@ class _Project(torch.autograd.Function):
         room = max(count, WIDTH)
         means2d, records = means.new_empty(views, room, 2), means.new_empty(views, room, RECORD)
         radii, order = means.new_empty(views, room), torch.empty(views, room, dtype=torch.int32)
+        depths = torch.empty(views, room, dtype=torch.float64)
         tiles, slots = means.new_empty(views, room, 4), torch.empty(views, room + 1, dtype=torch.int64)
         counts = np.empty(views, np.int64)
         gaussians = tuple(array(_padded(tensor, room)).ravel() for tensor in (means, quats, scales, opacities))
@@ -110,11 +115,11 @@ class _Project(torch.autograd.Function):
         bounds = _table(spans(room, min(threads, room // WIDTH)), 2)  # `project` takes eight at a time
         call = (
             phase_counters(2), bounds, *gaussians, *cameras, *options, means2d.numpy().ravel(), records.numpy().ravel(),
-            radii.numpy(), np.empty((views, room)), tiles.numpy().ravel(), slots.numpy(), order.numpy(), counts,
+            radii.numpy(), depths.numpy(), tiles.numpy().ravel(), slots.numpy(), order.numpy(), counts,
             np.empty((len(bounds), views), np.int64), np.empty((views, 2, room), np.int64),
         )  # fmt: skip
         run(project_and_sort, [call] * threads)
-        outputs = [means2d, records, radii, order, tiles, slots]
+        outputs = [means2d, records, radii, depths, order, tiles, slots]
         if room > count:
             outputs = [tensor[:, : count + (tensor is slots)].contiguous() for tensor in outputs]
         outputs.append(torch.from_numpy(counts))
@@ -176,6 +181,7 @@ class _Blend(torch.autograd.Function):
         records: Tensor,
         features: Tensor,
         background: Tensor,
+        depths: Tensor,
         order: Tensor,
         tiles: Tensor,
         slots: Tensor,
@@ -186,9 +192,9 @@ class _Blend(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         views, channels = records.shape[0], features.shape[1]
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-        seen, numbers = counts.tolist(), slots.numpy()
-        threads = thread_count() if sum(seen) > SERIAL_BELOW else 1
-        pieces = [(view, *span) for view in range(views) for span in spans(seen[view], threads)]
+        numbers = slots.numpy()
+        threads = thread_count() if sum(counts.tolist()) > SERIAL_BELOW else 1
+        parts = min(threads, MOST_PARTS)
         pairs = int(numbers[-1, -1])
         lists = _Lists(
             (tiles_x, tiles_y), numbers, np.empty(pairs, np.uint16), np.empty(views * tiles_x * tiles_y + 1, np.int64),
@@ -197,11 +203,11 @@ class _Blend(torch.autograd.Function):
         image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
         through = np.empty(alpha.numel() if ctx.needs_input_grad[3] else 0, np.float32)
         call = (
-            phase_counters(3), np.zeros(1, np.int64), _table(pieces, 3), order.numpy(),
-            tiles.numpy(), numbers, tiles_x, tiles_y, BLOCK_LEFT, BLOCK_TOP, np.empty(pairs, np.int32),
-            lists.pair_bits, np.zeros((len(pieces), views * tiles_x * tiles_y), np.int32), lists.starts,
-            lists.entry_gaussian, lists.entry_slot, lists.entry_bits, CONSTANTS, records.numpy(),
-            array(features).ravel(), array(background), image.numpy(), alpha.numpy(), through,
+            phase_counters(3), np.zeros(1, np.int64), counts.numpy(), depths.numpy(), order.numpy(), tiles.numpy(),
+            numbers, tiles_x, tiles_y, BLOCK_LEFT, BLOCK_TOP, np.empty(pairs, np.int32), lists.pair_bits,
+            np.zeros((parts, parts, views * tiles_x * tiles_y), np.int32), lists.starts, lists.entry_gaussian,
+            lists.entry_slot, lists.entry_bits, CONSTANTS, records.numpy(), array(features).ravel(),
+            array(background), image.numpy(), alpha.numpy(), through,
         )  # fmt: skip
         run(bin_and_blend, [call] * threads)
         ctx.save_for_backward(records, features, background, image, alpha)
@@ -230,7 +236,7 @@ class _Blend(torch.autograd.Function):
         v_background = None
         if ctx.needs_input_grad[3]:
             v_background = (g_image * ctx.through.view_as(alpha)).sum(dim=(2, 3))
-        return v_means2d, v_records, v_features, v_background, *[None] * 7
+        return v_means2d, v_records, v_features, v_background, *[None] * 8
 
 
 def _blend_threads(lists: _Lists) -> int:

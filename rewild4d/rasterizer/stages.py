@@ -67,8 +67,8 @@ def project_and_sort(
 
 @kernel
 def bin_and_blend(
-    counters: np.ndarray, tickets: np.ndarray, pieces: np.ndarray, order: np.ndarray, tiles: np.ndarray,
-    slots: np.ndarray, tiles_x: int, tiles_y: int, block_left: np.ndarray, block_top: np.ndarray,
+    counters: np.ndarray, tickets: np.ndarray, counts: np.ndarray, depths: np.ndarray, order: np.ndarray,
+    tiles: np.ndarray, slots: np.ndarray, tiles_x: int, tiles_y: int, block_left: np.ndarray, block_top: np.ndarray,
     pair_tile: np.ndarray, pair_bits: np.ndarray, histograms: np.ndarray, starts: np.ndarray,
     entry_gaussian: np.ndarray, entry_slot: np.ndarray, entry_bits: np.ndarray, constants: np.ndarray,
     records: np.ndarray, features: np.ndarray, background: np.ndarray, image: np.ndarray, alpha: np.ndarray,
@@ -79,20 +79,23 @@ def bin_and_blend(
     Args:
         counters: of three phases.
         tickets: of `blend`.
-        pieces: view, first and one past the last of its sorted Gaussians, [P, 3].
-        histograms: zero, [P, tiles of all views].
+        counts: visible Gaussians of each view, [V].
+        histograms: zero, [P, P, tiles of all views]: a view's Gaussians are marked, and scattered, in P parts.
         records: [V, N, 8]; all other arguments as in `mark_pairs`, `scatter_pairs` and `blend`.
     """
+    parts, units, count = len(histograms), len(histograms) * len(counts), records.shape[1]
     enter_phase(counters, 0)
     while True:
-        piece = phase_ticket(counters, 0)
-        if piece >= len(pieces):
+        unit = phase_ticket(counters, 0)
+        if unit >= units:
             break
-        view, begin, end = pieces[piece]
-        mark_pairs(
-            view, begin, end, order, records, tiles, slots, tiles_x, tiles_y, block_left, block_top, pair_tile,
-            pair_bits, histograms[piece],
-        )  # fmt: skip
+        view, part = unit // parts, unit % parts
+        if counts[view] > 0:
+            firsts = order[view][counts[view] * np.arange(parts) // parts]
+            mark_pairs(
+                view, count * part // parts, count * (part + 1) // parts, firsts, depths, records, tiles, slots,
+                tiles_x, tiles_y, block_left, block_top, pair_tile, pair_bits, histograms[part],
+            )  # fmt: skip
     end_phase(counters, 0)
     enter_phase(counters, 1)
     if phase_ticket(counters, 1) == 0:
@@ -100,13 +103,13 @@ def bin_and_blend(
     end_phase(counters, 1)
     enter_phase(counters, 2)
     while True:
-        piece = phase_ticket(counters, 2)
-        if piece >= len(pieces):
+        unit = phase_ticket(counters, 2)
+        if unit >= units:
             break
-        view, begin, end = pieces[piece]
+        view, part = unit // parts, unit % parts
         scatter_pairs(
-            view, begin, end, order, slots, pair_tile, pair_bits, histograms[piece], entry_gaussian, entry_slot,
-            entry_bits,
+            view, counts[view] * part // parts, counts[view] * (part + 1) // parts, order, slots, pair_tile,
+            pair_bits, histograms[0, part], entry_gaussian, entry_slot, entry_bits,
         )  # fmt: skip
     end_phase(counters, 2)
     blend(
