@@ -29,6 +29,14 @@ def test_settings_follow_the_length_of_the_clip() -> None:
     assert for_clip_of_ours(made, 300) == made
 
 
+def test_what_is_beyond_the_paper_differs_from_standard_in_these_three_alone() -> None:
+    standard, beyond = (load_preset("ours", Config, name) for name in ("standard", "beyond"))
+    geometry = msgspec.structs.replace(standard.geometry, limb_plane=100.0, sideways=1000.0)
+    loss = msgspec.structs.replace(standard.loss, isolated=False)
+    assert beyond == msgspec.structs.replace(standard, geometry=geometry, loss=loss)
+    assert standard.loss.isolated and standard.geometry.limb_plane == standard.geometry.sideways == 0
+
+
 def test_settings_follow_whether_the_cameras_are_known() -> None:
     quick, standard, paper = (load_preset("ours", Config, name) for name in ("quick", "standard", "paper"))
     made = for_clip_of_ours(standard, 24, filmed=True)
