@@ -52,8 +52,8 @@ class Options:
         fps: how many of them a second; of a folder of frames the rate at which it was taken.
         case: names or patterns of cases ("wolf/Run", "wolf/*"); all (of real videos: quadrupeds) where it is left out.
         protocol: what is held out and measured (see `list`); the data set's default where it is left out.
-        preset: size of the effort: quick, standard or paper; of `ours` also beyond, what is better than the paper's rules
-            where cameras are known.
+        preset: size of the effort: quick, standard or paper; of `ours` also beyond, standard with what is better than
+            the paper's rules where cameras are known.
         seeds: one run for each.
         prior: "template" (fitted to the clip), "coarse:<noise>" (from the truth plus noise: for studies), "rig" (the
             data set's own shape and skeleton: a bound) or a file (of real videos: what `prior fit` or `prior import`
