@@ -28,7 +28,7 @@ def preset_names(method: str) -> list[str]:
 def load_preset(method: str, config_type: type[T], preset: str) -> T:
     """A method's settings under a preset; a method without a preset file has its defaults under each of `PRESETS`.
 
-    A preset that `extends` another has its values, but for those that it names itself.
+    A preset that `extends` another, which itself extends none, has its values but for those that it names.
 
     Raises:
         UserError: no such preset, or the file does not fit the method's settings.
@@ -40,21 +40,24 @@ def load_preset(method: str, config_type: type[T], preset: str) -> T:
         return config_type()
     if preset not in presets:
         raise unknown_name(f"preset of '{method}'", preset, presets)
+    own = dict(presets[preset])
+    if base := own.pop("extends", None):
+        if base not in presets:
+            raise unknown_name(f"preset of '{method}'", base, presets)
+        own = _over(presets[base], own)
     try:
-        return msgspec.convert(_whole(presets, preset), type=config_type)
+        return msgspec.convert(own, type=config_type)
     except msgspec.ValidationError as error:
         raise UserError(f"presets/{method}.toml: [{preset}] does not fit {config_type.__name__}: {error}.") from error
 
 
-def _whole(presets: dict[str, Any], name: str) -> dict[str, Any]:
-    own = {key: value for key, value in presets[name].items() if key != "extends"}
-    base = presets[name].get("extends")
-    return _over(_whole(presets, base), own) if base else own
-
-
 def _over(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
     """Nested values with others in their place."""
-    nested = {key: _over(base[key], value) for key, value in own.items() if isinstance(base.get(key), dict)}
+    nested = {
+        key: _over(base[key], value)
+        for key, value in own.items()
+        if isinstance(value, dict) and isinstance(base.get(key), dict)
+    }
     return base | own | nested
 
 

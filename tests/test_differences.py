@@ -147,7 +147,7 @@ def test_a_preset_or_a_case_that_is_not_there_is_said(runs: Path, capsys: pytest
         assert stop.value.code == 2
         return capsys.readouterr().err
 
-    bogus = "unknown preset 'bogus'. Available: paper, quick, standard."
+    bogus = "unknown preset 'bogus'. Available: beyond, paper, quick, standard."
     assert bogus in refused("table", "sweep-random", "--runs", str(runs), "--preset", "bogus")
     page = str(runs / "page")
     assert bogus in refused("leaderboard", "build", "--runs", str(runs), "--out", page, "--preset", "bogus")

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from rewild4d.kernels import compiling
-from rewild4d.rasterizer import cpu
+from rewild4d.rasterizer import cpu, rasterize
 
 WIDTH, HEIGHT = 70, 50
 
@@ -115,6 +115,45 @@ def test_depths_that_single_precision_cannot_tell_apart_keep_their_order() -> No
     wanted = render(inputs, 20, 20, backend="reference")[0]
     single = {name: value.float() for name, value in inputs.items()}
     assert (render(single, 20, 20)[0] - wanted).abs().max() < 1e-4
+
+
+def test_what_lies_behind_a_pixel_that_a_gaussian_closed_alone_has_no_gradient() -> None:
+    """Two wide Gaussians, one of a single pixel that closes it, and a wide one behind; the loss looks at that pixel."""
+    focal, depths = 16.0, torch.tensor([1.0, 1.1, 1.2, 1.4])
+    sizes = torch.tensor([4.0, 4.0, 0.05, 4.0])
+    places = torch.tensor([(5.5 - 8) / focal, (5.5 - 8) / focal, 1.0])
+    inputs = (
+        depths[:, None] * places, torch.tensor([[1.0, 0, 0, 0]]).repeat(4, 1),
+        (sizes * depths / focal)[:, None].repeat(1, 3), torch.tensor([0.93, 0.93, 0.99, 0.5]), torch.rand(4, 3),
+    )  # fmt: skip
+    camera = torch.tensor([[[focal, 0, 8], [0, focal, 8], [0, 0, 1]]])
+    for backend, kind in (("numba", torch.float32), ("reference", torch.float64)):
+        leaves = [value.to(kind, copy=True).requires_grad_() for value in inputs]
+        image, _, _ = rasterize(*leaves, torch.eye(4)[None], camera, 16, 16, eps2d=0.01, backend=backend)
+        image[0, :, 5, 5].sum().backward()
+        slopes = [leaf.grad for leaf in leaves if leaf.grad is not None]
+        assert all((slope[3] == 0).all() for slope in slopes), backend
+        assert len(slopes) == 5 and all((slope[:2] != 0).all() for slope in slopes[3:]), (
+            "opacities and features in front"
+        )
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_gaussian_whose_radius_rounds_to_zero_is_listed_as_often_as_it_is_counted(count: int) -> None:
+    """Antialiasing leaves it an alpha of 1/255 and a hair, at a pixel's centre."""
+    inputs = (
+        torch.tensor([[0.0, 0, 1], [0.1, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]] * 2),
+        torch.tensor([[1 / 16.0] * 3, [2.0] * 3]), torch.tensor([0.5, 0.9]), torch.ones(2, 3),
+    )  # fmt: skip
+    leaves = [value[:count].clone().requires_grad_() for value in inputs]
+    camera = torch.tensor([[[16.0, 0, 8.5], [0, 16, 8.5], [0, 0, 1]]])
+    image, _, info = rasterize(
+        *leaves, torch.eye(4)[None], camera, 16, 16, eps2d=126.49999999999999, antialias=True, backend="numba"
+    )
+    assert info.radii[0, 0] == 0, "or the case is another"
+    image.sum().backward()
+    for leaf in leaves:
+        assert leaf.grad is not None and leaf.grad.abs().max() < 1e3
 
 
 @pytest.mark.parametrize("seed", range(4))

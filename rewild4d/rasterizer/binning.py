@@ -45,18 +45,18 @@ def _sort_run(run: np.ndarray, depths: np.ndarray) -> None:
 
 
 @kernel
-def sort_by_depth(
-    view: int, radii: np.ndarray, depths: np.ndarray, order: np.ndarray, keys: np.ndarray, spare: np.ndarray
-) -> int:
+def sort_by_depth(view: int, depths: np.ndarray, order: np.ndarray, keys: np.ndarray, spare: np.ndarray) -> int:
     """Write the visible Gaussians of one view, nearest first (ties by index), to order[view]; give their number.
+
+    They are those of a positive depth: a radius may round to zero where a Gaussian has a tile.
 
     ``keys`` and ``spare`` are int64 scratch of length N: bits of the depth in single precision above, index below. What
     is equal so is put right afterwards.
     """
     bits = depths[view].astype(np.float32).view(np.int32)
     count, lowest, highest = 0, np.int64(1) << 31, np.int64(0)
-    for n in range(radii.shape[1]):
-        if radii[view, n] > 0:
+    for n in range(depths.shape[1]):
+        if depths[view, n] > 0:
             key = np.int64(bits[n])
             keys[count] = (key << 32) | n
             lowest, highest = min(lowest, key), max(highest, key)
@@ -137,7 +137,8 @@ def mark_pairs(
 ) -> None:  # fmt: skip
     """Fill tile and block bits of the pairs of Gaussians begin..end, and count them by piece and tile.
 
-    They are taken as they are numbered, not front to back: so their slots are neighbours, which no other thread writes.
+    They are taken as they are numbered, not front to back: so their slots are neighbours, and hardly any two
+    threads write to one cache line.
 
     Args:
         view: theirs.

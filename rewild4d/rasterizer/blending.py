@@ -50,9 +50,11 @@ CONSTANTS = np.array([LOG2_MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, *POWER_TERMS
 """An argument of the kernels, so that the loop over blocks finds them in registers."""
 WEAKEST, STRONGEST_ALPHA, LEAST_LEFT, TERMS = range(4)
 
+AHEAD = 16
+"""Gaussians whose places in a tile are computed together, so that nothing waits for one of them."""
 
-AHEAD, PLACED = 16, 4 * LANES
-"""Gaussians whose places in a tile are computed together, so that nothing waits for one of them; numbers of a place."""
+PLACED = 4 * LANES
+"""Numbers of a place."""
 
 
 @inlined
@@ -118,9 +120,9 @@ def blend(
 ) -> None:
     """Blend tiles until no ticket is left: fill image [V, C, h, w], alpha [V, 1, h, w] and ``through``, 1 - alpha.
 
-    ``records`` and ``features`` are flat. ``entry_bits`` shrinks to the blocks where an entry really contributed;
-    ``pair_bits`` becomes 0 where it did nowhere, and only there: slots of a Gaussian share a cache line, its tiles have
-    different threads.
+    ``records`` and ``features`` are flat. ``entry_bits`` shrinks to the blocks where an entry really contributed or
+    closed a pixel; ``pair_bits`` becomes 0 where it did so nowhere, and only there: slots of a Gaussian share a cache
+    line, its tiles have different threads.
     ``through`` is flat and keeps the digits that alpha has lost near 1; empty where nobody needs them.
     Blocks without an open pixel are passed over from the next `AHEAD` Gaussians on: who looked for them after each one
     would wait for its whole arithmetic.
@@ -196,12 +198,11 @@ def _blend_entry(
         alpha, exponent = alpha_at(log_opacity, t, u, strongest, terms)
         before = load(left, block * LANES)
         weight = keep_where_ge(alpha, exponent, weakest) * before
+        touched |= (bits_gt(weight, zero) != 0) << block
         after = before - weight
         store(left, block * LANES, select_gt(after, least, after, negated_absolute(before)))
         weight = select_gt(after, least, weight, zero)
-        open_lanes = bits_gt(after, least)
-        touched |= (open_lanes & bits_gt(exponent, weakest) != 0) << block
-        closed |= (open_lanes == 0) << block
+        closed |= (bits_gt(after, least) == 0) << block
         color = block * channels * LANES
         if channels == 3:  # the usual case without a loop
             _add_channel(weight, features, feature, colors, color)

@@ -107,8 +107,7 @@ def blend_backward(
         if geometry and last - first > crowd:
             crowd_backward(
                 view, tile_left, tile_top, entry_slot[first:last], entry_gaussian[first:last], entry_bits[first:last],
-                records,
-                features, background, g_image, g_alpha, _first_channel(channels), row_length, sums,
+                records, features, background, g_image, g_alpha, _first_channel(channels), row_length, sums,
             )  # fmt: skip
             continue
         open_tile(tile_left, tile_top, width, height, left)

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from rewild4d.kernels.arrays import fits
-from rewild4d.kernels.magnitudes import all_below
 
 MOST_FEATURE = 2.0**100
 """Single precision ends at 3e38, and the backward pass multiplies channels by derivatives."""
@@ -59,8 +58,11 @@ def check_values(named: dict[str, Tensor]) -> None:
         ValueError: names the tensor and the index.
     """
     _check_pinholes(named["intrinsics"].tolist())
-    if all(map(fits, named.values())) and all_below(named.values(), MOST_FEATURE):
-        return  # in a tenth of the time; who is odd, if anybody is, the slow look says
+    if all(map(fits, named.values())):
+        from rewild4d.kernels.magnitudes import all_below  # numba, which a GPU has no need of
+
+        if all_below(named.values(), MOST_FEATURE):
+            return  # in a tenth of the time; who is odd, if anybody is, the slow look says
     _check_finite(named)
     _check_range(named)
 

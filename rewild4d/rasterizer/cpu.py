@@ -31,9 +31,8 @@ keep_freed_memory()
 SERIAL_BELOW = 512
 """Gaussians for which waking a second thread costs more than it saves."""
 
-MOST_PARTS = 8
-"""Into which a view's Gaussians are cut to be listed: their counts, the square of it for each tile, are added up by one
-thread."""
+MOST_PARTS = 4
+"""A view's Gaussians are marked in at most so many parts: one thread adds up the square of that many counts a tile."""
 
 
 def rasterize(

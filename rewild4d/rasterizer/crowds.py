@@ -100,7 +100,7 @@ def crowd_backward(
         tile_top: its first row.
         slots: of its list, front to back.
         gaussians: of its list.
-        listed_bits: the blocks of the tile where each contributes.
+        listed_bits: the blocks of the tile where each contributes or closes a pixel.
         records: flat.
         features: flat.
         background: [V, C].

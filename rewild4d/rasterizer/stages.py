@@ -62,7 +62,7 @@ def project_and_sort(
         if unit == views:
             _join_numbers(slots, bounds, totals)
         else:
-            counts[unit] = sort_by_depth(unit, radii, depths, order, keys[unit, 0], keys[unit, 1])
+            counts[unit] = sort_by_depth(unit, depths, order, keys[unit, 0], keys[unit, 1])
 
 
 @kernel
