@@ -53,12 +53,11 @@ def load_preset(method: str, config_type: type[T], preset: str) -> T:
 
 def _over(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
     """Nested values with others in their place."""
-    nested = {
-        key: _over(base[key], value)
-        for key, value in own.items()
-        if isinstance(value, dict) and isinstance(base.get(key), dict)
-    }
-    return base | own | nested
+    made = dict(base)
+    for key, value in own.items():
+        nested = isinstance(value, dict) and isinstance(base.get(key), dict)
+        made[key] = _over(base[key], value) if nested else value
+    return made
 
 
 def _preset_file(method: str) -> dict[str, Any]:

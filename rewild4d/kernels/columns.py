@@ -14,13 +14,20 @@ BLOCK = 64
 
 
 @inlined
+def load_four(numbers: np.ndarray, place: int, step: int) -> tuple[Any, Any, Any, Any]:
+    """Four vectors, ``step`` numbers apart."""
+    return (
+        load(numbers, place),
+        load(numbers, place + step),
+        load(numbers, place + 2 * step),
+        load(numbers, place + 3 * step),
+    )
+
+
+@inlined
 def four_rows(columns: np.ndarray, first: int, lane: int) -> tuple[Any, Any, Any, Any]:
     """Four numbers, from the first on, of sixteen Gaussians of a block."""
-    place = first * BLOCK + lane
-    return (
-        load(columns, place), load(columns, place + BLOCK), load(columns, place + 2 * BLOCK),
-        load(columns, place + 3 * BLOCK),
-    )  # fmt: skip
+    return load_four(columns, first * BLOCK + lane, BLOCK)
 
 
 @kernel

@@ -5,13 +5,11 @@ from collections.abc import Iterable
 import numpy as np
 from torch import Tensor
 
-from rewild4d.kernels.arrays import fits
 from rewild4d.kernels.compiling import kernel
-from rewild4d.kernels.pointers import floats_at
+from rewild4d.kernels.pointers import floats_at, packed
 from rewild4d.kernels.simd import LANES, absolute, bits_gt, load, splat
 
-_SIDE_BY_SIDE = 4
-_STEP = _SIDE_BY_SIDE * LANES
+_STEP = 4 * LANES
 _ALL = (1 << LANES) - 1
 
 
@@ -42,7 +40,7 @@ def all_below(tensors: Iterable[Tensor], bound: float) -> bool:
         tensors: float32 on the CPU, of any shape.
         bound: positive.
     """
-    packed = [tensor if tensor.is_contiguous() else tensor.contiguous() for tensor in tensors]
-    assert all(map(fits, packed))
-    places = np.array([(tensor.data_ptr(), tensor.numel()) for tensor in packed], np.int64).reshape(-1, 2)
+    kept = [tensor.contiguous() for tensor in tensors]  # alive until the kernel has read them
+    assert all(map(packed, kept))
+    places = np.array([(tensor.data_ptr(), tensor.numel()) for tensor in kept], np.int64).reshape(-1, 2)
     return _all_below(places[:, 0], places[:, 1], bound)

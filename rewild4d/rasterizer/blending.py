@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rewild4d.kernels.columns import load_four
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.powers import POWER_TERMS, exp2_with, load_terms
 from rewild4d.kernels.simd import (
@@ -198,7 +199,7 @@ def _blend_entry(
         alpha, exponent = alpha_at(log_opacity, t, u, strongest, terms)
         before = load(left, block * LANES)
         weight = keep_where_ge(alpha, exponent, weakest) * before
-        touched |= (bits_gt(weight, zero) != 0) << block
+        touched |= (bits_gt(weight, zero) != 0) << block  # what closes a pixel too: the backward pass must see it close
         after = before - weight
         store(left, block * LANES, select_gt(after, least, after, negated_absolute(before)))
         weight = select_gt(after, least, weight, zero)
@@ -230,22 +231,13 @@ def _write_tile(
     pixels, mattes, one = image.reshape(-1), alpha.reshape(-1), splat(np.float32(1))
     for block in range(0, BLOCKS, 4):
         x, y = tile_left, tile_top + block
-        a, b, c, d = _four(left, block * LANES, LANES)
+        a, b, c, d = load_four(left, block * LANES, LANES)
         a, b, c, d = absolute(a), absolute(b), absolute(c), absolute(d)
         store_blocks(mattes, view * height, x, y, width, height, (one - a, one - b, one - c, one - d))
         if len(through) > 0:
             store_blocks(through, view * height, x, y, width, height, (a, b, c, d))
         for channel in range(channels):
-            e, f, g, h = _four(colors, (block * channels + channel) * LANES, channels * LANES)
+            e, f, g, h = load_four(colors, (block * channels + channel) * LANES, channels * LANES)
             behind = splat(background[view, channel])
             composed = fma(a, behind, e), fma(b, behind, f), fma(c, behind, g), fma(d, behind, h)
             store_blocks(pixels, (view * channels + channel) * height, x, y, width, height, composed)
-
-
-@inlined
-def _four(numbers: np.ndarray, first: int, step: int) -> tuple:
-    """Four vectors, ``step`` apart."""
-    return (
-        load(numbers, first), load(numbers, first + step), load(numbers, first + 2 * step),
-        load(numbers, first + 3 * step),
-    )  # fmt: skip
