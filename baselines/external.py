@@ -34,7 +34,7 @@ from rewild4d.baselines.external_reading import Moment, moved_discs, painted, re
 from rewild4d.contracts import Log, MethodInfo
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import digest, load_tensors, save_tensors, write_text
-from rewild4d.meshes import Discs
+from rewild4d.io.meshes import Discs
 from rewild4d.ours.config import Count, Positive
 from rewild4d.ours.motion import camera_between, frame_position
 from rewild4d.priors.motion import pose_at

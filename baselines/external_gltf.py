@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rewild4d.datasets.animal import Surface
-from rewild4d.datasets.gltf import Document, Floats, consistent
-from rewild4d.datasets.morphs import target_offsets, target_weights
-from rewild4d.datasets.rig import clips, influences, inverse_binds, read_surface
+from rewild4d.datasets.rigs.animal import Surface
+from rewild4d.datasets.rigs.gltf import Document, Floats, consistent
+from rewild4d.datasets.rigs.morphs import target_offsets, target_weights
+from rewild4d.datasets.rigs.reader import clips, influences, inverse_binds, read_surface
 from rewild4d.errors import UserError
-from rewild4d.meshes import Mesh
+from rewild4d.io.meshes import Mesh
 
 
 def read_animation(path: Path, times: Sequence[float]) -> list[list[Mesh]]:

@@ -11,8 +11,8 @@ from torch.nn.functional import grid_sample, normalize
 
 from rewild4d.baselines.external_gltf import read_animation
 from rewild4d.errors import UserError
-from rewild4d.meshes import Discs, Mesh, discs, read_mesh
-from rewild4d.ply import read_splats
+from rewild4d.io.meshes import Discs, Mesh, discs, read_mesh
+from rewild4d.io.ply import read_splats
 from rewild4d.transforms import split_similarity
 from rewild4d.types import Camera, Frame, Splats
 

@@ -36,17 +36,13 @@ from rewild4d.baselines.gart_skeleton import PoseTable, prior_poses
 from rewild4d.baselines.gart_skinning import ResidualField, posed
 from rewild4d.baselines.gart_smal import template_prior
 from rewild4d.baselines.saved import Root, gaussians_from_state, load_state
-from rewild4d.baselines.splatting import (
-    SplatTraining,
-    run_steps,
-    surface_gaussians,
-)
+from rewild4d.baselines.splatting import SplatTraining, run_steps, surface_gaussians
 from rewild4d.contracts import Log, MethodInfo
 from rewild4d.harmonics import C0
 from rewild4d.kernels.threads import torch_on_one
 from rewild4d.ours.canonical import REST_GAIN, Gaussians
 from rewild4d.ours.checkpoint import fit_digest
-from rewild4d.ours.geometry_losses import neighbours
+from rewild4d.ours.losses.regularizers import neighbours
 from rewild4d.ours.schedule import exponential, for_clip
 from rewild4d.ours.symmetry import Key, Supervision, Target, match_times
 from rewild4d.rasterizer import RasterInfo

@@ -9,7 +9,7 @@ from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.config import Skinning
 from rewild4d.ours.fused.field import sample_grid
 from rewild4d.ours.fused.skinning import skin_both
-from rewild4d.ours.geometry_losses import tv_loss
+from rewild4d.ours.losses.regularizers import tv_loss
 from rewild4d.ours.skinning import build_field
 from rewild4d.transforms import skin_points, skin_quats
 from rewild4d.types import Prior

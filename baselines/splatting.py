@@ -20,7 +20,7 @@ from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.checkpoint import load_checkpoint, save_checkpoint
 from rewild4d.ours.config import Canonical, Count, Density, Opacity, Rate, Size, Weight, Whole
 from rewild4d.ours.density import DensityControl
-from rewild4d.ours.losses import WINDOW, colour_losses, silhouette_loss, union_window
+from rewild4d.ours.losses.images import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.schedule import exponential
 from rewild4d.ours.symmetry import Supervision, Target
 from rewild4d.priors.motion import colors_from_frames, pose_gaussians, quats_from_normals, sample_surface

@@ -18,7 +18,6 @@ from PIL import Image
 from tqdm import tqdm
 
 from rewild4d.contracts import Selection
-from rewild4d.datasets.artemis_files import ImagePair
 from rewild4d.errors import UserError
 from rewild4d.files import atomic, cache_folder, digest, file_state
 from rewild4d.types import Camera
@@ -34,6 +33,14 @@ ORIENTATION = 0x0112
 _FLIPS = {2: (1, -1), 3: (-1, -1), 4: (-1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}
 """Steps along rows and columns of an upright picture, by EXIF orientation."""
 _PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@dataclass(frozen=True)
+class ImagePair:
+    """The two files of one view at one frame."""
+
+    rgb: Path
+    alpha: Path
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Draw a table of the leaderboard as LaTeX sets it: its source and a picture of the compiled page, side by side.
 
-    python docs/draw_table.py artemis --runs leaderboard/results/2026-11-23-artemis-standard
+    python docs/draw_table.py artemis --runs results/2026-11-23-artemis-standard
 
 writes docs/tables/artemis.tex (what `rewild4d-bench table artemis --format latex` prints) and docs/tables/artemis.png.
 All words behind the name go to `rewild4d-bench table`. Needs pdflatex with booktabs (Debian: texlive-latex-recommended)

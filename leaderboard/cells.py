@@ -5,9 +5,10 @@ from collections.abc import Callable, Sequence
 from itertools import islice
 
 from rewild4d.leaderboard.layout import Cell
-from rewild4d.leaderboard.records import RunRecord, Score
+from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.statistics import estimate, paired
 from rewild4d.leaderboard.titles import digits_of
+from rewild4d.metrics.score import Score
 
 Values = dict[str, dict[int, float]]
 """Case -> seed -> value."""

@@ -15,8 +15,9 @@ from rewild4d.leaderboard.statistics import Estimate, estimate, ranks
 from rewild4d.leaderboard.tables import Entrant, Frame, by_protocol, cases_of, kind_of, rests_on
 from rewild4d.leaderboard.titles import TITLES, digits_of
 from rewild4d.leaderboard.variants import latest, marks, variants
+from rewild4d.metrics.names import KINDS
 from rewild4d.metrics.samples import Distance
-from rewild4d.metrics.sets import FILE, KINDS, Compared, distances, pool, read_features
+from rewild4d.metrics.sets import FILE, Compared, distances, pool, read_features
 
 NAMES = {name: kind for kind, scores in KINDS.items() for name in scores}
 """Score -> the kind of sets that it is a distance of."""

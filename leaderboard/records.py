@@ -10,31 +10,10 @@ import msgspec
 from rewild4d.errors import UserError
 from rewild4d.files import digest, write_text
 from rewild4d.metrics.samples import Distance
+from rewild4d.metrics.score import Score
 
 SCHEMA = 1
 FILE = "record.json"
-
-
-class Score(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One measured quantity.
-
-    Attributes:
-        value: the mean over ``count`` items, or None where it could not be computed; ``note`` then says why.
-        unit: "dB", "1" for a ratio, ...
-        better: "higher" or "lower".
-        count: how many items the mean is over.
-        per_item: the value of each item, in the order of the record's ``items``; None for an item without a value.
-        note: why there is no value, or what was left out of the mean.
-        floor: what a perfect result would get, where that is not the best value there is; None where nobody knows.
-    """
-
-    value: float | None
-    unit: str
-    better: str
-    count: int
-    per_item: list[float | None] = []
-    note: str = ""
-    floor: float | None = None
 
 
 class Timing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -57,7 +36,7 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         data: digests of the clip and of the truth, and the folder they came from.
         prior: name, provenance, digest and the quality of its fit; what the run asked for ("choice", "config").
         protocol: name, digest and settings.
-        coverage: what the numbers lean on (see rewild4d.coverage).
+        coverage: what the numbers lean on (see rewild4d.evaluation.coverage).
         items: label of each held-out image, as in ``Score.per_item`` of image scores.
         distances: between sets of novel views and the input video, with all that decides their values.
         alignments: by which shapes were laid on the truth.

@@ -15,7 +15,7 @@ from rewild4d.leaderboard.specs import Reported, ReportedCell
 from rewild4d.leaderboard.statistics import Estimate, estimate, ranks
 from rewild4d.leaderboard.titles import LESS_IS_BETTER, TITLES, digits_of
 from rewild4d.leaderboard.variants import Variant, coverage_text, is_floor, latest, marks, variants
-from rewild4d.metrics.sets import KINDS
+from rewild4d.metrics.names import KINDS
 
 POOLED = "KID and FVD in rows of the mean are means over cases; `table --pooled` computes them over all cases at once."
 

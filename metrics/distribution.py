@@ -26,7 +26,7 @@ from rewild4d.metrics.samples import (
 )
 
 VIEWS = 16
-"""Azimuths of KID-V, uniform over one turn: 2 pi i / 16 (`rewild4d.orbit.orbit_cameras`)."""
+"""Azimuths of KID-V, uniform over one turn: 2 pi i / 16 (`rewild4d.cameras.orbit.orbit_cameras`)."""
 FEW_IMAGES = 64
 """Below this many images a side, the noise of KID is as large as the effect of a visible blur."""
 LEAST_SEQUENCES = 5

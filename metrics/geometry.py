@@ -16,6 +16,7 @@ from torch import Tensor
 from rewild4d.metrics.alignment import Alignment, Undetermined, align_sequence
 from rewild4d.metrics.clouds import as_points, box_diagonal, paired, subsample
 from rewild4d.metrics.distances import Chamfer, Distances, chamfer, distances, fscore
+from rewild4d.metrics.names import ALIGNMENTS, THRESHOLDS, Fit
 
 __all__ = [
     "Chamfer",
@@ -29,14 +30,8 @@ __all__ = [
     "fscore",
 ]
 
-THRESHOLDS = (1, 2, 5)
-"""Distances of the F-scores in percent of the truth's diagonal."""
 POINTS = 30_000
 """Points of a cloud that a comparison looks at; more are drawn by the seed."""
-
-Fit = Literal["sequence", "frame", "none"]
-SUFFIX: dict[Fit, str] = {"sequence": "", "frame": "_framewise", "none": "_unaligned"}
-"""End of a score's name: one similarity for all moments is the headline, the others are scores of their own."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +116,7 @@ def compare_sequence(
 
     Scores: "chamfer" (mean of the directions) with "chamfer_to_truth" and "chamfer_to_prediction", in the clouds' unit;
     "chamfer_relative", over the diagonal; "fscore_1", "fscore_2", "fscore_5" at so many percent of the diagonal. Each
-    name ends in `SUFFIX` of the fit. The relative ones do not depend on the unit.
+    name ends in `names.ALIGNMENTS` of the fit. The relative ones do not depend on the unit.
 
     Args:
         predictions: one cloud a moment, each finite, may be empty, [n, 3].
@@ -154,7 +149,7 @@ def compare_sequence(
     frames = [None if cloud is None else distances(cloud, truth) for cloud, truth in zip(moved, targets, strict=True)]
     floors, floor_note = _floors(truths, seconds, targets, given, points, seed)
     scores = {
-        name + SUFFIX[fit]: _measured(quantity, unit, better, frames, floors, reason)
+        name + ALIGNMENTS[fit]: _measured(quantity, unit, better, frames, floors, reason)
         for name, (quantity, unit, better) in _quantities(length).items()
     }
     return Comparison(scores, alignments, length, f"{_counts(predictions, truths, points, seed)}; {floor_note}")

@@ -18,15 +18,10 @@ from torch import Tensor
 from rewild4d.errors import UserError
 from rewild4d.files import atomic, digest
 from rewild4d.metrics.distribution import kid
+from rewild4d.metrics.names import KINDS
 from rewild4d.metrics.samples import Conditions, Distance, Features
 from rewild4d.metrics.video import feature_distances
 
-KINDS = {
-    "kid_v": {"kid_v": "KID-V"},
-    "fvd_f": {"fvd_f": "FVD-F", "kvd_f": "KVD-F"},
-    "fvd_diag": {"fvd_diag": "FVD-Diag", "kvd_diag": "KVD-Diag"},
-}
-"""What two sets are called -> the scores of them, in the order of `distances`, and what each distance calls itself."""
 FILE = "features.npz"
 _SIDES = ("prediction", "truth")
 
@@ -36,7 +31,7 @@ class Compared:
     """Two sets of images or clips that are not paired.
 
     Attributes:
-        kind: one of `KINDS`.
+        kind: one of `metrics.names.KINDS`.
         prediction: features of the renders.
         truth: features of the reference.
         conditions: that both share.

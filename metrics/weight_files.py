@@ -6,17 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from rewild4d.errors import UserError
-from rewild4d.metrics.weights import (
-    Copy,
-    Pinned,
-    by_name,
-    keep,
-    make,
-    network,
-    places,
-    read_pinned,
-    table,
-)
+from rewild4d.metrics.weights import Copy, Pinned, by_name, keep, make, network, places, read_pinned, table
 
 LISTED = "`rewild4d-bench weights --help` lists"
 

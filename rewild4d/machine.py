@@ -16,35 +16,34 @@ from rewild4d.files import digest
 from rewild4d.kernels.threads import thread_count
 from rewild4d.registry import load_method
 
-PACKAGES = (
-    "baselines",
-    "benchmarks",
-    "commands",
-    "datasets",
-    "kernels",
-    "leaderboard",
-    "metrics",
-    "metrics.networks",
-    "ours",
-    "ours.fused",
-    "priors",
-    "rasterizer",
-)
-
+TOP = ("rewild4d", "rewild4d.baselines", "rewild4d.datasets", "rewild4d.leaderboard", "rewild4d.metrics")
+"""Packages whose folders stand at the top of the repository."""
 SHOWING = ("benchmarks", "commands", "leaderboard")
-"""Packages that start runs and show what was found: editing a table's layout changes no result."""
+"""Packages that start runs and show results: editing a table's layout changes no result."""
 
 
 @cache
 def code_version() -> dict[str, str]:
-    """The package's version and a digest over the sources that decide a result, so that edited code never reuses an
-    old run."""
+    """Return the package's version and a digest of the sources that decide a result.
+
+    The digest is part of a run's id, so that edited code never reuses an old run.
+    """
     parts: list[str | bytes] = []
-    for package in ("rewild4d", *(f"rewild4d.{name}" for name in PACKAGES if name not in SHOWING)):
-        for file in sorted(resources.files(package).iterdir(), key=lambda entry: entry.name):
-            if file.name.endswith((".py", ".toml")):
-                parts += [package, file.name, file.read_bytes()]
+    for name, content in sorted(result_sources().items()):
+        parts += [name, content]
     return {"version": __version__, "sources": digest(*parts)[:16]}
+
+
+def result_sources() -> dict[str, bytes]:
+    """Read all sources that decide a result: path below the installed package -> content."""
+    found = {}
+    for package in TOP:
+        folder = Path(str(resources.files(package)))
+        for file in folder.rglob("*"):
+            name = Path(*package.split(".")[1:], file.relative_to(folder))
+            if file.suffix in (".py", ".toml") and name.parts[0] not in SHOWING:
+                found[name.as_posix()] = file.read_bytes()
+    return found
 
 
 def code_of(method: str) -> dict[str, str]:

@@ -20,12 +20,12 @@ METHODS = {
     "external": "rewild4d.baselines.external:External",
 }
 DATASETS = {
-    "artemis": "rewild4d.datasets.artemis:Artemis",
-    "davis": "rewild4d.datasets.davis:Davis",
-    "aptv2": "rewild4d.datasets.aptv2:AptV2",
-    "online": "rewild4d.datasets.online:Online",
+    "artemis": "rewild4d.datasets.artemis.reader:Artemis",
+    "davis": "rewild4d.datasets.video.davis:Davis",
+    "aptv2": "rewild4d.datasets.video.aptv2:AptV2",
+    "online": "rewild4d.datasets.video.online:Online",
 }
-BUILTIN = {"artemis": "rewild4d.datasets.synthetic:ensure"}
+BUILTIN = {"artemis": "rewild4d.datasets.builtin.synthetic:ensure"}
 """Data sets that make themselves on first use: a function that returns their folder."""
 
 

@@ -9,8 +9,9 @@ import pytest
 
 from rewild4d import cli
 from rewild4d.errors import UserError
-from rewild4d.image_scores import COLOR_METRICS, NAMES, summarize
-from rewild4d.protocol import find_protocol, load_protocols
+from rewild4d.evaluation.image_scores import summarize
+from rewild4d.evaluation.protocol import find_protocol, load_protocols
+from rewild4d.metrics.names import COLOR_METRICS, IMAGES
 from rewild4d.registry import load_method
 
 PROTOCOL = """
@@ -94,8 +95,8 @@ def test_a_package_that_cannot_be_used_hides_no_other(
 
 
 def test_every_image_score_says_which_way_is_better() -> None:
-    lower = {name for name in NAMES if summarize(name, [0.5]).better == "lower"}
-    assert lower == {name for name in NAMES if name.startswith("lpips")}
+    lower = {name for name in IMAGES if summarize(name, [0.5]).better == "lower"}
+    assert lower == {name for name in IMAGES if name.startswith("lpips")}
     assert set(COLOR_METRICS) == {"psnr", "ssim", "lpips_alex", "lpips_vgg"}
     with pytest.raises(KeyError):
         summarize("rmse", [0.5])

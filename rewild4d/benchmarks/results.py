@@ -114,4 +114,4 @@ def default_path(benchmark: str, device: torch.device | None = None) -> Path:
     """Where a result goes: named after benchmark, processor (or GPU) and day, so that a day's last run stays."""
     found = this_machine(device)
     processor = re.sub(r"[^a-z0-9]+", "-", found.get("gpu", found["processor"]).lower()).strip("-")
-    return Path("leaderboard", "speed", f"{benchmark}-{processor}-{datetime.now(UTC):%Y-%m-%d}.json")
+    return Path("results", "speed", f"{benchmark}-{processor}-{datetime.now(UTC):%Y-%m-%d}.json")

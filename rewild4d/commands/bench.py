@@ -39,7 +39,7 @@ class RasterizerOptions:
         peers: time the peers too.
         probes: measure peak memory too, and on the CPU start-up times (there in processes of their own).
         threads: that compute; torch's own number where it is left out.
-        out: file for the data; leaderboard/speed/rasterizer-<processor>-<day>.json where it is left out.
+        out: file for the data; results/speed/rasterizer-<processor>-<day>.json where it is left out.
         json: print the data as JSON, and nothing else, to standard output.
     """
 
@@ -66,7 +66,7 @@ class StepOptions:
         device: cpu or cuda.
         probes: measure peak memory too (on the CPU), in processes of their own.
         threads: that compute; torch's own number where it is left out.
-        out: file for the data; leaderboard/speed/step-<processor>-<day>.json where it is left out.
+        out: file for the data; results/speed/step-<processor>-<day>.json where it is left out.
         json: print the data as JSON, and nothing else, to standard output.
     """
 

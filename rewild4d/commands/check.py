@@ -6,12 +6,12 @@ from typing import Any
 
 from rewild4d.commands.shared import open_dataset
 from rewild4d.config import parse_flags
-from rewild4d.conformance import check_method
 from rewild4d.contracts import Finding
-from rewild4d.datasets.mask_check import SPLIT
-from rewild4d.datasets.parts import Parts
+from rewild4d.datasets.video.mask_check import SPLIT
+from rewild4d.datasets.video.parts import Parts
 from rewild4d.errors import UserError
-from rewild4d.runner import choose_cases
+from rewild4d.running.conformance import check_method
+from rewild4d.running.runner import choose_cases
 
 DESCRIPTION = """Verify a data set's folder (every fault named, not only the first), or that a method keeps its
 contract: same seed same result, save and load same pixels, resume, a clear error on an empty mask."""

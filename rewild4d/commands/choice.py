@@ -5,11 +5,11 @@ from fnmatch import fnmatchcase
 
 import msgspec
 
-from rewild4d import planning
 from rewild4d.config import preset_names
 from rewild4d.errors import UserError, unknown_name
+from rewild4d.evaluation.protocol import load_protocols
 from rewild4d.leaderboard.specs import Spec
-from rewild4d.protocol import load_protocols
+from rewild4d.running import planning
 
 
 def chosen(name: str, spec: Spec, choice: planning.Choice) -> Spec:

@@ -8,23 +8,24 @@ import msgspec
 import torch
 import tyro
 
-from rewild4d import describing
 from rewild4d.commands.shared import reader_of
 from rewild4d.config import parse_flags
-from rewild4d.coverage import coverage
 from rewild4d.errors import UserError
+from rewild4d.evaluation.coverage import coverage
+from rewild4d.evaluation.measuring import evaluate
+from rewild4d.evaluation.protocol import find_protocol
+from rewild4d.evaluation.refining import ready_to_score
 from rewild4d.leaderboard.records import FILE, RunRecord, Timing, read_record, to_json, write_record
 from rewild4d.leaderboard.tables import markdown
 from rewild4d.machine import code_of, machine, peak_memory_mib, pick_device
-from rewild4d.original_view import original_frames
 from rewild4d.progress import Progress
-from rewild4d.protocol import evaluate, find_protocol
 from rewild4d.rasterizer import pick_rasterizer
-from rewild4d.refining import ready_to_score
 from rewild4d.registry import load_method
-from rewild4d.runner import STAMP, fit_seconds
-from rewild4d.view import save_pictures
-from rewild4d.workers import share_cores, this_process
+from rewild4d.running import provenance
+from rewild4d.running.runner import STAMP, fit_seconds
+from rewild4d.running.workers import share_cores, this_process
+from rewild4d.visualize.original_view import original_frames
+from rewild4d.visualize.run_pictures import save_pictures
 
 DESCRIPTION = """Score saved reconstructions again, with the protocol that they were fitted for (another one could hold
 out what the method has seen), draw their pictures again and write their records anew."""
@@ -85,7 +86,7 @@ def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: s
             raise UserError(f"{place}: the {name} of {record.case} is not the one that {folder} was fitted to.")
     reconstruction = load_method(record.method).load(saved, device)
     begin = time.perf_counter()
-    shown = describing.shown_of(clip, record.prior)
+    shown = provenance.shown_of(clip, record.prior)
     progress = Progress(f"{record.case}: refine on held-out frames")
     reconstruction, clip, truth = ready_to_score(reconstruction, clip, truth, shown, progress)
     progress.close()
@@ -98,8 +99,8 @@ def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: s
     described = {"digest": protocol.digest, **msgspec.to_builtins(protocol)}
     renewed = msgspec.structs.replace(
         record, status="ok", error="", **found.keep(folder), coverage=coverage(clip, truth), pictures=pictures,
-        diagnostics=describing.diagnostics(reconstruction, shown, protocol.background), protocol=described,
-        marks=describing.marks(record.method, record.prior.get("choice", ""), reconstruction),
+        diagnostics=provenance.diagnostics(reconstruction, shown, protocol.background), protocol=described,
+        marks=provenance.marks(record.method, record.prior.get("choice", ""), reconstruction),
         code=code_of(record.method), machine=machine(device, rasterizer), timing=_timing(record, spent, seconds),
     )  # fmt: skip
     return read_record(write_record(renewed, folder))

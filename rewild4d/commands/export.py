@@ -6,17 +6,17 @@ from pathlib import Path
 
 import tyro
 
-from rewild4d import describing
+from rewild4d.cameras.recropping import all_moments, seen_by
 from rewild4d.commands.shared import reader_of, require_writable
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError
-from rewild4d.export import KINDS, export, parse_kinds, why_not
+from rewild4d.evaluation.protocol import find_protocol
+from rewild4d.io.export import KINDS, export, parse_kinds, why_not
 from rewild4d.leaderboard.records import FILE, read_record
 from rewild4d.machine import pick_device
-from rewild4d.protocol import find_protocol
 from rewild4d.rasterizer import pick_rasterizer, set_default
-from rewild4d.recropping import all_moments, seen_by
 from rewild4d.registry import load_method
+from rewild4d.running import provenance
 
 DESCRIPTION = """Write a run's reconstruction as files for other programs: Gaussians of every frame (ply), an animated
 skinned mesh (glb), cameras (OpenCV axes, JSON) and films (mp4). Of a video that is every frame which shows the animal,
@@ -56,7 +56,7 @@ def main(arguments: list[str]) -> int:
     protocol = find_protocol(record.dataset, record.protocol["name"])
     clip, truth = reader_of(options.run, record, options.data).load(record.case, protocol.selection)
     reconstruction = load_method(record.method).load(saved, device)
-    clip = all_moments(*seen_by(reconstruction, clip, truth, describing.shown_of(clip, record.prior)))
+    clip = all_moments(*seen_by(reconstruction, clip, truth, provenance.shown_of(clip, record.prior)))
     reasons = {kind: why_not(reconstruction, kind, clip) for kind in kinds}
     if all(reasons.values()):
         raise UserError(f"{options.run}: nothing can be written: {'; '.join(f'{k}: {r}' for k, r in reasons.items())}.")

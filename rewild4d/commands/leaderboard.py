@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from rewild4d import planning
 from rewild4d.commands.choice import chosen
 from rewild4d.commands.shared import require_writable
 from rewild4d.config import parse_flags
@@ -17,6 +16,7 @@ from rewild4d.leaderboard.records import RunRecord, find_records
 from rewild4d.leaderboard.site import Part, build_site
 from rewild4d.leaderboard.specs import load_specs
 from rewild4d.leaderboard.tables import difference_table, named_table
+from rewild4d.running import planning
 
 BUILD = """Make a static page from records alone: a sortable table per protocol, the named tables that have records, and
 a page per run with its settings, provenance, curves over time and pictures. Every folder of runs is a part of its own,

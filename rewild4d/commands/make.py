@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rewild4d.config import parse_flags
-from rewild4d.datasets.studio import make_artemis
+from rewild4d.datasets.rigs.studio import make_artemis
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.progress import Progress
 

@@ -9,14 +9,14 @@ import torch
 
 from rewild4d.commands.shared import open_dataset, require_writable
 from rewild4d.config import parse_flags
-from rewild4d.datasets.grabcut import rough_masks
-from rewild4d.datasets.grounded_sam import DETECTOR, SEGMENTER, grounded_masks
-from rewild4d.datasets.mask_check import SPLIT
-from rewild4d.datasets.mask_makers import MaskMaker, parse_boxes, run_program, write_masks
-from rewild4d.datasets.masks import list_images
+from rewild4d.datasets.masking.grabcut import rough_masks
+from rewild4d.datasets.masking.grounded_sam import DETECTOR, SEGMENTER, grounded_masks
+from rewild4d.datasets.masking.makers import MaskMaker, parse_boxes, run_program, write_masks
+from rewild4d.datasets.masking.masks import list_images
+from rewild4d.datasets.video.mask_check import SPLIT
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.machine import pick_device
-from rewild4d.runner import choose_cases
+from rewild4d.running.runner import choose_cases
 
 DESCRIPTION = """Make masks of the animal. --tool program runs any command that reads a folder of frames and writes a
 folder of masks; --tool grounded-sam2 uses Grounding DINO and SAM 2 (pip install -e '.[masks]'; their weights are on

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from rewild4d.config import parse_flags, preset_names
 from rewild4d.errors import UserError
+from rewild4d.evaluation.protocol import find_protocol, load_protocols
 from rewild4d.leaderboard.specs import load_specs
-from rewild4d.protocol import find_protocol, load_protocols
 from rewild4d.registry import BUILTIN, load_dataset, load_method, names
 
 

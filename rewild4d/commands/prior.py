@@ -7,9 +7,9 @@ from pathlib import Path
 from rewild4d.commands.shared import require_writable_file
 from rewild4d.config import parse_flags
 from rewild4d.contracts import Selection
-from rewild4d.datasets.online import Online
-from rewild4d.datasets.parts import Parts
-from rewild4d.datasets.whole_frames import whole_clip
+from rewild4d.datasets.video.online import Online
+from rewild4d.datasets.video.parts import Parts
+from rewild4d.datasets.video.whole_frames import whole_clip
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.priors.choose import Use, split_marks
 from rewild4d.priors.config import FOOTAGE

@@ -18,17 +18,17 @@ from rewild4d.commands.shared import (
     require_writable,
 )
 from rewild4d.config import load_preset, parse_flags, with_method_flags
-from rewild4d.datasets.parts import Parts
+from rewild4d.datasets.video.parts import Parts
 from rewild4d.errors import UserError
+from rewild4d.evaluation.protocol import find_protocol
 from rewild4d.leaderboard.records import RunRecord, to_json
 from rewild4d.leaderboard.tables import markdown
 from rewild4d.machine import pick_device
 from rewild4d.priors.choose import Use
-from rewild4d.protocol import find_protocol
 from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_dataset, load_method
-from rewild4d.runner import Entry, Plan, choose_cases, execute
-from rewild4d.workers import usable_cores
+from rewild4d.running.runner import Entry, Plan, choose_cases, execute
+from rewild4d.running.workers import usable_cores
 
 DESCRIPTION = """Fit a method on every case of a data set and score it on the views that it never saw.
 Finished runs are skipped and a killed one resumes. Without --data the built-in animals are made on first use.

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import msgspec
 
-from rewild4d import planning
 from rewild4d.commands.choice import cases_of, chosen
 from rewild4d.commands.shared import (
     check_numbers,
@@ -20,19 +19,20 @@ from rewild4d.commands.shared import (
 )
 from rewild4d.config import parse_flags
 from rewild4d.contracts import DatasetReader
-from rewild4d.datasets.parts import Parts
+from rewild4d.datasets.video.parts import Parts
 from rewild4d.errors import UserError
+from rewild4d.evaluation.protocol import Protocol
 from rewild4d.leaderboard.formats import markdown
 from rewild4d.leaderboard.layout import Table
 from rewild4d.leaderboard.records import RunRecord, to_json
 from rewild4d.leaderboard.specs import Spec, find_spec, load_specs
 from rewild4d.leaderboard.tables import named_table
 from rewild4d.machine import pick_device
-from rewild4d.protocol import Protocol
 from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_dataset
-from rewild4d.runner import Entry, Plan, choose_cases, execute, pieces
-from rewild4d.workers import usable_cores
+from rewild4d.running import planning
+from rewild4d.running.runner import Entry, Plan, choose_cases, execute, pieces
+from rewild4d.running.workers import usable_cores
 
 DESCRIPTION = """Fit what a table of leaderboard/tables (see `list`) needs and has no record for yet, on every case, and
 print it. Finished runs are skipped and a killed one resumes."""

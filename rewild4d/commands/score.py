@@ -4,17 +4,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from rewild4d.cloud_scoring import score_clouds
 from rewild4d.commands.shared import require_writable_file
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError, unknown_name
+from rewild4d.evaluation.cloud_scoring import score_clouds
+from rewild4d.evaluation.folders import score_pictures
+from rewild4d.evaluation.networks import FAMILIES, load_networks
+from rewild4d.evaluation.pairing import Inputs
+from rewild4d.evaluation.reports import Report, markdown, to_json
 from rewild4d.files import write_text
-from rewild4d.leaderboard.reports import Report, markdown, to_json
 from rewild4d.machine import pick_device
 from rewild4d.metrics.samples import Progress as ShowProgress
-from rewild4d.pairing import Inputs
 from rewild4d.progress import Progress
-from rewild4d.scoring import FAMILIES, load_networks, score_pictures
 
 DESCRIPTION = """Score a folder of images or clips, or a .ply file, against the truth. Images are matched by file name,
 clips (subfolders of frames, or videos) by their own; nothing is resized or cropped."""

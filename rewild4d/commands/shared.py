@@ -16,7 +16,7 @@ from rewild4d.priors.config import PRESETS, STANDARD
 from rewild4d.priors.landmarks import load_mapping
 from rewild4d.progress import Progress
 from rewild4d.registry import load_builtin, load_dataset, load_method
-from rewild4d.runner import Entry, Plan
+from rewild4d.running.runner import Entry, Plan
 
 SOURCE_FLAGS = ("masks", "parts", "start", "end", "fps", "keypoints")
 """Flags that a reader takes if its `options` name them."""

@@ -6,7 +6,6 @@ from typing import Annotated
 
 import tyro
 
-from rewild4d import planning
 from rewild4d.commands.choice import chosen
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError, unknown_name
@@ -16,7 +15,8 @@ from rewild4d.leaderboard.pooled import pooled_table, pooled_tables
 from rewild4d.leaderboard.records import RunRecord, find_records
 from rewild4d.leaderboard.specs import find_spec
 from rewild4d.leaderboard.tables import difference_table, named_table, protocol_tables
-from rewild4d.runner import choose_cases
+from rewild4d.running import planning
+from rewild4d.running.runner import choose_cases
 
 DESCRIPTION = """Print what was found, from the records in a folder: with a name one of the tables in leaderboard/tables
 (see `list`), rows averaged over the cases, the best bold, the second underlined; without one everything, a table per

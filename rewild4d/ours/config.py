@@ -205,7 +205,7 @@ class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     compact_power: Positive = 2.0
     """Exponent on the weights: a squared weight leaves less torso in every part."""
     compact_every: Count = 4
-    """Steps between evaluations; +.02 dB in the mean of 24 pairs with `deform.sampled` (leaderboard/results)."""
+    """Steps between evaluations; +.02 dB in the mean of 24 pairs with `deform.sampled` (results)."""
     smooth: Weight = 0.1
     """Smoothness of rendered normals (paper)."""
     smooth_every: Count = 2
@@ -229,7 +229,7 @@ class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     still: Weight = 0.0
     """Pose: steps between neighbouring frames as Geman and McClure weigh them: what drifts slowly is held still."""
     still_step: Positive = 1e-3
-    """Step of a rotation (half radians) or joint (diagonals) between drift and motion; tried: leaderboard/results."""
+    """Step of a rotation (half radians) or joint (diagonals) between drift and motion; tried: results."""
     rigid: Weight = 1.0
     """Deformed branch: change of distance between canonical neighbours; +0.3 dB on one horse (and fewer Gaussians)."""
     rigid_neighbours: Count = 5

@@ -18,13 +18,13 @@ from rewild4d.ours.coloring import initial_colors
 from rewild4d.ours.config import Config, Rates
 from rewild4d.ours.deform import Posed
 from rewild4d.ours.density import DensityControl
-from rewild4d.ours.geometry_losses import compact_loss, neighbours, rigid_loss, smooth_loss
 from rewild4d.ours.gradients import all_finite, clip_gradients
-from rewild4d.ours.losses import WINDOW, colour_losses, silhouette_loss, union_window
+from rewild4d.ours.losses.images import WINDOW, colour_losses, silhouette_loss, union_window
+from rewild4d.ours.losses.regularizers import compact_loss, neighbours, rigid_loss, smooth_loss
+from rewild4d.ours.losses.skeleton import neighbour_keys, stance
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.pose import blend_poses, pose_distance
 from rewild4d.ours.schedule import exponential, fade, ramp
-from rewild4d.ours.skeleton import neighbour_keys, stance
 from rewild4d.ours.symmetry import Key, Supervision, Target
 from rewild4d.ours.warmup import WarmUp
 from rewild4d.rasterizer import RasterInfo, rasterize

@@ -11,7 +11,7 @@ from rewild4d.errors import UserError
 from rewild4d.files import atomic, load_tensors, save_tensors
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.config import Config
-from rewild4d.ours.geometry_losses import relative_turn
+from rewild4d.ours.losses.regularizers import relative_turn
 from rewild4d.ours.model import Model
 from rewild4d.ours.motion import camera_between, frame_position, interpolate_similarity
 from rewild4d.ours.pose import Pose

@@ -9,7 +9,7 @@ from rewild4d.kernels.arrays import fits
 from rewild4d.ours.config import Skinning
 from rewild4d.ours.fused.field import sample_grid
 from rewild4d.ours.fused.simplex import softmax
-from rewild4d.ours.geometry_losses import tv_loss
+from rewild4d.ours.losses.regularizers import tv_loss
 
 
 class SkinningField(nn.Module):

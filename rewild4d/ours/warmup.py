@@ -10,10 +10,10 @@ from torch import Tensor, nn
 
 from rewild4d.ours.adam import Adam
 from rewild4d.ours.config import Config
-from rewild4d.ours.losses import blurred
+from rewild4d.ours.losses.images import blurred
+from rewild4d.ours.losses.skeleton import neighbour_keys, skeleton_losses
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import pose_distance
-from rewild4d.ours.skeleton import neighbour_keys, skeleton_losses
 from rewild4d.ours.symmetry import Key, Supervision
 from rewild4d.priors.motion import sample_surface
 from rewild4d.rasterizer import rasterize

@@ -18,23 +18,10 @@ from rewild4d.priors.io import seal
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.race import Race
-from rewild4d.priors.search import (
-    facings,
-    mask_rays,
-    single_view,
-    trajectory,
-    up_directions,
-    working_frame,
-)
+from rewild4d.priors.search import facings, mask_rays, single_view, trajectory, up_directions, working_frame
 from rewild4d.priors.silhouettes import overlap
 from rewild4d.priors.template import MIRROR, PARENTS, diagonal, quadruped
-from rewild4d.transforms import (
-    camera_in_object,
-    mirror_camera,
-    mirror_transforms,
-    similarity,
-    skin_points,
-)
+from rewild4d.transforms import camera_in_object, mirror_camera, mirror_transforms, similarity, skin_points
 from rewild4d.types import OBJECT_DIAGONAL, Clip, Frame, Prior
 
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from rewild4d.cameras.recropping import recropped
 from rewild4d.errors import UserError
 from rewild4d.priors.io import seal
 from rewild4d.priors.motion import camera_at, pose_at, world_camera
-from rewild4d.recropping import recropped
 from rewild4d.transforms import camera_in_object
 from rewild4d.types import Camera, Clip, Prior
 

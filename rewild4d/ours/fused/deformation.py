@@ -14,28 +14,9 @@ from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.halves import AVAILABLE
 from rewild4d.kernels.powers import LOG2_E, exp2
-from rewild4d.kernels.simd import (
-    LANES,
-    divide,
-    fma,
-    load,
-    maximum,
-    minimum,
-    splat,
-    square_root,
-    store,
-    take_ticket,
-)
+from rewild4d.kernels.simd import LANES, divide, fma, load, maximum, minimum, splat, square_root, store, take_ticket
 from rewild4d.kernels.threads import run, thread_count
-from rewild4d.ours.fused.layers import (
-    BLOCK,
-    Factors,
-    Layout,
-    backward_block,
-    forward_block,
-    pair_layers,
-    round_up,
-)
+from rewild4d.ours.fused.layers import BLOCK, Factors, Layout, backward_block, forward_block, pair_layers, round_up
 from rewild4d.ours.fused.queries import Reach, mix_back, read_query
 from rewild4d.ours.fused.sampled_rows import sample_rows
 

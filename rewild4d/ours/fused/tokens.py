@@ -11,17 +11,7 @@ from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.matrix import add_product, transpose
 from rewild4d.kernels.powers import LOG2_E, exp2
 from rewild4d.kernels.rows import add_row_sums, sum_rows
-from rewild4d.kernels.simd import (
-    LANES,
-    absolute,
-    divide,
-    fma,
-    load,
-    maximum,
-    select_gt,
-    splat,
-    store,
-)
+from rewild4d.kernels.simd import LANES, absolute, divide, fma, load, maximum, select_gt, splat, store
 
 NORM_EPS = 1e-5
 """As `torch.nn.LayerNorm` has it."""

@@ -1,0 +1,1 @@
+"""Read, check and write folders in the Artemis / Dynamic Furry Animals format."""

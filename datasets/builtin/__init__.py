@@ -1,0 +1,1 @@
+"""Make the built-in procedural animals."""

@@ -1,0 +1,160 @@
+"""Named points that people annotated: BADJA's joints on DAVIS, and COCO-like ones as in APTv2 and APT-36K."""
+
+import json
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rewild4d.datasets.keypoints.entries import Entry, LeftOut, Unusable, numbers, short, shown
+from rewild4d.errors import UserError
+from rewild4d.types import Crop, Keypoints
+
+BADJA = {
+    8: "right_front_upper", 9: "right_front_middle", 10: "right_front_paw",
+    12: "left_front_upper", 13: "left_front_middle", 14: "left_front_paw", 15: "neck",
+    18: "right_hind_upper", 19: "right_hind_middle", 20: "right_hind_paw",
+    22: "left_hind_upper", 23: "left_hind_middle", 24: "left_hind_paw",
+    25: "tail_start", 28: "tail_middle", 31: "tail_tip", 32: "jaw", 33: "nose", 35: "right_ear", 36: "left_ear",
+}  # fmt: skip
+"""The joints that BADJA annotates (of its 37) and what we call them."""
+BADJA_SIZE = (1920, 1080)
+"""BADJA's joints are (row, column) in frames of this size."""
+APT = (
+    "left_eye", "right_eye", "nose", "neck", "root_of_tail", "left_shoulder", "left_elbow", "left_front_paw",
+    "right_shoulder", "right_elbow", "right_front_paw", "left_hip", "left_knee", "left_back_paw", "right_hip",
+    "right_knee", "right_back_paw",
+)  # fmt: skip
+"""The keypoints of APTv2, APT-36K and AP-10K."""
+
+
+def read_json(path: Path) -> Any:
+    """The contents of a JSON file.
+
+    Raises:
+        UserError: it is missing or no JSON.
+    """
+    try:
+        return json.loads(path.read_bytes())
+    except OSError as error:
+        raise UserError(f"{path}: expected a JSON file, but: {error.strerror}.") from error
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path}: expected JSON, but it cannot be parsed ({error}).") from error
+
+
+OfFrames = tuple[list[Keypoints | None], str]
+"""The keypoints of each frame of a video, and a sentence on what their file holds but is not used ("" for nothing)."""
+
+
+def badja_joints(entry: Entry) -> tuple[str, list[tuple[float, float]], list[bool]]:
+    """An entry of BADJA's: the stem of its frame, and (column, row) and visibility of every joint.
+
+    Places are in a frame of `BADJA_SIZE`, pixel centres at +0.5.
+
+    Raises:
+        Unusable: one of them is not there, or they do not fit each other.
+    """
+    path, joints, visible = entry.get("image_path"), entry.get("joints"), entry.get("visibility")
+    if not isinstance(path, str):
+        raise Unusable("have no image_path", shown(entry, "image_path"))
+    if not isinstance(joints, list) or not joints:
+        raise Unusable("have no joints", shown(entry, "joints"))
+    if not isinstance(visible, list) or len(visible) != len(joints):
+        raise Unusable("have no visibility for each joint", shown(entry, "visibility"))
+    places = [numbers(joint) for joint in joints]
+    wrong = next((number for number, place in enumerate(places) if len(place) != 2), None)
+    if wrong is not None:
+        raise Unusable("have a joint that is no pair of numbers", f"joint {wrong} {short(joints[wrong])}")
+    return Path(path).stem, [(column + 0.5, row + 0.5) for row, column in places], [bool(value) for value in visible]
+
+
+def bounded(names: Sequence[str], points: Tensor, seen: Tensor, size: tuple[int, int]) -> Keypoints:
+    """Keypoints of which those outside their frame are not visible.
+
+    Args:
+        names: [n].
+        points: (column, row) in pixels, [n, 2].
+        seen: which of them the file says are visible, bool, [n].
+        size: width and height of the frame.
+    """
+    return Keypoints(tuple(names), points, seen & inside(points, size))
+
+
+def inside(points: Tensor, size: tuple[int, int]) -> Tensor:
+    """Which points lie in their frame, bool, [n]; one that is not finite does not."""
+    return ((points >= 0) & (points <= torch.tensor(size))).all(dim=1)
+
+
+def not_used(path: Path, found: Sequence[Keypoints | None], size: tuple[int, int], left: LeftOut) -> str:
+    """A sentence on the points that a file marks as seen but that lie outside their frame, and on the entries that were
+    left out; "" where there are none.
+
+    Args:
+        path: of the file.
+        found: of each frame.
+        size: width and height of the frames in pixels.
+        left: entries of the file.
+    """
+    count = sum(int((~inside(keypoints.points, size)).sum()) for keypoints in found if keypoints is not None)
+    outside = [f"{count} keypoints outside their frame taken as not visible"] if count else []
+    return "; ".join([*outside, *(f"{path.name}: {sentence}" for sentence in left.told())])
+
+
+def read_badja(path: Path, stems: Sequence[str], size: tuple[int, int]) -> OfFrames:
+    """BADJA's joints of one sequence, those outside the frame not visible.
+
+    Args:
+        path: joint_annotations/<sequence>.json.
+        stems: of the frames that are used, in order.
+        size: width and height of the frames that are used.
+
+    Raises:
+        UserError: no such file, or not what BADJA writes.
+    """
+    content, left = read_json(path), LeftOut()
+    named = {}
+    if isinstance(content, list):
+        named = dict(left.usable(content, partial(_named_joints, size=size)))
+    if not named:
+        reasons = "; ".join(left.told()) or "no list of such"
+        raise UserError(f"{path}: expected BADJA's list of image_path, joints[37] and visibility[37], got {reasons}.")
+    found = [named.get(stem) for stem in stems]
+    return found, not_used(path, found, size, left)
+
+
+def _named_joints(entry: Entry, size: tuple[int, int]) -> tuple[str, Keypoints]:
+    stem, places, visible = badja_joints(entry)
+    if len(places) <= max(BADJA):
+        raise Unusable("have fewer joints than 37", f"{len(places)} joints")
+    scale = torch.tensor((size[0] / BADJA_SIZE[0], size[1] / BADJA_SIZE[1]))
+    points, seen = torch.tensor([places[i] for i in BADJA]) * scale, torch.tensor([visible[i] for i in BADJA])
+    # a joint that nobody saw may lie anywhere, which nobody need be told
+    points[~seen & ~inside(points, size)] = 0.0
+    return stem, bounded(tuple(BADJA.values()), points, seen, size)
+
+
+def coco_keypoints(values: Sequence[float], names: Sequence[str], size: tuple[int, int]) -> tuple[Keypoints, int]:
+    """One annotation's keypoints; those outside the image are taken as not visible.
+
+    Args:
+        values: x, y, v of each, [3 n].
+        names: [n].
+        size: width and height of the image.
+
+    Returns:
+        The keypoints and how many lay outside the image.
+    """
+    table = torch.tensor(values, dtype=torch.float32).reshape(len(names), 3)
+    seen = table[:, 2] > 0
+    found = bounded(names, table[:, :2] + 0.5, seen, size)
+    return found, int((seen & ~found.visible).sum())
+
+
+def in_crop(keypoints: Keypoints | None, crop: Crop, size: int) -> Keypoints | None:
+    """The same points in the pixels of a crop."""
+    if keypoints is None:
+        return None
+    return Keypoints(keypoints.names, crop.from_original(keypoints.points, size), keypoints.visible)

@@ -1,0 +1,1 @@
+"""Read masks, and make them where there are none."""

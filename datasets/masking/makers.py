@@ -1,0 +1,152 @@
+"""Masks for videos that have none: what a maker of masks gets and gives, and any program as one.
+
+A maker gets the frames one after the other and gives a mask for each. Another program is one through folders: we write
+frames/00000.png, ..., it writes masks/00000.png, ..., and a command line joins the two.
+"""
+
+import math
+import shlex
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from rewild4d.datasets.masking.masks import list_images, match_masks, open_masks
+from rewild4d.errors import UserError
+from rewild4d.files import atomic
+
+Box = tuple[float, float, float, float]
+"""Left, top, width, height in pixels."""
+PLACES = ("frames", "masks", "boxes")
+"""What a command line may name in braces."""
+
+
+@dataclass(frozen=True)
+class Unmasked:
+    """Frames that need masks.
+
+    Attributes:
+        title: what a sentence calls them.
+        stems: name of each frame's mask file, without suffix.
+        size: width and height.
+        images: every frame, uint8 [h, w, 3].
+        boxes: of the animal, by frame number; empty where nobody knows one.
+    """
+
+    title: str
+    stems: tuple[str, ...]
+    size: tuple[int, int]
+    images: Callable[[], Iterator[np.ndarray]]
+    boxes: dict[int, Box]
+
+
+MaskMaker = Callable[[Unmasked], Iterator[np.ndarray]]
+"""Frames -> a mask for each, uint8 [h, w], 0 where the animal is not."""
+
+
+def write_masks(source: Unmasked, maker: MaskMaker, folder: Path) -> tuple[list[Path], int]:
+    """Write folder/<stem>.png for every frame.
+
+    Returns:
+        The files, and in how many of them there is no animal.
+
+    Raises:
+        UserError: what the maker raises, or a folder that cannot be written.
+    """
+    paths, empty = [], 0
+    for stem, mask in zip(source.stems, maker(source), strict=False):
+        paths.append(folder / f"{stem}.png")
+        _write(paths[-1], mask)
+        empty += not (mask > 127).any()
+    if len(paths) < len(source.stems):
+        raise UserError(f"{source.title}: expected a mask for each of {len(source.stems)} frames, got {len(paths)}.")
+    return paths, empty
+
+
+def run_program(command: str) -> MaskMaker:
+    """Any program as a maker of masks.
+
+    Args:
+        command: with {frames} and {masks} in it, for the folders that it reads and writes; {boxes}, if it is there,
+            stands for a text file with lines "frame left top width height".
+
+    Raises:
+        UserError: a command without {frames} or {masks}, or with another name in braces.
+    """
+    try:
+        words = shlex.split(command)
+        said = [word.format(**dict.fromkeys(PLACES, Path())) for word in words]
+    except (KeyError, IndexError, ValueError, AttributeError, TypeError) as error:
+        names = ", ".join(f"{{{name}}}" for name in PLACES)
+        raise UserError(f"--command: expected a command line with {names} in it, got '{command}' ({error}).") from error
+    if not said or not all(f"{{{name}}}" in command for name in PLACES[:2]):
+        raise UserError(f"--command: expected a command line with {{frames}} and {{masks}} in it, got '{command}'.")
+
+    def maker(source: Unmasked) -> Iterator[np.ndarray]:
+        with tempfile.TemporaryDirectory(prefix="rewild4d-masks-") as name:
+            places = {place: Path(name) / place for place in PLACES}
+            places["frames"].mkdir()
+            places["masks"].mkdir()
+            stems = [f"{index:05d}" for index in range(len(source.stems))]
+            for stem, image in zip(stems, source.images(), strict=True):
+                _write(places["frames"] / f"{stem}.png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+            lines = [f"{index} {' '.join(f'{x:g}' for x in box)}\n" for index, box in sorted(source.boxes.items())]
+            places["boxes"].write_text("".join(lines))
+            _call([word.format(**places) for word in words])
+            written = list_images(places["masks"])
+            if not written:
+                raise UserError(f"{words[0]}: expected a mask for each of {len(stems)} frames, but it wrote none.")
+            files, _ = match_masks(written, stems, places["masks"])
+            missing = files.count(None)
+            if missing:
+                raise UserError(
+                    f"{words[0]}: expected a mask for each of {len(stems)} frames, but {missing} are missing (first: "
+                    f"{stems[files.index(None)]}.png)."
+                )
+            masks = open_masks(files)
+            for index in range(len(stems)):
+                mask = masks.read(index, None, source.size)
+                assert mask is not None
+                yield mask
+
+    return maker
+
+
+def _call(words: list[str]) -> None:
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, errors="replace", stdin=subprocess.DEVNULL)
+    except OSError as error:
+        raise UserError(f"{words[0]}: expected a program that can be run, but: {error.strerror}.") from error
+    if done.returncode:
+        said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1].rstrip(".")
+        raise UserError(f"{words[0]}: the program ended with status {done.returncode} and said: {said}.")
+
+
+def parse_boxes(texts: tuple[str, ...], count: int) -> dict[int, Box]:
+    """Boxes by frame number from "left,top,width,height" (frame 0) or "frame:left,top,width,height".
+
+    Raises:
+        UserError: another form, an empty box, or a frame that is not there.
+    """
+    boxes = {}
+    for text in texts:
+        before, colon, numbers = text.rpartition(":")
+        try:
+            frame = int(before) if colon else 0
+            left, top, width, height = (float(number) for number in numbers.split(","))
+        except ValueError as error:
+            raise UserError(f"--box: expected left,top,width,height or frame:left,..., got '{text}'.") from error
+        is_finite = all(map(math.isfinite, (left, top, width, height)))
+        if not (0 <= frame < count and is_finite and width > 0 and height > 0):
+            raise UserError(f"--box: expected a box with a size, in a frame from 0 to {count - 1}, got '{text}'.")
+        boxes[frame] = (left, top, width, height)
+    return boxes
+
+
+def _write(path: Path, image: np.ndarray) -> None:
+    with atomic(path) as temporary:
+        cv2.imwrite(str(temporary), image)

@@ -1,0 +1,1 @@
+"""Read rigged, animated glTF files and render them with exact truth."""

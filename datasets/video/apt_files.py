@@ -1,0 +1,217 @@
+"""Annotations of APTv2 and APT-36K: COCO-like JSON whose subjects are (video, track) pairs.
+
+Every split file of APTv2 lists all images, so clips are found through annotations. APT-36K has Windows paths.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from rewild4d.datasets.keypoints.entries import (
+    Entry,
+    LeftOut,
+    Unusable,
+    box_of,
+    by_id,
+    image_of,
+    listed,
+    look_up,
+    numbers,
+    shown,
+    triples_of,
+)
+from rewild4d.datasets.keypoints.keypoints import APT, coco_keypoints, read_json
+from rewild4d.errors import UserError
+from rewild4d.types import Keypoints
+
+NAMES = {"howling-monkey": "howling monkey", "raccon": "raccoon", "hourse": "horse"}
+"""Spellings of APT-36K and what they mean."""
+
+UNLISTED = "animal of no listed category"
+"""The species where no annotation of an animal names a category that its file lists."""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One animal in one frame.
+
+    Attributes:
+        file: path of the image as the data set's own folder has it: "easy/10gorilla/v12C1/0000.jpg".
+        number: of the frame in its clip.
+        size: width and height that the annotation states.
+        box: left, top, width, height in pixels.
+        keypoints: in the frame's pixels.
+    """
+
+    file: PurePosixPath
+    number: int
+    size: tuple[int, int]
+    box: tuple[float, float, float, float]
+    keypoints: Keypoints
+
+
+@dataclass
+class Subject:
+    """One animal in one clip."""
+
+    name: str
+    track: int
+    species: str
+    sightings: list[Sighting] = field(default_factory=list)
+    outside: int = 0
+
+
+@dataclass(frozen=True)
+class Annotations:
+    """All subjects of a data set, and what did not fit, a sentence each.
+
+    Attributes:
+        subjects: by name.
+        faults: of all files.
+        clip_faults: of each clip, by its folder; under "" those of which nobody knows the clip.
+    """
+
+    subjects: dict[str, Subject]
+    faults: tuple[str, ...]
+    clip_faults: dict[str, list[str]]
+
+
+def read_annotations(root: Path) -> Annotations:
+    """Every subject of every split, by "<clip folder>@<track>".
+
+    Raises:
+        UserError: no annotation file, one that is damaged or of another kind, or no annotation that fits an image.
+    """
+    files = sorted({*root.glob("annotations*/*.json"), *root.glob("*.json")})
+    subjects: dict[str, Subject] = {}
+    faults: list[str] = []
+    clip_faults: dict[str, list[str]] = {}
+    seen: set[tuple[str, int]] = set()
+    read = 0
+    for path in files:
+        table = read_json(path)
+        if not isinstance(table, dict) or "annotations" not in table:
+            continue
+        read += 1
+        left = _add(path, table, subjects, seen)
+        faults += [f"{path.name}: {sentence}" for sentence in left.told()]
+        for clip in left.groups:
+            clip_faults.setdefault(clip, []).extend(f"{path.name}: {sentence}" for sentence in left.told(clip))
+    if not read:
+        raise UserError(f"{root / 'annotations'}: expected annotation files of APTv2 or APT-36K (.json), got none.")
+    if not subjects:
+        raise UserError(f"{root}: expected annotations of animals in images, got none: {'; '.join(faults) or 'empty'}.")
+    for subject in subjects.values():
+        subject.sightings.sort(key=lambda sighting: (sighting.number, str(sighting.file)))
+    return Annotations(dict(sorted(subjects.items())), tuple(faults), clip_faults)
+
+
+def _add(path: Path, table: dict[str, Any], subjects: dict[str, Subject], seen: set[tuple[str, int]]) -> LeftOut:
+    """Add one file's annotations; gives those that did not fit.
+
+    Args:
+        path: of the file.
+        table: what it holds.
+        subjects: by name, which gain sightings.
+        seen: file and track of every sighting so far: splits overlap.
+    """
+    try:
+        entries = listed(table, "annotations")
+        images, kinds = (
+            by_id(listed(table, "images"), "file_name", str),
+            by_id(listed({"categories": []} | table, "categories"), "name", str),
+        )
+    except ValueError as error:
+        raise UserError(f"{path}: expected COCO-like annotations, got {error}.") from error
+    for key in ("video_id", "track_id"):
+        if entries and not any(isinstance(entry, dict) and key in entry for entry in entries):
+            raise UserError(f"{path}: expected annotations with video_id and track_id, got none with {key}.")
+    left = LeftOut()
+    for species, track, outside, sighting in left.usable(entries, partial(_sighting, images, kinds)):
+        if (str(sighting.file), track) in seen:
+            continue
+        seen.add((str(sighting.file), track))
+        name = f"{sighting.file.parent}@{track}"
+        subject = subjects.setdefault(name, Subject(name, track, species))
+        subject.species = species if subject.species == UNLISTED else subject.species
+        subject.outside += outside
+        subject.sightings.append(sighting)
+    return left
+
+
+def _sighting(images: dict[Any, Entry], kinds: dict[Any, Entry], entry: Entry) -> tuple[str, int, int, Sighting]:
+    """Species, track, the number of keypoints outside the image, and the sighting of one annotation.
+
+    Raises:
+        Unusable: one that is not there or makes no sense.
+    """
+    image, kind = image_of(images, entry), look_up(kinds, entry, "category_id")
+    species = str(kind["name"]) if kind else UNLISTED
+    file = clean_path(image["file_name"])
+    try:
+        size = _size(image)
+        box = _within(box_of(entry), size, entry)
+        values = triples_of(entry, len(APT)) if entry.get("keypoints") else [0.0] * (3 * len(APT))
+        keypoints, outside = coco_keypoints(values, APT, size)
+        return (
+            NAMES.get(species, species),
+            _track(entry),
+            outside,
+            Sighting(file, _number(file.stem), size, box, keypoints),
+        )
+    except Unusable as fault:
+        fault.group = str(file.parent)
+        raise
+
+
+def _size(image: Entry) -> tuple[int, int]:
+    try:
+        return int(image["width"]), int(image["height"])
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        got = f"image_id {image['id']} with {shown(image, 'width')} and {shown(image, 'height')}"
+        raise Unusable("name an image without width and height in pixels", got) from error
+
+
+def _track(entry: Entry) -> int:
+    """The number of an animal in its clip; nobody may guess it."""
+    found = numbers([entry.get("track_id")])
+    if not found or not found[0].is_integer():
+        raise Unusable("have no whole number as track_id", shown(entry, "track_id"))
+    return int(found[0])
+
+
+def _within(
+    box: tuple[float, float, float, float], size: tuple[int, int], entry: Entry
+) -> tuple[float, float, float, float]:
+    """The part of a box that lies in its image."""
+    left, top, width, height = box
+    right, bottom = min(left + width, size[0]), min(top + height, size[1])
+    left, top = max(left, 0.0), max(top, 0.0)
+    if not (right > left and bottom > top):  # also where a number is NaN
+        raise Unusable("have no box inside their image", shown(entry, "bbox"))
+    return left, top, right - left, bottom - top
+
+
+def clean_path(text: str) -> PurePosixPath:
+    """A file name as the data set's own folder has it.
+
+    APT-36K's "D:\\Animal_pose\\AP-36k-patr1\\29wolf\\v3c2\\frame7.jpg" becomes "29wolf/v3c2/frame7.jpg".
+    """
+    path = PurePosixPath(text.encode("ascii", "ignore").decode().replace("\\", "/"))
+    if re.match(r"^[A-Za-z]:", str(path)) or path.is_absolute():
+        return PurePosixPath(*path.parts[-3:])
+    return path
+
+
+def _number(stem: str) -> int:
+    digits = re.findall(r"[0-9]+", stem)
+    return int(digits[-1]) if digits else 0
+
+
+def image_places(root: Path, file: PurePosixPath) -> Iterator[Path]:
+    """Where an image may lie."""
+    for folder in ("data", "", "images"):
+        yield root / folder / file

@@ -1,0 +1,249 @@
+"""Reads DAVIS 2016 and 2017 (Perazzi et al. 2016; Pont-Tuset et al. 2017).
+
+    JPEGImages/<480p | ...>/<sequence>/00000.jpg
+    Annotations/<480p | ...>/<sequence>/00000.png
+    badja/<sequence>.json
+
+Masks of 2016 are grey (0 and 255) and hold one foreground; those of 2017 are indexed, hold object ids and 255 for void.
+A sequence with several objects gives a case for each, "dogs-jump@2", beside the one of all together, "dogs-jump".
+BADJA's joints are read where they lie beside it.
+"""
+
+import tomllib
+from collections.abc import Iterator, Sequence
+from functools import cached_property, partial
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rewild4d.contracts import Finding, Selection
+from rewild4d.datasets.keypoints.files import read_keypoints
+from rewild4d.datasets.keypoints.keypoints import read_badja
+from rewild4d.datasets.masking.masks import MaskFiles, list_images, match_masks, open_masks
+from rewild4d.datasets.video.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
+from rewild4d.datasets.video.mask_check import check_videos
+from rewild4d.datasets.video.parts import with_parts
+from rewild4d.datasets.video.wild import Moment, Video, files_identity, original_images, split_video
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.types import Clip, Keypoints, Truth
+
+FPS = 24.0
+RESOLUTIONS = ("480p", "1080p", "Full-Resolution")
+"""Of which the first that is there is read."""
+LICENCE = "CC BY-NC 4.0 (DAVIS, Perazzi et al. 2016, Pont-Tuset et al. 2017): attribute, non-commercial"
+
+
+Facts = dict[str, Any]
+"""What davis.toml says of a sequence."""
+
+
+def known_sequences() -> dict[str, Facts]:
+    """What is known of the animals in DAVIS, by sequence (davis.toml)."""
+    return tomllib.loads((resources.files("rewild4d.datasets.video") / "davis.toml").read_text(encoding="utf-8"))
+
+
+class Davis:
+    """DAVIS 2016 and 2017: real videos with true masks.
+
+    Keeps contracts.DatasetReader.
+
+    Args:
+        root: the folder that holds JPEGImages (or a folder DAVIS that does).
+        masks: other masks for the frames that methods see, <sequence>/00000.png; held-out frames are judged by DAVIS's
+            own where they are there.
+        keypoints: a file of them (`keypoint_files`) in place of BADJA's.
+        parts: of the masks that methods see (`parts.Parts`); held-out frames are judged by all of DAVIS's.
+
+    Raises:
+        UserError: no such folder, or no frames in it.
+    """
+
+    options = ("masks", "keypoints", "parts")
+    keypoint_mapping, keypoint_use = "badja", "none"
+
+    def __init__(
+        self, root: Path, masks: Path | None = None, keypoints: Path | None = None, parts: str = "auto"
+    ) -> None:
+        self.root = root / "DAVIS" if (root / "DAVIS" / "JPEGImages").is_dir() else root
+        self.masks, self.keypoints = (Path(path) if path else None for path in (masks, keypoints))
+        self.parts = parts
+        images = self.root / "JPEGImages"
+        self.resolution = next((name for name in RESOLUTIONS if (images / name).is_dir()), None)
+        if self.resolution is None:
+            raise UserError(f"{images}: expected frames in one of {', '.join(RESOLUTIONS)}, got none.")
+        if self.masks is not None and not self.masks.is_dir():
+            raise UserError(f"{self.masks}: expected a folder of masks, got no such folder.")
+
+    @property
+    def licence(self) -> str:
+        return LICENCE
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The options that differ from their defaults, for the record."""
+        given = {"masks": self.masks, "keypoints": self.keypoints}
+        paths = {name: str(path.resolve()) for name, path in given.items() if path is not None}
+        return paths | ({"parts": self.parts} if self.parts != "auto" else {})
+
+    def cases(self, selection: Selection) -> list[str]:
+        """Every sequence with masks; where it has several objects, "<sequence>@<id>" for each of them too."""
+        return list(self._table)
+
+    def default_cases(self, selection: Selection) -> list[str]:
+        """The quadrupeds among the known sequences (all sequences where there is none), one object at a time.
+
+        Objects that are known to be people or things are none of them (`animals` in davis.toml).
+        """
+        known = known_sequences()
+        several = {sequence for sequence, number in self._table.values() if number is not None}
+        single = {
+            case: sequence for case, (sequence, number) in self._table.items() if number or sequence not in several
+        }
+        fit = [case for case, name in single.items() if known.get(name, {}).get("quadruped", name in known)]
+        chosen = [case for case in fit if not self._strangers(case)]
+        return chosen or list(single)
+
+    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
+        """Decode one case.
+
+        Raises:
+            UserError: no such case, or files of it that cannot be used.
+        """
+        return split_video(self.video(case), selection)
+
+    def originals(self, case: str, selection: Selection) -> Iterator[np.ndarray]:
+        """The whole frames that the images of a clip were cut from, uint8 [h, w, 3]; for pictures alone.
+
+        Raises:
+            UserError: as `load`.
+        """
+        return original_images(self.video(case), selection)
+
+    def video(self, case: str) -> Video:
+        """The frames and masks of a case.
+
+        Raises:
+            UserError: as `load`.
+        """
+        if case not in self._table:
+            raise unknown_name("case", case, self._table)
+        sequence, object_id = self._table[case]
+        files = self._frames(sequence)
+        size = image_size(files[0])
+        own = self._own_masks(sequence, files)
+        given, note = self._given_masks(sequence, files, object_id)
+        used, every = given or own, range(len(files))
+        joints, outside = self._joints(sequence, files, size)
+        facts = known_sequences().get(sequence, {})
+        species, strangers = str(facts.get("species", sequence)), self._strangers(case)
+        told = f"no {species}: object {', '.join(map(str, strangers))} of its masks" if strangers else ""
+        notes = (note, outside, str(facts.get("note", "")), _odd_animal(facts), told)
+        video = Video(
+            title=str(files[0].parent), name=case, species=case if object_id in strangers else species, fps=FPS,
+            licence=LICENCE, identity=files_identity(*files, *own.files, *used.files) + f" {object_id}", size=size,
+            moments=tuple(Moment(file.name, i / FPS, joints.get(file.stem)) for i, file in enumerate(files)),
+            images=partial(read_images, files, size),
+            masks=partial(read_masks, used, object_id, every, size),
+            true_masks=partial(read_masks, own, object_id, every, size) if given or self.parts == "main" else None,
+            notes=tuple(text for text in notes if text),
+        )  # fmt: skip
+        # what DAVIS itself calls one object is one
+        is_named = given is None or (object_id is None and len(given.ids) > 1)
+        return with_parts(video, self.parts, is_named)
+
+    def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
+        """Verify some sequences, each file decoded; contact sheets go to ``sheets``."""
+        return check_videos(self, cases, sheets)
+
+    @cached_property
+    def _table(self) -> dict[str, tuple[str, int | None]]:
+        """Case -> sequence and object id (None: the whole foreground)."""
+        table: dict[str, tuple[str, int | None]] = {}
+        for folder in sorted((self.root / "JPEGImages" / str(self.resolution)).iterdir()):
+            masks = self._mask_folder(folder.name)
+            if not folder.is_dir() or masks is None:
+                continue
+            ids = open_masks(list_images(masks)[:1]).ids  # the first frame names all objects
+            table[folder.name] = (folder.name, None)
+            if len(ids) > 1:
+                table |= {f"{folder.name}@{number}": (folder.name, number) for number in ids}
+        if not table:
+            raise UserError(f"{self.root / 'Annotations'}: expected masks of the sequences in JPEGImages, got none.")
+        return table
+
+    def _mask_folder(self, sequence: str) -> Path | None:
+        folders = [self.root / name / str(self.resolution) / sequence for name in _ANNOTATIONS]
+        given = [self.masks / sequence] if self.masks else []
+        return next((folder for folder in (*folders, *given) if folder.is_dir() and list_images(folder)), None)
+
+    def _frames(self, sequence: str) -> list[Path]:
+        folder = self.root / "JPEGImages" / str(self.resolution) / sequence
+        files = list_images(folder, FRAME_SUFFIXES)
+        if not files:
+            raise UserError(f"{folder}: expected frames ({', '.join(FRAME_SUFFIXES)}), got none.")
+        return files
+
+    def _own_masks(self, sequence: str, files: list[Path]) -> MaskFiles:
+        """DAVIS's masks; none where it has none."""
+        for name in _ANNOTATIONS:
+            folder = self.root / name / str(self.resolution) / sequence
+            if folder.is_dir() and (found := list_images(folder)):
+                return open_masks(match_masks(found, [file.stem for file in files], folder)[0])
+        return MaskFiles((None,) * len(files), ())
+
+    def _given_masks(self, sequence: str, files: list[Path], object_id: int | None) -> tuple[MaskFiles | None, str]:
+        """Masks of --masks, and a sentence on them; those without object ids are of the one animal of the case.
+
+        Raises:
+            UserError: they hold object ids, but not this one.
+        """
+        if self.masks is None:
+            return None, ""
+        folder = self.masks / sequence
+        found, note = match_masks(list_images(folder), [file.stem for file in files], folder)
+        masks, note = open_masks(found), f"masks of the input from {folder}" + (f"; {note}" if note else "")
+        if object_id is None or object_id in masks.ids:
+            return masks, note
+        if masks.ids:
+            raise UserError(
+                f"{folder}: expected masks of object {object_id} for the case {sequence}@{object_id}, got those of "
+                f"{', '.join(map(str, masks.ids))} (masks of one animal alone hold 0 and 255)."
+            )
+        return masks, f"{note}; they hold no object ids: all of them is taken as object {object_id}"
+
+    def _joints(self, sequence: str, files: list[Path], size: tuple[int, int]) -> tuple[dict[str, Keypoints], str]:
+        """Keypoints by the frame's stem, and a sentence on what their file holds but is not used."""
+        stems = [file.stem for file in files]
+        own = next((file for file in _badja_files(self.root, sequence) if file.is_file()), None)
+        if self.keypoints is not None:
+            found, told = read_keypoints(self.keypoints, stems, size)
+        elif own is not None:
+            found, told = read_badja(own, stems, size)
+        else:
+            return {}, ""
+        known = {stem: points for stem, points in zip(stems, found, strict=True) if points is not None}
+        return known, told
+
+    def _strangers(self, case: str) -> list[int]:
+        """Ids of the objects of a case that are known to be no animal of the sequence (`animals` in davis.toml)."""
+        sequence, object_id = self._table[case]
+        facts, masks = known_sequences().get(sequence, {}), self._mask_folder(sequence)
+        # masks from elsewhere may number their objects otherwise
+        if "animals" not in facts or masks is None or not masks.is_relative_to(self.root / _ANNOTATIONS[0]):
+            return []
+        ids = [number for name, number in self._table.values() if name == sequence and object_id in (None, number)]
+        return [number for number in ids if number is not None and number not in facts["animals"]]
+
+
+_ANNOTATIONS = ("Annotations", "Annotations_unsupervised")
+
+
+def _badja_files(root: Path, sequence: str) -> Iterator[Path]:
+    for folder in ("badja", "joint_annotations", "BADJA/joint_annotations"):
+        yield root / folder / f"{sequence}.json"
+
+
+def _odd_animal(facts: Facts) -> str:
+    return "" if facts.get("quadruped", True) else f"a {facts['species']} is no quadruped: no four-legged template fits"

@@ -1,0 +1,42 @@
+"""Frames of a video that lie in a folder as images, and masks beside them."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rewild4d.datasets.images import read_rgb
+from rewild4d.datasets.masking.masks import MaskFiles
+from rewild4d.errors import UserError
+
+FRAME_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+def image_size(file: Path) -> tuple[int, int]:
+    """Width and height of an upright image."""
+    height, width = read_rgb(file, upright=True).shape[:2]
+    return width, height
+
+
+def read_images(files: Sequence[Path], size: tuple[int, int]) -> Iterator[np.ndarray]:
+    """The frames one after the other, turned upright as their EXIF says, uint8 [h, w, 3].
+
+    Raises:
+        UserError: a frame that cannot be read or has another size than the first.
+    """
+    for file in files:
+        image = read_rgb(file, upright=True)
+        if (image.shape[1], image.shape[0]) != size:
+            raise UserError(
+                f"{file}: expected {size[0]}x{size[1]} pixels like {files[0].name}, "
+                f"got {image.shape[1]}x{image.shape[0]}."
+            )
+        yield image
+
+
+def read_masks(
+    masks: MaskFiles, object_id: int | None, indices: Sequence[int], size: tuple[int, int]
+) -> Iterator[np.ndarray | None]:
+    """The masks of some frames, one after the other; None where a frame has none."""
+    for index in indices:
+        yield masks.read(index, object_id, size)

@@ -1,0 +1,192 @@
+"""What `check` says of masks: holes, jumps, empty frames, more than one part, and a picture of all that.
+
+Nothing here changes a mask. A person looks at the contact sheet and decides.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from rewild4d.contracts import Finding, Selection
+from rewild4d.datasets.masking.masks import FRAMED, MaskFacts, mask_facts
+from rewild4d.datasets.video.wild import LEAST_AREA, TWIN, Video, lay_out
+from rewild4d.errors import UserError
+from rewild4d.files import atomic
+
+HOLES = 0.01
+"""Share of the animal that may be enclosed background."""
+PART = 0.02
+"""A second part above this share of the largest is told."""
+JUMP = 0.35
+"""The mask jumps where its area changes by more than this share, or its middle moves by as much of its width."""
+SHEET_FRAMES = 24
+TILE = 240
+MOST_CASES = 12
+"""Contact sheets are drawn, and files decoded, for no more cases than these where none is named."""
+SPLIT = Selection(cameras="unknown", size=256, framing="crop", split=5)
+"""The split of the protocols, to see whether enough frames remain."""
+
+
+class VideoReader(Protocol):
+    """A reader of real videos."""
+
+    def cases(self, selection: Selection) -> list[str]: ...
+    def default_cases(self, selection: Selection) -> list[str]: ...
+    def video(self, case: str) -> Video: ...
+
+
+def check_videos(reader: VideoReader, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
+    """Look at every frame and mask of some cases.
+
+    Args:
+        reader: of the data set.
+        cases: which; the first few of its default ones where none is named.
+        sheets: folder for contact sheets; None draws none.
+    """
+    try:
+        names = list(cases) or reader.default_cases(SPLIT)
+    except UserError as error:
+        return [_fault(error)]
+    findings = []
+    for name in names if cases else names[:MOST_CASES]:
+        try:
+            findings += check_video(reader.video(name), sheets)
+        except UserError as error:
+            findings.append(_fault(error))
+    if not cases and len(names) > MOST_CASES:
+        told = f"{MOST_CASES} of {len(names)} cases looked at; --case names others"
+        findings.append(Finding("warning", "check", told))
+    return findings
+
+
+def check_video(video: Video, sheets: Path | None) -> list[Finding]:
+    """Findings on one video; its contact sheet goes to ``sheets``/<case>.png.
+
+    Raises:
+        UserError: files that cannot be read.
+    """
+    count = len(video.moments)
+    shown = set(np.linspace(0, count - 1, min(count, SHEET_FRAMES)).round().astype(int).tolist())
+    facts: list[MaskFacts | None] = []
+    tiles: dict[int, np.ndarray] = {}
+    for index, (image, mask) in enumerate(zip(video.images(), video.masks(), strict=False)):
+        facts.append(mask_facts(mask) if mask is not None else None)
+        if index in shown:
+            tiles[index] = tile(image, mask)
+    if len(facts) < count:
+        raise UserError(f"{video.title}: expected {count} frames, got {len(facts)}: it is cut off.")
+    troubles = {what: test(facts) for what, test in _TESTS.items()}
+    findings = [Finding("warning", video.name, note) for note in video.notes]
+    for what, indices in troubles.items():
+        if indices:
+            told = f"{what} in {len(indices)} of {count} frames: {_names(video, indices)}"
+            findings.append(Finding("warning", video.name, told))
+    if troubles[_SECOND] or troubles[_TWO]:
+        told = "where other parts are not the animal, --parts main keeps to its own (see the contact sheet)"
+        findings.append(Finding("warning", video.name, told))
+    try:
+        layout = lay_out(video, facts, SPLIT)
+        findings += [Finding("warning", video.name, note) for note in layout.notes]
+        train = layout.tested.count(False)
+        said = f"{count} frames of {video.size[0]}x{video.size[1]} at {video.fps:.4g} a second: {train} to learn from, "
+        findings.append(Finding("ok", video.name, f"{said}{len(layout.used) - train} to test"))
+    except UserError as error:
+        findings.append(_fault(error))
+    if sheets is not None:
+        marked = {index for indices in troubles.values() for index in indices}
+        path = sheets / f"{video.name.replace('/', '__')}.png"
+        _save(path, contact_sheet(tiles, [moment.label for moment in video.moments], marked))
+        findings.append(Finding("ok", video.name, f"contact sheet: {path}"))
+    return findings
+
+
+def _fault(error: UserError) -> Finding:
+    path, _, sentence = str(error).partition(": ")
+    return Finding("error", path, sentence.rstrip("."))
+
+
+def _empty(facts: Sequence[MaskFacts | None]) -> list[int]:
+    return [i for i, fact in enumerate(facts) if fact is None or fact.area < LEAST_AREA]
+
+
+def _holed(facts: Sequence[MaskFacts | None]) -> list[int]:
+    return [i for i, fact in enumerate(facts) if fact is not None and fact.holes > HOLES]
+
+
+def _split(facts: Sequence[MaskFacts | None]) -> list[int]:
+    return [i for i, fact in enumerate(facts) if fact is not None and PART < fact.second <= TWIN]
+
+
+def _twins(facts: Sequence[MaskFacts | None]) -> list[int]:
+    return [i for i, fact in enumerate(facts) if fact is not None and fact.second > TWIN]
+
+
+def _jumps(facts: Sequence[MaskFacts | None]) -> list[int]:
+    """Frames whose mask differs much from that of the frame before."""
+    found = []
+    for i in range(1, len(facts)):
+        before, after = facts[i - 1], facts[i]
+        if before is None or after is None or before.box is None or after.box is None:
+            continue
+        grown = max(before.area, after.area) / min(before.area, after.area) - 1
+        a, b = np.array(before.box, dtype=float), np.array(after.box, dtype=float)
+        moved = np.abs((a[:2] + a[2:]) / 2 - (b[:2] + b[2:]) / 2).max() / max(1.0, float((a[2:] - a[:2]).max()))
+        if grown > JUMP or moved > JUMP:
+            found.append(i)
+    return found
+
+
+def _framed(facts: Sequence[MaskFacts | None]) -> list[int]:
+    return [i for i, fact in enumerate(facts) if fact is not None and fact.framed > FRAMED]
+
+
+_SECOND, _TWO = "a second part beside the animal", "two parts of like size (two animals?)"
+_TESTS: dict[str, Callable[[Sequence[MaskFacts | None]], list[int]]] = {
+    "no mask or an empty one": _empty,
+    "animal all along the image's border (is the mask inverted?)": _framed,
+    f"holes (or gaps between legs) above {HOLES:.0%} of the animal": _holed,
+    _SECOND: _split,
+    _TWO: _twins,
+    "a jump from the frame before": _jumps,
+}
+
+
+def _names(video: Video, indices: Sequence[int]) -> str:
+    return ", ".join(video.moments[i].label for i in indices[:6]) + (", ..." if len(indices) > 6 else "")
+
+
+def tile(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """A small picture of a frame with its mask tinted and outlined, uint8 [h, TILE, 3]."""
+    scale = TILE / image.shape[1]
+    size = (TILE, max(1, round(image.shape[0] * scale)))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    if mask is None:
+        return (small * 0.4).astype(np.uint8)
+    matte = cv2.resize(mask, size, interpolation=cv2.INTER_AREA)[..., None].astype(np.float32) / 255
+    tinted = small * (0.45 + 0.2 * matte) + matte * np.array((10.0, 90.0, 10.0), dtype=np.float32)
+    drawn = np.clip(tinted, 0, 255).astype(np.uint8)
+    outlines, _ = cv2.findContours((matte[..., 0] > 0.5).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(drawn, outlines, -1, (80, 255, 80), 1, cv2.LINE_AA)
+    return drawn
+
+
+def contact_sheet(tiles: dict[int, np.ndarray], labels: Sequence[str], marked: set[int]) -> np.ndarray:
+    """Tiles in reading order, each under its label; those that a warning names have red labels, uint8 [H, W, 3]."""
+    cells = []
+    for index, picture in tiles.items():
+        strip = np.full((18, picture.shape[1], 3), 255, np.uint8)
+        color = (200, 0, 0) if index in marked else (40, 40, 40)
+        cv2.putText(strip, labels[index], (4, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, 1, cv2.LINE_AA)
+        cells.append(np.concatenate((strip, picture)))
+    columns = min(6, len(cells))
+    cells += [np.full_like(cells[0], 255)] * (-len(cells) % columns)
+    rows = [np.concatenate(cells[i : i + columns], axis=1) for i in range(0, len(cells), columns)]
+    return np.concatenate(rows)
+
+
+def _save(path: Path, image: np.ndarray) -> None:
+    with atomic(path) as temporary:
+        cv2.imwrite(str(temporary), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))

@@ -1,0 +1,347 @@
+"""Reads a person's own video: a file or a folder of frames, and masks of the animal in it.
+
+Masks are a folder (named or numbered like the frames, or as many), a second video, or the alpha channel of the frames
+themselves; root/masks is looked at where nothing is named. Images are turned as their EXIF says and videos as their
+header says; frames keep their own time stamps, so any frame rate will do, a variable one too.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+
+from rewild4d.contracts import Finding, Selection
+from rewild4d.datasets.keypoints.files import read_keypoints
+from rewild4d.datasets.masking import masks as mask_files
+from rewild4d.datasets.masking.makers import Unmasked
+from rewild4d.datasets.masking.masks import MaskFiles, fit_size, match_masks, open_masks, read_transparency
+from rewild4d.datasets.video.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
+from rewild4d.datasets.video.mask_check import check_videos
+from rewild4d.datasets.video.parts import with_parts
+from rewild4d.datasets.video.video_file import ASSUMED_FPS, SUFFIXES, read_video, video_facts
+from rewild4d.datasets.video.wild import Masks, Moment, Video, files_identity, original_images, split_video
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.types import Clip, Keypoints, Truth
+
+FOLDER_FPS = 25.0
+"""Of a folder of frames where --fps is left out."""
+MOST_FRAMES = 300
+"""A longer video is thinned evenly where --fps is left out: more frames fill the memory and hardly help."""
+LICENCE = "a person's own video; its terms are not known"
+
+
+@dataclass(frozen=True)
+class Material:
+    """The frames of a video in order: image files, or one video file.
+
+    Attributes:
+        files: empty for a video file.
+        times: seconds of every frame, ascending.
+        size: width and height.
+        has_alpha: whether the frames carry a mask of their own: any is transparent anywhere.
+        notes: what was found wrong, a sentence each.
+    """
+
+    files: tuple[Path, ...]
+    times: tuple[float, ...]
+    size: tuple[int, int]
+    has_alpha: bool
+    notes: tuple[str, ...]
+
+
+class Online:
+    """A person's own video, with masks.
+
+    Keeps contracts.DatasetReader. The case is called like the file or the folder; where masks hold several objects,
+    each is a case of its own too: "clip@2".
+
+    Args:
+        root: a video file, a folder of frames, or a folder that holds one called frames (and one called masks).
+        masks: folder of masks or a video of them.
+        start: seconds from where on frames are used.
+        end: seconds up to which frames are used.
+        fps: frames per second that are kept; of a folder also the rate at which it was taken.
+        parts: of the masks (`parts.Parts`).
+        keypoints: a file of them (`keypoint_files`), which names the frames or counts those of the video from 0.
+
+    Raises:
+        UserError: no such file, or numbers that make no sense.
+    """
+
+    options = ("masks", "start", "end", "fps", "keypoints", "parts")
+    licence = LICENCE
+
+    def __init__(
+        self,
+        root: Path,
+        masks: Path | str | None = None,
+        start: float | str | None = None,
+        end: float | str | None = None,
+        fps: float | str | None = None,
+        keypoints: Path | str | None = None,
+        parts: str = "auto",
+    ) -> None:
+        self.root, self.parts = root, parts
+        self.masks, self.keypoints = (Path(path) if path else None for path in (masks, keypoints))
+        self.start, self.end, self.fps = (None if value is None else float(value) for value in (start, end, fps))
+        for path in (self.root, *([self.masks] if self.masks else [])):
+            if not path.exists():
+                raise UserError(f"{path}: expected a video file or a folder of images, but there is no such thing.")
+        if self.fps is not None and not 0 < self.fps <= 1000:
+            raise UserError(f"--fps: expected a number above 0, up to 1000, got {self.fps:g}.")
+        if (self.start or 0) < 0 or (self.end is not None and self.end <= (self.start or 0)):
+            end = "no end" if self.end is None else f"{self.end:g}"
+            raise UserError(f"--start and --end: expected 0 <= start < end, got {self.start or 0:g} and {end}.")
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The options that differ from their defaults, for the record."""
+        given = {
+            "masks": self.masks and self.masks.resolve(), "start": self.start, "end": self.end, "fps": self.fps,
+            "keypoints": self.keypoints and self.keypoints.resolve(),
+            "parts": None if self.parts == "auto" else self.parts,
+        }  # fmt: skip
+        return {name: str(value) for name, value in given.items() if value is not None}
+
+    def cases(self, selection: Selection) -> list[str]:
+        """The video's name, and one for each object where its masks hold several."""
+        return list(self._table)
+
+    def default_cases(self, selection: Selection) -> list[str]:
+        """The whole mask, or each object on its own where there are several."""
+        return [case for case, number in self._table.items() if number is not None] or list(self._table)
+
+    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
+        """Decode one case.
+
+        Raises:
+            UserError: no such case, no masks, or files that cannot be used.
+        """
+        return split_video(self.video(case), selection)
+
+    def originals(self, case: str, selection: Selection) -> Iterator[np.ndarray]:
+        """The whole frames that the images of a clip were cut from, uint8 [h, w, 3]; for pictures alone.
+
+        Raises:
+            UserError: as `load`.
+        """
+        return original_images(self.video(case), selection)
+
+    def video(self, case: str) -> Video:
+        """The frames and masks of a case.
+
+        Raises:
+            UserError: as `load`.
+        """
+        if case not in self._table:
+            raise unknown_name("case", case, self._table)
+        material, (indices, thinned) = self._material, self._chosen
+        times = [material.times[i] for i in indices]
+        span = times[-1] - times[0]
+        masks, note = self._masks(self._table[case])
+        points, outside = self._keypoints
+        settings = f"{indices} {self._table[case]} {self.fps}"
+        sources = self._mask_sources
+        video = Video(
+            title=str(self.root), name=case, species="animal", fps=(len(times) - 1) / span if span else FOLDER_FPS,
+            licence=LICENCE, identity=files_identity(*(material.files or (self.root,)), *sources) + settings,
+            size=material.size,
+            moments=tuple(Moment(self._label(i), material.times[i], points[i]) for i in indices),
+            images=self._images, masks=masks,
+            notes=(*material.notes, *(text for text in (thinned, note, outside) if text)),
+        )  # fmt: skip
+        return with_parts(video, self.parts, is_named=self._table[case] is None and len(self._table) > 1)
+
+    def unmasked(self, case: str) -> Unmasked:
+        """The chosen frames without their masks, for programs that make some; masks are named by frame number.
+
+        Raises:
+            UserError: as `load`.
+        """
+        stems = tuple(self._stems[i] for i in self._chosen[0])
+        return Unmasked(str(self.root), stems, self._material.size, self._images, {})
+
+    @property
+    def _stems(self) -> list[str]:
+        """Names of all frames; of a video their numbers."""
+        return [f.stem for f in self._material.files] or [f"{i:05d}" for i in range(len(self._material.times))]
+
+    @cached_property
+    def _keypoints(self) -> tuple[list[Keypoints | None], str]:
+        """Of every frame, and a sentence on what of their file is not used."""
+        if self.keypoints is None:
+            return [None] * len(self._material.times), ""
+        return read_keypoints(self.keypoints, self._stems, self._material.size)
+
+    @property
+    def name(self) -> str:
+        """Of the video: its file's or folder's name."""
+        return self.root.stem if self.root.is_file() else self.root.resolve().name
+
+    def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
+        """Verify the video and its masks; a contact sheet goes to ``sheets``."""
+        return check_videos(self, cases, sheets)
+
+    @cached_property
+    def _frames_root(self) -> Path:
+        inner = [self.root / name for name in ("frames", "images") if (self.root / name).is_dir()]
+        return inner[0] if inner else self.root
+
+    @cached_property
+    def _material(self) -> Material:
+        if self.root.is_file():
+            if self.root.suffix.lower() in FRAME_SUFFIXES:
+                raise UserError(f"{self.root}: expected a video or a folder of frames, got one image.")
+            facts = video_facts(self.root)
+            fault = f"ffmpeg complains of the video, {len(facts.times)} frames were read: {facts.faults}"
+            order = f"time stamps are missing or out of order: {ASSUMED_FPS:g} frames a second assumed"
+            notes = (*((fault,) if facts.faults else ()), *(() if facts.is_stamped else (order,)))
+            return Material((), facts.times, (facts.width, facts.height), facts.has_alpha, notes)
+        files = tuple(mask_files.list_images(self._frames_root, FRAME_SUFFIXES))
+        if not files:
+            expected = f"frames ({', '.join(FRAME_SUFFIXES)})"
+            videos = [entry.name for entry in self._frames_root.iterdir() if entry.suffix.lower() in SUFFIXES]
+            hint = f", but there is {videos[0]}: name that file" if videos else ", got none"
+            raise UserError(f"{self._frames_root}: expected {expected}{hint}.")
+        rate = self.fps or FOLDER_FPS
+        size = image_size(files[0])
+        has_alpha = any(alpha is not None and bool((alpha < 255).any()) for alpha in map(read_transparency, files))
+        notes = () if self.fps else (f"a folder of frames has no frame rate: {FOLDER_FPS:g} a second assumed (--fps)",)
+        return Material(files, tuple(i / rate for i in range(len(files))), size, has_alpha, notes)
+
+    @cached_property
+    def _chosen(self) -> tuple[list[int], str]:
+        """Indices of the frames between --start and --end at --fps, and a sentence where they were thinned unasked."""
+        times = self._material.times
+        low, high = self.start or 0.0, self.end if self.end is not None else float("inf")
+        inside = [i for i, time in enumerate(times) if low <= time <= high]
+        if not inside:
+            raise UserError(
+                f"{self.root}: expected frames between {low:g} and {high:g} s, but the last is at {times[-1]:.2f} s."
+            )
+        if self.fps and not self._material.files:
+            return _thinned([times[i] for i in inside], inside, self.fps), ""
+        if len(inside) > MOST_FRAMES and not self.fps:
+            step = -(-len(inside) // MOST_FRAMES)
+            return inside[::step], f"{len(inside)} frames thinned to every {step}th (--fps and --end choose otherwise)"
+        return inside, ""
+
+    @cached_property
+    def _table(self) -> dict[str, int | None]:
+        """Case -> object id (None: all that the masks hold)."""
+        name = self.name
+        ids = self._mask_files.ids if self._mask_files else ()
+        return {name: None} | {f"{name}@{number}": number for number in ids if len(ids) > 1}
+
+    @cached_property
+    def _mask_place(self) -> Path | None:
+        """The folder or video of masks, or None where they are the frames' alpha."""
+        beside = self.root / "masks" if self.root.is_dir() else None
+        place = self.masks or (beside if beside and beside.is_dir() else None)
+        if place is None and not self._material.has_alpha:
+            raise UserError(
+                f"{self.root}: expected masks of the animal, but no frame is transparent anywhere and no --masks was "
+                "given; `rewild4d-bench masks` makes some."
+            )
+        return place
+
+    @cached_property
+    def _mask_match(self) -> tuple[MaskFiles, str] | None:
+        """The mask of each chosen frame where masks lie in a folder."""
+        if self._mask_place is None or not self._mask_place.is_dir():
+            return None
+        found, (indices, _) = mask_files.list_images(self._mask_place), self._chosen
+        stems = [file.stem for file in self._material.files] or [str(i) for i in range(len(self._material.times))]
+        if len(found) == len(indices) < len(stems):  # made from the chosen frames alone
+            matched, note = match_masks(found, [stems[i] for i in indices], self._mask_place)
+            if None in matched:  # as many masks as chosen frames, but numbered by themselves
+                matched = list(found)
+                note = f"one mask for each of the {len(found)} chosen frames: matched in order, {found[0].name} first"
+        else:
+            every, note = match_masks(found, stems, self._mask_place)
+            matched = [every[i] for i in indices]
+        return open_masks(matched), note
+
+    @property
+    def _mask_files(self) -> MaskFiles | None:
+        return self._mask_match[0] if self._mask_match else None
+
+    @property
+    def _mask_sources(self) -> Sequence[Path | None]:
+        if self._mask_files:
+            return self._mask_files.files
+        return (self._mask_place,) if self._mask_place else ()
+
+    def _masks(self, object_id: int | None) -> tuple[Masks, str]:
+        size, (indices, _) = self._material.size, self._chosen
+        if self._mask_match:
+            masks, note = self._mask_match
+            return partial(read_masks, masks, object_id, range(len(indices)), size), note
+        if self._mask_place is None:
+            return self._alphas, "masks are the frames' alpha channel"
+        return self._video_masks(self._mask_place)
+
+    def _video_masks(self, path: Path) -> tuple[Masks, str]:
+        """Masks out of a video: of all frames, or of the chosen ones only."""
+        facts, (indices, _) = video_facts(path), self._chosen
+        total = len(self._material.times)
+        if len(facts.times) == total:
+            chosen, note = indices, ""
+        elif len(facts.times) == len(indices):
+            chosen, note = list(range(len(indices))), "the video of masks is matched to the chosen frames in order"
+        else:
+            raise UserError(
+                f"{path}: expected a mask for each of the {total} frames of {self.root.name}, got {len(facts.times)}."
+            )
+        return partial(_mask_stream, path, chosen, self._material.size, facts.has_alpha), note
+
+    def _images(self) -> Iterator[np.ndarray]:
+        indices = self._chosen[0]
+        if self._material.files:
+            return read_images([self._material.files[i] for i in indices], self._material.size)
+        return (frame[..., :3] for frame in _picked(read_video(self.root), indices))
+
+    def _alphas(self) -> Iterator[np.ndarray | None]:
+        indices = self._chosen[0]
+        if self._material.files:
+            return (_file_alpha(self._material.files[i], self._material.size) for i in indices)
+        return (frame[..., 3] for frame in _picked(read_video(self.root), indices))
+
+    def _label(self, index: int) -> str:
+        return self._material.files[index].name if self._material.files else f"frame {index}"
+
+
+def _thinned(times: list[float], indices: list[int], fps: float) -> list[int]:
+    """The frames nearest to an even grid, each once."""
+    grid = np.arange(times[0], times[-1] + 0.5 / fps, 1 / fps)
+    after = np.searchsorted(times, grid).clip(1, max(1, len(times) - 1))
+    before = after - 1
+    known = np.asarray([*times, times[-1]]) if len(times) == 1 else np.asarray(times)
+    nearest = np.where(grid - known[before] <= known[after] - grid, before, after)
+    return [indices[i] for i in sorted(set(nearest.tolist())) if i < len(indices)]
+
+
+def _picked(frames: Iterator[np.ndarray], indices: Sequence[int]) -> Iterator[np.ndarray]:
+    """Some frames of a stream; it is not read beyond the last of them."""
+    wanted, last = set(indices), max(indices)
+    for index, frame in enumerate(frames):
+        if index in wanted:
+            yield frame
+        if index == last:
+            return
+
+
+def _mask_stream(path: Path, indices: Sequence[int], size: tuple[int, int], alpha: bool) -> Iterator[np.ndarray | None]:
+    for frame in _picked(read_video(path), indices):
+        values = (
+            np.ascontiguousarray(frame[..., 3]) if alpha else mask_files.shades(frame[..., :3], mask_files.FILM_TINT)
+        )
+        yield fit_size(values, size, str(path))
+
+
+def _file_alpha(file: Path, size: tuple[int, int]) -> np.ndarray | None:
+    """The alpha channel of an image that has one, uint8 [h, w]."""
+    alpha = read_transparency(file)
+    return None if alpha is None else fit_size(alpha, size, str(file))

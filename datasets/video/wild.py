@@ -1,0 +1,349 @@
+"""A video of an animal and its masks, made into a clip and a truth: usable frames, split, crops, cache.
+
+Every reader of real videos describes what it has as a `Video`; from there on all of them are alike. Frames without the
+animal, and those where the image's border cuts it, are kept out, and the clip says so.
+"""
+
+import json
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from rewild4d.contracts import Selection
+from rewild4d.datasets.keypoints.keypoints import in_crop
+from rewild4d.datasets.masking.masks import MaskFacts, mask_facts
+from rewild4d.datasets.video.crops import cut, follow, lost_share
+from rewild4d.datasets.video.travel import TravelMeter
+from rewild4d.errors import UserError
+from rewild4d.files import atomic, cache_folder, digest, file_state
+from rewild4d.types import Clip, Crop, Frame, Keypoints, Truth
+
+LEAST_FRAMES = 4
+"""Usable frames without which nothing is reconstructed: three to learn from and one to test."""
+LEAST_AREA = 64
+"""Pixels of mask below which a frame counts as one without the animal."""
+TWIN = 0.5
+"""A second part above this share of the largest may be a second animal."""
+LOST = 0.02
+"""Share of the animal outside the crop of a held-out frame above which it is told."""
+_CACHE_VERSION = "3"
+
+Masks = Callable[[], Iterator[np.ndarray | None]]
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One frame of a video before anything is cut.
+
+    Attributes:
+        label: what a sentence calls it: a file's name or "frame 12".
+        time: seconds from the start of the video.
+        keypoints: annotated points in the original frame's pixels.
+    """
+
+    label: str
+    time: float
+    keypoints: Keypoints | None = None
+
+
+@dataclass(frozen=True)
+class Video:
+    """A video with masks, to be read from start to end as often as needed.
+
+    Attributes:
+        title: what a sentence calls it: its path.
+        name: of the case.
+        species: free text.
+        fps: frames per second, on average.
+        licence: of the data.
+        identity: text that changes with everything that decides the frames; for the cache.
+        size: width and height of the frames.
+        moments: in the order of time.
+        images: every moment's frame, uint8 [h, w, 3].
+        masks: every moment's mask, uint8 [h, w], or None where it has none.
+        true_masks: by which held-out frames are judged where they are better known than ``masks``.
+        notes: what was assumed, a sentence each.
+        masks_without: ``masks`` where those of the given moments decide nothing for others; None: they never do.
+    """
+
+    title: str
+    name: str
+    species: str
+    fps: float
+    licence: str
+    identity: str
+    size: tuple[int, int]
+    moments: tuple[Moment, ...]
+    images: Callable[[], Iterator[np.ndarray]]
+    masks: Masks
+    true_masks: Masks | None = None
+    notes: tuple[str, ...] = ()
+    masks_without: Callable[[Collection[int]], Masks] | None = None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which frames of a video are used, how, and where they are cut.
+
+    Attributes:
+        used: indices of moments, ascending.
+        tested: which of them are held out, bool for each.
+        crops: of each.
+        notes: what was left out and why, a sentence each.
+        travel: x and y of the animal's motion over the background from each frame that is not held out to the next of
+            them, pixels of the original frames; empty until the frames were looked at.
+    """
+
+    used: tuple[int, ...]
+    tested: tuple[bool, ...]
+    crops: tuple[Crop, ...]
+    notes: tuple[str, ...]
+    travel: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def shown(self) -> list[int]:
+        """Rows of the frames that are not held out."""
+        return [row for row, tested in enumerate(self.tested) if not tested]
+
+
+def split_video(video: Video, selection: Selection) -> tuple[Clip, Truth]:
+    """The frames that a method gets and those that are held out, cut around the animal.
+
+    Cameras are None: nobody knows them (`contracts.Reconstruction.camera`).
+
+    Raises:
+        UserError: too few usable frames, or files that cannot be read.
+    """
+    if selection.framing != "crop" or selection.cameras != "unknown" or not selection.split or selection.split < 2:
+        raise UserError(
+            f"{video.title}: expected a protocol for videos (cameras = 'unknown', framing = 'crop', split = 2 or more)."
+        )
+    layout, folder = _laid_out(video, selection)
+    frames = _Frames(video, layout, np.load(folder / "rgba.npy", mmap_mode="r"))
+    shown = tuple(frames[i] for i in layout.shown)
+    hidden = _Chosen(frames, [i for i, tested in enumerate(layout.tested) if tested])
+    travel = _travel_in_crops(layout, selection.size)
+    clip = Clip(
+        video.name, video.species, shown, video.fps / selection.stride, video.licence,
+        digest(frames.digest(layout.shown), travel), (*video.notes, *layout.notes),
+        start=video.moments[layout.used[0]].time, travel=travel,
+    )  # fmt: skip
+    return clip, Truth(hidden, None, frames.digest(hidden.indices))
+
+
+def _travel_in_crops(layout: Layout, size: int) -> torch.Tensor:
+    """The travel in pixels of the crop that each step leads to, [T - 1, 2]."""
+    sides = torch.tensor([layout.crops[row].side for row in layout.shown[1:]])
+    return torch.tensor(layout.travel).reshape(-1, 2) * (size / sides)[:, None]
+
+
+def usable(
+    video: Video, facts: Sequence[MaskFacts | None], stride: int = 1, least: int = 1
+) -> tuple[list[int], tuple[str, ...]]:
+    """Indices of the frames that show the whole animal, and what was left out and why, a sentence each.
+
+    Frames that the image's border cuts stay where most are like that.
+
+    Args:
+        video: whose frames.
+        facts: of each moment's mask; None where there is none.
+        stride: every so many frames are looked at.
+        least: how many frames there must be.
+
+    Raises:
+        UserError: there are fewer.
+    """
+    kept = [(i, facts[i]) for i in range(0, len(facts), stride)]
+    missing = [i for i, fact in kept if fact is None]
+    empty = [i for i, fact in kept if fact is not None and (fact.box is None or fact.area < LEAST_AREA)]
+    seen = [i for i, fact in kept if fact is not None and fact.box is not None and fact.area >= LEAST_AREA]
+    is_cut = [i for i in seen if (fact := facts[i]) is not None and fact.is_cut]
+    notes = [_told(video, missing, "without a mask left out"), _told(video, empty, "without the animal left out")]
+    used = [i for i in seen if i not in set(is_cut)]
+    if len(used) < max(LEAST_FRAMES, len(seen) // 4):
+        used, cut_note = seen, "where the image's border cuts the animal kept, because most are like that"
+    else:
+        cut_note = "where the image's border cuts the animal left out"
+    notes.append(_told(video, is_cut, cut_note))
+    twins = [i for i in used if (fact := facts[i]) is not None and fact.second > TWIN]
+    notes.append(
+        _told(video, twins, "with two parts of like size (two animals?) taken as one animal (--parts main takes one)")
+    )
+    if len(used) < least:
+        reasons = [f"{len(missing)} have no mask" if missing else "", f"{len(empty)} an empty one" if empty else ""]
+        said = " and ".join(reason for reason in reasons if reason)
+        raise UserError(
+            f"{video.title}: expected at least {least} frame{'s' * (least > 1)} with a mask of the animal, got "
+            f"{len(used)} of {len(kept)}{f' ({said})' if said else ''}."
+        )
+    return used, tuple(note for note in notes if note)
+
+
+def original_images(video: Video, selection: Selection) -> Iterator[np.ndarray]:
+    """The whole frames that the images were cut from, held-out ones too, in the order of time, uint8 [h, w, 3]."""
+    used = {*_laid_out(video, selection)[0].used}
+    return (image for index, image in enumerate(video.images()) if index in used)
+
+
+def _laid_out(video: Video, selection: Selection) -> tuple[Layout, Path]:
+    """The layout of a video and the folder of its cut frames, made where they are not there yet."""
+    folder = cache_folder() / "wild" / _key(video, selection)
+    if not (folder / "rgba.npy").is_file():
+        layout = lay_out(video, _facts(video.masks), selection)
+        if video.masks_without:  # which are held out is known now
+            video = replace(video, masks=video.masks_without(set(layout.used) - {layout.used[i] for i in layout.shown}))
+            layout = replace(layout, crops=_crops(video, _facts(video.masks), layout.used, layout.tested))
+        _fill(video, layout, selection.size, folder)
+    return _read_layout(folder / "layout.json"), folder
+
+
+def lay_out(video: Video, facts: Sequence[MaskFacts | None], selection: Selection) -> Layout:
+    """Choose frames and crops from what the masks say.
+
+    Args:
+        video: whose frames.
+        facts: of each moment's mask; None where there is none.
+        selection: its stride and split.
+
+    Raises:
+        UserError: too few usable frames.
+    """
+    used, notes = usable(video, facts, selection.stride, LEAST_FRAMES)
+    tested = split_frames(len(used), selection.split or len(used))
+    return Layout(tuple(used), tuple(tested), _crops(video, facts, used, tested), notes)
+
+
+def _facts(masks: Masks) -> list[MaskFacts | None]:
+    return [None if mask is None else mask_facts(mask) for mask in masks()]
+
+
+def _crops(
+    video: Video, facts: Sequence[MaskFacts | None], used: Sequence[int], tested: Sequence[bool]
+) -> tuple[Crop, ...]:
+    """The crops of the used frames, from what the masks of those say that are not held out."""
+    shown = [
+        (i, fact.box) for i, test in zip(used, tested, strict=True) if not test and (fact := facts[i]) and fact.box
+    ]
+    times = [video.moments[i].time for i, _ in shown]
+    return tuple(follow(times, [box for _, box in shown], [video.moments[i].time for i in used], video.size))
+
+
+def split_frames(count: int, split: int) -> list[bool]:
+    """Which of the usable frames are held out: the middle one of every ``split``, never the first or the last."""
+    return [i % split == split // 2 and 0 < i < count - 1 for i in range(count)]
+
+
+def _told(video: Video, indices: list[int], what: str) -> str:
+    """A sentence about some frames, with runs as ranges."""
+    if not indices:
+        return ""
+    runs: list[list[int]] = []
+    for index in indices:
+        if runs and index == runs[-1][1] + 1:
+            runs[-1][1] = index
+        else:
+            runs.append([index, index])
+    labels = [
+        video.moments[a].label if a == b else f"{video.moments[a].label} to {video.moments[b].label}" for a, b in runs
+    ]
+    shown = ", ".join(labels[:6]) + (", ..." if len(labels) > 6 else "")
+    return f"{len(indices)} of {len(video.moments)} frames {what}: {shown}"
+
+
+def _fill(video: Video, layout: Layout, size: int, folder: Path) -> None:
+    """Cut every used frame and write the cache; the images are written last and say that it is complete."""
+    place = {index: row for row, index in enumerate(layout.used)}
+    lost: list[int] = []
+    meter, written = TravelMeter(), 0
+    truths = video.true_masks() if video.true_masks else iter([None] * len(video.moments))
+    header = {"descr": "|u1", "fortran_order": False, "shape": (len(layout.used), size, size, 4)}
+    with atomic(folder / "rgba.npy") as temporary, temporary.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+        for index, (image, mask, truth) in enumerate(zip(video.images(), video.masks(), truths, strict=False)):
+            row = place.get(index)
+            if row is None or mask is None:
+                continue
+            judged = truth if layout.tested[row] and truth is not None else mask
+            crop = layout.crops[row]
+            file.write(cut(image, judged, crop, size).tobytes())
+            written += 1
+            if not layout.tested[row]:
+                meter.add(image, mask)
+            elif lost_share(judged, crop) > LOST:
+                lost.append(index)
+        if written < len(layout.used):
+            raise UserError(f"{video.title}: expected {len(layout.used)} frames to cut, got {written}: it is cut off.")
+        note = _told(video, lost, f"held out reach over their crop with more than {LOST:.0%} of the animal")
+        notes, travel = (*layout.notes, note) if note else layout.notes, tuple(meter.result().tolist())
+        _write_layout(folder / "layout.json", replace(layout, notes=notes, travel=travel))
+
+
+def _write_layout(path: Path, layout: Layout) -> None:
+    with atomic(path) as temporary:
+        temporary.write_text(json.dumps(asdict(layout)))
+
+
+def _read_layout(path: Path) -> Layout:
+    parts = json.loads(path.read_text())
+    crops = tuple(Crop(**values) for values in parts.pop("crops"))
+    return Layout(crops=crops, **{name: tuple(values) for name, values in parts.items()})
+
+
+def _key(video: Video, selection: Selection) -> str:
+    parts = [_CACHE_VERSION, video.identity, str(selection.size), str(selection.stride), str(selection.split)]
+    return digest(*parts)[:32]
+
+
+def files_identity(*files: Path | None) -> str:
+    """Path, size and time of change of some files, as text."""
+    return digest(*(file_state(file) for file in files if file is not None))
+
+
+class _Frames(Sequence[Frame]):
+    """All used frames, from the memory map on access."""
+
+    def __init__(self, video: Video, layout: Layout, rgba: np.ndarray) -> None:
+        self.layout, self._rgba = layout, rgba
+        moments = [video.moments[i] for i in layout.used]
+        start = moments[0].time
+        self.times = [moment.time - start for moment in moments]
+        self.keypoints = [
+            in_crop(moment.keypoints, crop, rgba.shape[1]) for moment, crop in zip(moments, layout.crops, strict=True)
+        ]
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[item] for item in range(*index.indices(len(self)))]
+        rgba = torch.from_numpy(self._rgba[index].astype(np.float32) / 255).permute(2, 0, 1).contiguous()
+        crop, points = self.layout.crops[index], self.keypoints[index]
+        return Frame(self.times[index], None, rgba[:3], rgba[3:], 0, crop, points)
+
+    def digest(self, indices: Sequence[int]) -> str:
+        """SHA-256 over times, crops, keypoints and pixels of some frames."""
+        parts: list[str | torch.Tensor | np.ndarray] = []
+        for index in indices:
+            parts += [repr(self.times[index]), repr(self.layout.crops[index]), self._rgba[index]]
+            points = self.keypoints[index]
+            parts += [points.points, points.visible] if points else []
+        return digest(*parts)
+
+
+class _Chosen(Sequence[Frame]):
+    """Some of the frames, read on access."""
+
+    def __init__(self, frames: _Frames, indices: list[int]) -> None:
+        self.frames, self.indices = frames, indices
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, index: Any) -> Any:
+        chosen = self.indices[index]
+        return [self.frames[item] for item in chosen] if isinstance(index, slice) else self.frames[chosen]

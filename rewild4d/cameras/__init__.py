@@ -1,0 +1,1 @@
+"""Cameras of inputs and novel views, and rendering from them."""

@@ -1,0 +1,1 @@
+"""Score reconstructions and folders of results by a protocol."""

@@ -1,0 +1,198 @@
+"""Scores of anybody's results: two folders of images or of clips, or two point clouds, without our methods."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from rewild4d.datasets.video.footage import open_footage
+from rewild4d.evaluation.image_scores import (
+    SILHOUETTES,
+    PairDistance,
+    measure,
+    needs,
+    summarize,
+    without_value,
+)
+from rewild4d.evaluation.networks import FAMILIES, Networks
+from rewild4d.evaluation.pairing import Inputs, Match, Shown, images_beside, match_inputs
+from rewild4d.evaluation.reports import SCHEMA, Report
+from rewild4d.machine import code_version, machine
+from rewild4d.metrics.distribution import kid
+from rewild4d.metrics.names import IMAGES, split_name
+from rewild4d.metrics.samples import Conditions, Distance, Images, Progress, image_features
+from rewild4d.metrics.score import Score
+from rewild4d.metrics.video import clip_distances
+
+NO_MATTE = ("no true masks: name them with --masks", "no predicted masks: name them with --pred-masks")
+PAIRED = "takes the sets for independent, but they are paired: near a perfect prediction it is negative, KID-u is zero"
+ONE_SIDED = {
+    (True, False): "the predictions have alpha, the truths have none: see that they lie on the same background",
+    (False, True): "the truths have alpha, the predictions have none: see that they lie on the same background",
+}
+
+Stage = Callable[[str], Progress]
+"""Begins a stage of the work by its title and gives what shows its progress."""
+
+
+@torch.no_grad()
+def score_pictures(
+    inputs: Inputs,
+    *,
+    networks: Networks,
+    families: Sequence[str] = FAMILIES,
+    background: float = 1.0,
+    fps: float | None = None,
+    paired: bool = True,
+    device: torch.device,
+    stage: Stage,
+) -> Report:
+    """Score images or clips against true ones.
+
+    Args:
+        inputs: the paths.
+        networks: of the learned metrics; see `networks.load_networks`.
+        families: which of `FAMILIES`.
+        background: grey level in [0, 1] behind every image that has alpha.
+        fps: of clips whose files do not say it.
+        paired: whether each prediction belongs to one truth; if not, only distances between the sets are computed.
+        device: that the networks compute on, for the record.
+        stage: shows progress.
+
+    Raises:
+        UserError: a path, an image or a mask that cannot be used.
+    """
+    started = time.monotonic()
+    prediction, truth = (open_footage(path) for path in (inputs.prediction, inputs.truth))
+    scores: dict[str, Score] = {}
+    items: list[str] = []
+    notes: list[str] = []
+    sides = [prediction.reels, truth.reels]
+    if paired:
+        matches, notes = match_inputs(inputs, prediction, truth)
+        scores, items, seen = image_scores(matches, families, networks, background, stage("images"))
+        notes += seen
+        sides[0] = tuple(match.prediction for match in matches)
+    rates = {reel.fps for side in sides for reel in side if reel.fps} or ({fps} if fps else set())
+    if len(rates) > 1:
+        notes.append(f"frame rates differ: {', '.join(f'{rate:g}' for rate in sorted(rates))}")
+    conditions = Conditions(f"{background:g} behind alpha", fps=min(rates) if len(rates) == 1 else None)
+    shown = [[Shown(reel, background) for reel in side] for side in sides]
+    distances = image_distances(shown, paired, families, networks, conditions, stage)
+    if truth.clips and prediction.clips:
+        distances += video_distances(shown, paired, families, networks, conditions, stage)
+    return Report(
+        schema=SCHEMA,
+        kind="clips" if truth.clips else "images",
+        inputs={name: str(path) for name, path in vars(inputs).items() if path is not None},
+        settings={"background": conditions.background} | ({"fps": f"{conditions.fps:g}"} if conditions.fps else {}),
+        scores=scores,
+        distances=distances,
+        networks={name: network.digest for name, network in networks.lpips.items()}
+        | {distance.extractor: distance.digest for distance in distances if distance.value is not None},
+        items=items,
+        notes=notes,
+        code=code_version(),
+        machine=machine(device, "none"),
+        seconds=round(time.monotonic() - started, 3),
+    )
+
+
+def image_scores(
+    matches: Sequence[Match], families: Sequence[str], networks: Networks, background: float, progress: Progress
+) -> tuple[dict[str, Score], list[str], list[str]]:
+    """Scores by name, the label of each image, and what to beware of."""
+    names = [name for name in IMAGES if _family(name) in families]
+    reasons = {name: networks.missing.get(_family(name), "") for name in names}
+    values: dict[str, list[float | None]] = {name: [] for name in names if not reasons[name]}
+    lpips = {name: _Remembering(network) for name, network in networks.lpips.items()}
+    total, labels = sum(len(match.truth) for match in matches), list[str]()
+    alphas, mattes = set[tuple[bool, bool]](), set[int]()
+    for label, shown, alpha in images_beside(matches, background):
+        alphas.add(alpha)
+        mattes |= {side for side, matte in enumerate((shown.truth_matte, shown.prediction_matte)) if matte is not None}
+        for name in values:
+            values[name] += measure(name, shown, lpips)
+        labels.append(label)
+        progress(len(labels), total)
+    scores = {}
+    for name in names:
+        absent = [NO_MATTE[side] for side, needed in enumerate(needs(name)) if needed and side not in mattes]
+        reason = next(filter(None, [*absent, reasons[name]]), "")
+        scores[name] = without_value(name, reason) if reason else summarize(name, values[name])
+    return scores, labels, [ONE_SIDED[alpha] for alpha in ONE_SIDED if alpha in alphas]
+
+
+def image_distances(
+    shown: Sequence[Sequence[Images]], paired: bool, families: Sequence[str], networks: Networks,
+    conditions: Conditions, stage: Stage,
+) -> list[Distance]:  # fmt: skip
+    """KID of all images of the two sides, and KID-u where they are paired; a clip is a sequence."""
+    if "kid" not in families:
+        return []
+    if networks.images is None:
+        counts = [sum(map(len, side)) for side in shown]
+        return [_absent(name, counts, networks.missing["kid"], conditions) for name in ("KID", "KID-u")[: 1 + paired]]
+    x, y = (
+        image_features(side, networks.images, stage(f"KID, {title}"))
+        for side, title in zip(_numbered(shown, paired), ("predictions", "truths"), strict=True)
+    )
+    found = kid(x, y, conditions=conditions)
+    if not paired:
+        return [found]
+    beware = "; ".join(filter(None, (found.note, PAIRED)))
+    return [replace(found, note=beware), kid(x, y, paired=True, conditions=conditions)]
+
+
+def _numbered(shown: Sequence[Sequence[Images]], paired: bool) -> Sequence[Sequence[Images]]:
+    """The clips of both sides; unpaired truths are numbered after the predictions, for they are other sequences."""
+    prediction, truth = shown
+    return shown if paired else (prediction, [*([] for _ in prediction), *truth])
+
+
+def video_distances(
+    shown: Sequence[Sequence[Images]], paired: bool, families: Sequence[str], networks: Networks,
+    conditions: Conditions, stage: Stage,
+) -> list[Distance]:  # fmt: skip
+    """FVD, KVD and their companions, each clip a sequence of its own."""
+    if "fvd" not in families:
+        return []
+    if networks.videos is None:
+        counts = [len(side) for side in shown]
+        return [_absent(name, counts, networks.missing["fvd"], conditions) for name in ("FVD", "KVD")]
+    prediction, truth = ([[clip] if len(clip) else [] for clip in side] for side in _numbered(shown, paired))
+    return clip_distances(
+        prediction, truth, networks.videos, paired=paired, conditions=conditions, progress=stage("FVD")
+    )
+
+
+class _Remembering:
+    """A pair distance that knows the last pairs again: the union of two images with alpha is the full frame."""
+
+    def __init__(self, network: PairDistance):
+        self.network = network
+        self.seen: deque[tuple[Tensor, Tensor, Tensor]] = deque(maxlen=2)
+
+    def __call__(self, prediction: Tensor, truth: Tensor) -> Tensor:
+        for x, y, value in self.seen:
+            if torch.equal(x, prediction) and torch.equal(y, truth):
+                return value
+        self.seen.append((prediction, truth, self.network(prediction, truth)))
+        return self.seen[-1][2]
+
+
+def _family(name: str) -> str:
+    metric, _ = split_name(name)
+    return "silhouette" if metric in SILHOUETTES else metric.replace("_", "-")
+
+
+def _absent(name: str, counts: Sequence[int], reason: str, conditions: Conditions) -> Distance:
+    """A distance that has no network to be computed with."""
+    return Distance(
+        name=name, value=None, n=counts[0], m=counts[1], sequences=0, estimator="", interval=None,
+        note=f"not computed: {reason}", extractor="", digest="", resize="", background=conditions.background,
+        crop=conditions.crop, frames=None, fps=conditions.fps,
+    )  # fmt: skip

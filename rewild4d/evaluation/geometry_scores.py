@@ -1,0 +1,84 @@
+"""Scores of a reconstruction's shape: points of its Gaussians against the true surface, over the moments of a clip."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from rewild4d.contracts import Reconstruction
+from rewild4d.io.sampling import sample_gaussians
+from rewild4d.metrics.geometry import Comparison, Fit, compare_sequence
+from rewild4d.metrics.names import ALIGNMENTS, DENSE
+from rewild4d.metrics.score import Score
+from rewild4d.types import Truth
+
+
+def score_geometry(
+    reconstruction: Reconstruction, truth: Truth, times: Sequence[float], names: Sequence[str], points: int
+) -> tuple[dict[str, Score], list[dict[str, Any]]]:
+    """Compare shapes.
+
+    Args:
+        reconstruction: what is scored; `io.sampling.sample_gaussians` says which points stand for it.
+        truth: with a surface.
+        times: moments, seconds.
+        names: out of `metrics.names.GEOMETRY`.
+        points: drawn from each cloud.
+
+    Returns:
+        The scores by name, each with its sampling floor, and the alignments that they stand on.
+    """
+    if not names:
+        return {}, []
+    if truth.sample is None:
+        reason = "not computed: the data set has no geometry"
+        return {name: Score(None, *_kind(name), 0, [], reason) for name in names}, []
+    scores: dict[str, Score] = {}
+    alignments: list[dict[str, Any]] = []
+    for dense, count in DENSE.items():
+        asked = [name for name in names if _parts(name)[1] == dense]
+        if not asked:
+            continue
+        drawn = count or points
+        predictions = [sample_gaussians(reconstruction.at(time), drawn, seed=0) for time in times]
+        truths, seconds = ([truth.sample(time, drawn, seed) for time in times] for seed in (1, 2))
+        for fit, suffix in ALIGNMENTS.items():
+            wanted = [name for name in asked if _parts(name)[0] == suffix]
+            if not wanted:
+                continue
+            found = compare_sequence(
+                predictions, truths, fit=fit, diagonal=truth.diagonal, up=truth.up, seconds=seconds, points=drawn
+            )
+            scores |= {name: _score(found, name) for name in wanted}
+            alignments += _describe(found, fit, drawn)
+    return {name: scores[name] for name in names}, alignments
+
+
+def _parts(name: str) -> tuple[str, str]:
+    """The ends of a name: how predictions were laid on the truth, and how many points."""
+    dense = next((end for end in DENSE if end and name.endswith(end)), "")
+    short = name.removesuffix(dense)
+    return next((suffix for suffix in ALIGNMENTS.values() if suffix and short.endswith(suffix)), ""), dense
+
+
+def _kind(name: str) -> tuple[str, str]:
+    """Unit, and which way is better."""
+    if name.startswith("fscore"):
+        return "1", "higher"
+    return ("1" if name.startswith("chamfer_relative") else "world"), "lower"
+
+
+def _score(found: Comparison, name: str) -> Score:
+    item = found.scores[name.removesuffix(_parts(name)[1])]
+    parts = [part for part in (item.note, found.note if item.value is not None else "") if part]
+    present = sum(value is not None for value in item.per_frame)
+    return Score(item.value, item.unit, item.better, present, list(item.per_frame), "; ".join(parts), item.floor)
+
+
+def _describe(found: Comparison, fit: Fit, points: int) -> list[dict[str, Any]]:
+    return [
+        {
+            "fit": fit, "points": points, "moment": index if fit == "frame" else None, "scale": one.transform.scale,
+            "matrix": one.transform.matrix.tolist(), "start": one.start, "iterations": one.iterations,
+            "converged": one.converged, "clamped": one.clamped,
+        }
+        for index, one in enumerate(found.alignments) if one is not None
+    ]  # fmt: skip

@@ -1,0 +1,155 @@
+"""Score a reconstruction by a protocol: render, composite, align, compare."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from rewild4d.cameras.input_view import finite_at, input_camera
+from rewild4d.cameras.rendering import render
+from rewild4d.contracts import Log, Reconstruction
+from rewild4d.errors import UserError
+from rewild4d.evaluation import geometry_scores, image_scores, novel_views
+from rewild4d.evaluation.networks import Networks, families_of, load_networks
+from rewild4d.evaluation.protocol import Protocol
+from rewild4d.metrics import names
+from rewild4d.metrics.samples import Distance
+from rewild4d.metrics.score import Score
+from rewild4d.metrics.sets import FILE, Compared, write_features
+from rewild4d.types import Clip, Frame, Truth
+
+
+class Evaluation(NamedTuple):
+    """What was measured.
+
+    Attributes:
+        scores: by name.
+        items: label of each held-out image, as in ``Score.per_item`` of image scores.
+        distances: between sets of images or clips, with all that decides their values.
+        alignments: by which shapes were laid on the truth.
+        networks: SHA-256 of the weights that scores leaned on.
+        sets: the features that ``distances`` were computed from.
+    """
+
+    scores: dict[str, Score]
+    items: list[str]
+    distances: list[Distance]
+    alignments: list[dict[str, Any]]
+    networks: dict[str, str]
+    sets: list[Compared]
+
+    def keep(self, folder: Path) -> dict[str, Any]:
+        """The fields of a record; features of sets are written into its folder, for scores pooled over cases."""
+        fields = self._asdict()
+        sets = fields.pop("sets")
+        return fields | {"features": write_features(sets, folder / FILE) if sets else ""}
+
+
+def evaluate(
+    reconstruction: Reconstruction, clip: Clip, truth: Truth, protocol: Protocol, log: Log, device: torch.device
+) -> Evaluation:
+    """Score a reconstruction by all that a protocol asks for.
+
+    Args:
+        reconstruction: of the clip.
+        clip: what the method saw: the reference of novel views, and the moments at which shapes are compared.
+        truth: what it did not see.
+        protocol: what is measured.
+        log: progress.
+        device: where the metric networks compute.
+    """
+    networks = load_networks(families_of(protocol.scores), device)
+    scores, items = _score_images(reconstruction, truth, protocol, networks, log)
+    shape = [name for name in protocol.scores if name in names.GEOMETRY]
+    found, alignments = geometry_scores.score_geometry(reconstruction, truth, clip.times, shape, protocol.points or 0)
+    scores |= found
+    sets = [name for name in protocol.scores if name in names.SETS]
+    distances: list[Distance] = []
+    compared: list[Compared] = []
+    if protocol.novel is not None and sets:
+        distances, compared = novel_views.novel_view_distances(
+            reconstruction, clip, protocol.novel, names=sets, background=protocol.background, render=render,
+            images=networks.images, videos=networks.videos, log=log, up=truth.up,
+        )  # fmt: skip
+        scores |= novel_views.as_scores(distances, sets, dict(networks.missing))
+    used = {name: network.digest for name, network in networks.lpips.items()}
+    used |= {distance.extractor: distance.digest for distance in distances}
+    return Evaluation({name: scores[name] for name in protocol.scores}, items, distances, alignments, used, compared)
+
+
+@torch.no_grad()
+def input_psnr(reconstruction: Reconstruction, shown: Clip, background: float) -> Score:
+    """PSNR of the frames that the method was shown, over the full frame: how closely it fits them, which tells nothing
+    of what it was not shown, and beside the held-out PSNR whether it lacks freedom or evidence.
+
+    Args:
+        reconstruction: of the clip.
+        shown: what the method saw, with cameras where the reconstruction knows none.
+        background: grey level in [0, 1] behind prediction and truth alike.
+    """
+    values: list[float | None] = []
+    for batch in _batches(shown.frames, 16):
+        beside = _beside(batch, list(_render_frames(reconstruction, batch)), background)
+        values += image_scores.measure("psnr", beside, {})
+    return image_scores.summarize("psnr", values)
+
+
+def _score_images(
+    reconstruction: Reconstruction, truth: Truth, protocol: Protocol, networks: Networks, log: Log
+) -> tuple[dict[str, Score], list[str]]:
+    """The scores of held-out images, and the label of each image."""
+    asked = [name for name in protocol.scores if name in names.IMAGES]
+    absent = {name: networks.missing.get(names.split_name(name)[0].replace("_", "-")) for name in asked}
+    values: dict[str, list[float | None]] = {name: [] for name in asked if not absent[name]}
+    labels = []
+    total = len(truth.held_out) if asked else 0
+    for batch in _batches(truth.held_out if asked else (), 16):
+        rendered = list(_render_frames(reconstruction, batch))
+        shown = _beside(batch, rendered, protocol.background)
+        for name in values:
+            values[name] += image_scores.measure(name, shown, networks.lpips)
+        labels += [f"view {frame.view} at {frame.time:.4f} s" for frame in batch]
+        log(len(labels), total, {})
+    scores = {name: image_scores.summarize(name, items) for name, items in values.items()}
+    scores |= {name: image_scores.without_value(name, reason) for name, reason in absent.items() if reason}
+    return scores, labels
+
+
+def _render_frames(reconstruction: Reconstruction, frames: Iterable[Frame]) -> Iterator[tuple[Tensor, Tensor]]:
+    """Render each frame's camera at its time; the Gaussians of one time are asked for once."""
+    time, splats = None, None
+    for frame in frames:
+        if splats is None or frame.time != time:
+            time, splats = frame.time, finite_at(reconstruction, frame.time)
+        camera = input_camera(reconstruction, frame)
+        if camera is not None:
+            yield render(splats, camera)
+        elif not len(splats):
+            yield torch.zeros_like(frame.rgb), torch.zeros_like(frame.mask)
+        else:
+            raise UserError(
+                f"the frame at {frame.time:.4f} s needs a camera, but neither the data set nor the "
+                "reconstruction knows it."
+            )
+
+
+def _beside(frames: list[Frame], rendered: list[tuple[Tensor, Tensor]], background: float) -> image_scores.Beside:
+    target = torch.stack([frame.over(background) for frame in frames])
+    mask = torch.stack([frame.mask for frame in frames])
+    alpha = torch.stack([alpha for _, alpha in rendered])
+    image = (torch.stack([color for color, _ in rendered]) + (1 - alpha) * background).clamp(0, 1)
+    return image_scores.Beside(image, target.clamp(0, 1), alpha, mask, background)
+
+
+def _batches(frames: Iterable[Frame], size: int) -> Iterator[list[Frame]]:
+    """Groups of equally sized frames, in order."""
+    batch: list[Frame] = []
+    for frame in frames:
+        if batch and (len(batch) == size or frame.mask.shape != batch[0].mask.shape):
+            yield batch
+            batch = []
+        batch.append(frame)
+    if batch:
+        yield batch

@@ -1,0 +1,91 @@
+"""Load the networks that learned metrics need, or say which weights are missing."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from rewild4d.metrics import names
+from rewild4d.metrics.samples import ImageExtractor
+from rewild4d.metrics.score import Score
+from rewild4d.metrics.video import VideoExtractor
+from rewild4d.metrics.weights import WeightsMissing, is_here
+
+FAMILIES = ("psnr", "ssim", "lpips-alex", "lpips-vgg", "silhouette", "kid", "fvd")
+"""What may be asked for; `score --only` chooses from these."""
+NETWORKS = {"lpips-alex": "lpips-alex", "lpips-vgg": "lpips-vgg", "kid": "inception-fid", "fvd": "i3d-k400"}
+"""Families that need a network, and whose weights they are (`metrics.weights`)."""
+
+
+class LpipsNetwork(Protocol):
+    """What `rewild4d.metrics.features.Lpips` is, as far as it is needed here."""
+
+    digest: str
+
+    def __call__(self, prediction: Tensor, target: Tensor, /) -> Tensor:
+        """Two batches [B, 3, H, W] in [0, 1] -> [B]."""
+
+
+@dataclass(frozen=True)
+class Networks:
+    """What the learned metrics need; a user's own extractor takes the place of any.
+
+    Attributes:
+        lpips: "lpips_alex", "lpips_vgg" -> distance of two batches.
+        images: of KID, or None.
+        videos: of FVD and KVD, or None.
+        missing: why one is not there, by family ("lpips-alex", "kid", "fvd").
+    """
+
+    lpips: Mapping[str, LpipsNetwork] = field(default_factory=dict)
+    images: ImageExtractor | None = None
+    videos: VideoExtractor | None = None
+    missing: Mapping[str, str] = field(default_factory=dict)
+
+
+def load_networks(families: Sequence[str], device: torch.device) -> Networks:
+    """The networks that some families need; one whose weights are not here is named in ``missing``.
+
+    Raises:
+        UserError: a weight file that is there is not the one it should be.
+    """
+    from rewild4d.metrics.features import Lpips, i3d, inception
+
+    makers: dict[str, Callable[[], Any]] = {
+        "lpips-alex": lambda: Lpips("alex", device=device),
+        "lpips-vgg": lambda: Lpips("vgg", device=device),
+        "kid": lambda: inception(device=device),
+        "fvd": lambda: i3d(device=device),
+    }
+    made: dict[str, Any] = {}
+    missing: dict[str, str] = {}
+    for family in [family for family in makers if family in families]:
+        try:
+            made[family] = makers[family]()
+        except WeightsMissing as error:
+            missing[family] = str(error)
+    lpips = {family.replace("-", "_"): made[family] for family in ("lpips-alex", "lpips-vgg") if family in made}
+    return Networks(lpips, made.get("kid"), made.get("fvd"), missing)
+
+
+def families_of(scores: Iterable[str]) -> list[str]:
+    """List the families of networks that scores need."""
+    found = set()
+    for name in scores:
+        metric = names.split_name(name)[0]
+        if metric.startswith("lpips"):
+            found.add(metric.replace("_", "-"))
+        elif name in names.SETS:
+            found.add("kid" if name == "kid_v" else "fvd")
+    return sorted(found)
+
+
+def may_be_scored_now(scores: Mapping[str, Score]) -> bool:
+    """Tell whether any of a record's scores was left out for want of a network that is here now."""
+    missing = str(WeightsMissing())
+    families = families_of(
+        name for name, score in scores.items() if score.value is None and score.note.endswith(missing)
+    )
+    return any(is_here(NETWORKS[family]) for family in families)

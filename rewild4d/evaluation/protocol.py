@@ -1,0 +1,130 @@
+"""Evaluation protocols: a TOML file names what is held out and what is measured."""
+
+from importlib import metadata, resources
+from importlib.resources.abc import Traversable
+from typing import Literal
+
+import msgspec
+
+from rewild4d.contracts import Selection
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.files import digest
+from rewild4d.metrics import names
+
+
+class NovelViews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How novel views are drawn and compared; a protocol holds one.
+
+    Attributes:
+        frames: moments, evenly spaced over the clip, that KID-V sees from every view.
+        clip: frames T of a clip that FVD sees; a shorter video is padded with its last frame.
+        stride: frames from the start of one clip to that of the next.
+        upright: the circle is level in the world (`world_up`) and its middle is that of the images. Left out, as in
+            the first versions: up is the mean of the cameras' own, which tilts the circle of a camera that did not go
+            around the animal, and the images have the first one's principal point.
+    """
+
+    frames: int = 8
+    clip: int = 16
+    stride: int = 8
+    upright: Literal[True] | None = None
+
+
+class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One named, versioned way to score a reconstruction.
+
+    Attributes:
+        name: equals the file's name; ends in the version.
+        dataset: which reader it is for.
+        title: for table captions.
+        description: one paragraph that travels with the numbers.
+        background: grey level in [0, 1] behind prediction and truth alike.
+        scores: what is measured, out of `metrics.names.ALL`: on held-out images, on the shape, on novel views as a set.
+        floors: methods that are always printed beside the others.
+        selection: what a method gets and what is held out.
+        default: the data set's protocol where the user names none; the highest version where several say so.
+        points: drawn from each cloud for scores of the shape.
+        novel: how novel views are drawn for scores of sets.
+    """
+
+    name: str
+    dataset: str
+    title: str
+    description: str
+    background: float
+    scores: tuple[str, ...]
+    floors: tuple[str, ...]
+    selection: Selection
+    default: bool = False
+    points: int | None = None
+    novel: NovelViews | None = None
+
+    def __post_init__(self) -> None:
+        for name in self.scores:
+            if name not in names.ALL:
+                raise ValueError(f"unknown score '{name}'")
+        if self.points is None and any(name in names.GEOMETRY for name in self.scores):
+            raise ValueError("scores of the shape need 'points'")
+        if self.novel is None and any(name in names.SETS for name in self.scores):
+            raise ValueError("scores of novel views need a table 'novel'")
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over every setting; one that is left out, and came later than the protocol, changes nothing."""
+        later = {"points": self.points, "novel": self.novel}
+        given = msgspec.to_builtins(self)
+        for name, value in later.items():
+            if value is None:
+                del given[name]
+        if self.selection.split is None:
+            del given["selection"]["split"]
+        if self.novel is not None and self.novel.upright is None:
+            del given["novel"]["upright"]
+        return digest(msgspec.json.encode(given))
+
+
+def load_protocols() -> dict[str, Protocol]:
+    """All protocols by name: our own, then those of packages that installed some (entry point `rewild4d.protocols`).
+
+    Raises:
+        UserError: a package's protocol cannot be read, or has a name that is taken.
+    """
+    folder = resources.files("rewild4d.leaderboard") / "protocols"
+    found = {protocol.name: protocol for protocol in map(_decode, _tomls(folder))}
+    for entry in metadata.entry_points(group="rewild4d.protocols"):
+        try:
+            added = [_decode(file) for file in _tomls(resources.files(entry.value))]
+        except (ImportError, OSError, msgspec.DecodeError) as error:
+            raise UserError(f"protocols '{entry.name}': {entry.value}: {error}.") from error
+        for protocol in added:
+            if found.setdefault(protocol.name, protocol) is not protocol:
+                raise UserError(f"protocols '{entry.name}': {entry.value}: the name '{protocol.name}' is taken.")
+    return found
+
+
+def _tomls(folder: Traversable) -> list[Traversable]:
+    files = (entry for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    return sorted(files, key=lambda entry: entry.name)
+
+
+def _decode(file: Traversable) -> Protocol:
+    return msgspec.toml.decode(file.read_bytes(), type=Protocol)
+
+
+def find_protocol(dataset: str, name: str | None) -> Protocol:
+    """The protocol of that name, or the data set's default.
+
+    Raises:
+        UserError: unknown, or made for another data set.
+    """
+    protocols = load_protocols()
+    if name is None:
+        names = [p.name for p in protocols.values() if p.dataset == dataset and p.default]
+        name = max(names, key=lambda text: int(text.rpartition("-v")[2]), default=None)
+        if name is None:
+            raise UserError(f"--protocol: the data set '{dataset}' has no default; name one of its protocols.")
+    if name not in protocols:
+        raise unknown_name("protocol", name, protocols)
+    if protocols[name].dataset != dataset:
+        raise UserError(f"protocol '{name}' is for the data set '{protocols[name].dataset}', not for '{dataset}'.")
+    return protocols[name]

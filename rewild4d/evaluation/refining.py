@@ -1,0 +1,33 @@
+"""What is scored: the reconstruction as it was fitted, or, where its kind has that, refined on the scored frames."""
+
+from rewild4d.cameras.recropping import seen_by
+from rewild4d.contracts import Log, Reconstruction
+from rewild4d.types import Clip, Truth
+
+
+def ready_to_score(
+    reconstruction: Reconstruction, clip: Clip, truth: Truth, shown: Clip, log: Log
+) -> tuple[Reconstruction, Clip, Truth]:
+    """A reconstruction, its clip and its truth as they are scored.
+
+    Frames without a camera get the reconstruction's. A held-out frame without one is a moment of the input view; a
+    reconstruction that can be `refined` (contracts.Reconstruction) is fitted to those, and to nothing else.
+
+    Args:
+        reconstruction: of ``shown``.
+        clip: all frames of the video.
+        truth: as the data set gives it.
+        shown: the frames of the clip that the method saw.
+        log: progress.
+
+    Raises:
+        ValueError: what is refined does not say so in its marks.
+    """
+    clip, placed = seen_by(reconstruction, clip, truth, shown)
+    refine = getattr(reconstruction, "refined", None)
+    if refine is None or not len(truth.held_out) or truth.held_out[0].camera is not None:
+        return reconstruction, clip, placed
+    refined = refine([frame for frame in placed.held_out if frame.camera is not None], log)
+    if not getattr(refined, "marks", ()):
+        raise ValueError(f"{type(reconstruction).__name__}.refined: expected marks that say so, got none.")
+    return refined, clip, placed

@@ -1,0 +1,1 @@
+"""Read and write PLY, OBJ and GLB files, and sample their surfaces."""

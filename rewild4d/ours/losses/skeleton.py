@@ -1,0 +1,102 @@
+"""The skeleton's own regularisers of a batch of poses, and the neighbouring frames that one of them needs."""
+
+import math
+
+from torch import Tensor
+
+from rewild4d.kernels.arrays import fits
+from rewild4d.ours.config import Geometry
+from rewild4d.ours.fused.skeleton import Weights, stand
+from rewild4d.ours.losses.regularizers import attach_loss, limit_loss, sagittal_losses, still_loss, temporal_loss
+from rewild4d.ours.model import Model
+from rewild4d.ours.pose import Pose
+from rewild4d.ours.symmetry import Key
+from rewild4d.types import OBJECT_DIAGONAL
+
+
+def neighbour_keys(keys: list[Key], frames: int, config: Geometry) -> tuple[list[Key], list[int]]:
+    """Each view with the frames before and after it, in triples, and the rows of the views themselves.
+
+    At an end of the clip the triple is moved inwards. Clips of two frames get no neighbours, nor does who needs none.
+
+    Args:
+        keys: the views of a step.
+        frames: number of frames.
+        config: the weights of the temporal terms.
+    """
+    if (not config.temporal and not config.still) or frames < 3:
+        return keys, list(range(len(keys)))
+    triples, own = [], []
+    for row, key in enumerate(keys):
+        middle = min(max(key.frame, 1), frames - 2)
+        triples += [key._replace(frame=middle + offset) for offset in (-1, 0, 1)]
+        own.append(3 * row + key.frame - middle + 1)
+    return triples, own
+
+
+def stance(model: Model, poses: Pose, rows: list[int], config: Geometry) -> tuple[Pose, Tensor, Tensor]:
+    """Chosen poses of a batch, their transforms, and the regularisers of the whole batch.
+
+    Args:
+        model: gives the skeleton.
+        poses: [B, J, ...]; where B = 3 k, triples of neighbouring frames as `neighbour_keys` makes them.
+        rows: which are chosen, k of them.
+        config: the weights of joint limits, attachment, planes and (over triples) temporal smoothness and stillness.
+
+    Returns:
+        Poses [k, J, ...], transforms [k, J, 4, 4] and the weighted sum, scalar.
+    """
+    triples = len(poses.quats) == 3 * len(rows)
+    skeleton = model.pivots, model.parents, model.mirror
+    if fits(poses.quats):
+        *own, transforms, total = stand(*poses, rows, *skeleton, _weights(config, triples))
+        return Pose(*own), transforms, total
+    transforms = model.transforms(poses)
+    total = skeleton_losses(model, poses, transforms, config, triples)
+    return Pose(*(tensor[rows] for tensor in poses)), transforms[rows], total
+
+
+def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geometry, triples: bool) -> Tensor:
+    """Weighted sum of joint limits, attachment, planes and (over triples) smoothness and stillness, scalar.
+
+    Args:
+        model: gives the skeleton.
+        pose: [B, J, ...].
+        transforms: of the same poses, [B, J, 4, 4].
+        config: the weights.
+        triples: whether the poses are those of triples of neighbouring frames; of others no step is known.
+    """
+    if fits(pose.quats):
+        return stand(*pose, [], model.pivots, model.parents, model.mirror, _weights(config, triples))[-1]
+    total = pose.shifts.sum() * 0.0
+    if config.limit:
+        total = total + config.limit * limit_loss(pose, model.parents, config.limit_degrees)
+    if config.attach:
+        total = total + config.attach * attach_loss(transforms, model.pivots, model.parents)
+    planes, skeleton = _plane_weights(config), (model.pivots, model.parents, model.mirror)
+    for weight, loss in zip(planes, sagittal_losses(pose, transforms, *skeleton), strict=True):
+        total = total + weight * loss
+    if config.temporal and triples:
+        total = total + config.temporal * temporal_loss(pose)
+    if config.still and triples:
+        total = total + config.still * still_loss(pose, config.still_step)
+    return total
+
+
+def _weights(config: Geometry, triples: bool) -> Weights:
+    cosine = math.cos(math.radians(config.limit_degrees) / 2)
+    temporal, still = (config.temporal, config.still) if triples else (0.0, 0.0)
+    return Weights(
+        config.limit,
+        *_plane_weights(config),
+        cosine,
+        config.attach,
+        temporal,
+        still,
+        config.still_step,
+        OBJECT_DIAGONAL,
+    )
+
+
+def _plane_weights(config: Geometry) -> tuple[float, float, float]:
+    return config.limb_plane, config.body_plane, config.sideways

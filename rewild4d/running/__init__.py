@@ -1,0 +1,1 @@
+"""Turn a plan into records: plan, run, resume, and describe what was run."""

@@ -1,0 +1,153 @@
+"""What every method must keep, tested on a case small enough for any machine: `check --method NAME`.
+
+A plug-in that passes can be run, resumed, evaluated again and compared.
+"""
+
+import math
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from rewild4d.cameras.rendering import render
+from rewild4d.config import load_preset
+from rewild4d.contracts import Finding, Method, Reconstruction
+from rewild4d.errors import UserError
+from rewild4d.files import digest
+from rewild4d.priors.kinematics import pose
+from rewild4d.priors.motion import pose_at, pose_gaussians, quats_from_normals, sample_surface
+from rewild4d.priors.template import MIRROR, PARENTS, quadruped
+from rewild4d.progress import Progress
+from rewild4d.registry import load_method
+from rewild4d.running.runner import save_reconstruction
+from rewild4d.transforms import (
+    camera_in_object,
+    look_at,
+    mirror_camera,
+    mirror_transforms,
+    similarity,
+    transform_splats,
+)
+from rewild4d.types import Camera, Case, Clip, Frame, Prior, Splats, Truth
+
+
+def check_method(name: str, preset: str) -> list[Finding]:
+    """Fit the method twice on a tiny case and look whether it keeps the contract."""
+    method = load_method(name)
+    config = load_preset(name, method.Config, preset)
+    case = tiny_case()
+    findings = []
+    with tempfile.TemporaryDirectory() as folder:
+        for title, test in _checks(name, method, config, case, Path(folder)):
+            try:
+                message = test()
+                findings.append(Finding("error" if message else "ok", f"{name}: {title}", message or "kept"))
+            except Exception as error:  # whatever a plug-in raises is what the check is there to report
+                findings.append(Finding("error", f"{name}: {title}", f"{type(error).__name__}: {error}"))
+                if title == "fits":
+                    break
+    return findings
+
+
+def _checks(
+    name: str, method: Method, config: Any, case: Case, folder: Path
+) -> Iterator[tuple[str, Callable[[], str]]]:
+    """The checks in order: each gives an empty string where the promise is kept, or what came instead."""
+    fitted: list[Reconstruction] = []
+
+    def fit(clip: Clip = case.clip, workdir: Path | None = None) -> Reconstruction:
+        progress = Progress(f"check {name}")
+        try:
+            return method.fit(
+                clip, case.prior, config=config, seed=0, device=torch.device("cpu"), log=progress, workdir=workdir
+            )
+        finally:
+            progress.close()
+
+    def fits() -> str:
+        (folder / "work").mkdir()
+        fitted.append(fit(workdir=folder / "work"))
+        splats = fitted[0].at(case.clip.times[0])
+        return "" if isinstance(splats, Splats) else f"expected types.Splats from at(time), got {type(splats).__name__}"
+
+    def repeats() -> str:
+        return _difference(fitted[0], fit(), case, "a second fit with the same seed")
+
+    def reloads() -> str:
+        save_reconstruction(fitted[0], folder / "saved")
+        return _difference(fitted[0], method.load(folder / "saved", torch.device("cpu")), case, "the saved one")
+
+    def resumes() -> str:
+        return _difference(fitted[0], fit(workdir=folder / "work"), case, "a fit resumed in a finished work folder")
+
+    def refuses() -> str:
+        empty = replace(case.clip.frames[1], mask=torch.zeros_like(case.clip.frames[1].mask))
+        frames = (case.clip.frames[0], empty, *case.clip.frames[2:])
+        try:
+            fit(replace(case.clip, frames=frames, digest=digest(case.clip.digest, "empty")))
+        except UserError as error:
+            return "" if str(error) else "expected a sentence in the UserError, got nothing"
+        return "" if method.info.is_floor else "expected a UserError on an empty mask, got a reconstruction"
+
+    yield "fits", fits
+    yield "same seed, same result", repeats
+    yield "save and load, same pixels", reloads
+    yield "resumes to the same result", resumes
+    yield "refuses an empty mask in one sentence", refuses
+
+
+def _difference(one: Reconstruction, other: Reconstruction, case: Case, what: str) -> str:
+    for frame in (case.clip.frames[0], case.truth.held_out[-1]):
+        assert frame.camera is not None
+        pictures = [render(reconstruction.at(frame.time), frame.camera) for reconstruction in (one, other)]
+        if not torch.equal(pictures[0][0], pictures[1][0]):
+            largest = float((pictures[0][0] - pictures[1][0]).abs().max())
+            return f"expected the same pixels from {what}, got a difference of up to {largest:.2e}"
+    return ""
+
+
+def tiny_case(frames: int = 4, width: int = 96, height: int = 64, views: int = 6) -> Case:
+    """A walking template seen from a ring of cameras in a turned, scaled world: the truth is known exactly."""
+    template, mirror = quadruped(), torch.tensor(MIRROR)
+    times = torch.arange(frames, dtype=torch.float64) / 10
+    angles = torch.zeros(frames, len(PARENTS), 3)
+    for leg, phase in zip((10, 13, 16, 19), (0.0, 0.5, 0.0, 0.5), strict=True):
+        angles[:, leg, 0] = 0.4 * torch.sin(2 * math.pi * (times.float() * 2 + phase))
+    transforms = pose(angles, template.bones[:, 0], PARENTS)
+    turn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3)))[0]
+    world = similarity(0.3, turn * torch.linalg.det(turn), torch.tensor((0.4, -0.2, 0.7), dtype=torch.float64))
+    ring = [_ring_camera(world, 2 * math.pi * view / views, width, height) for view in range(views)]
+    cameras = tuple(camera_in_object(ring[i % views], world) for i in range(frames))
+    prior = Prior(
+        name="exact", provenance="the template that the images were drawn from", vertices=template.vertices,
+        faces=template.faces, weights=template.weights, bones=template.bones, parents=torch.tensor(PARENTS),
+        mirror=mirror, times=times, object_to_world=world.expand(frames, 4, 4).clone(), cameras=cameras,
+        transforms=transforms, cameras_flip=tuple(map(mirror_camera, cameras)),
+        transforms_flip=mirror_transforms(transforms, mirror), quality={}, digest=digest(transforms, world),
+    )  # fmt: skip
+    sample = sample_surface(prior, 4000, torch.Generator().manual_seed(0))
+    colors = 0.5 + 0.4 * torch.sin(3 * sample.points)
+    scales = sample.radius * torch.tensor((1.0, 1.0, 0.5)).expand(4000, 3)
+
+    def shot(index: int, view: int) -> Frame:
+        object_to_world, posed = pose_at(prior, float(times[index]))
+        splats = pose_gaussians(sample, quats_from_normals(sample.normals), scales, colors, posed)
+        rgb, mask = render(transform_splats(splats, object_to_world), ring[view])
+        return Frame(float(times[index]), ring[view], rgb, mask, view)
+
+    shown = tuple(shot(i, i % views) for i in range(frames))
+    held = [shot(i, (i + 2) % views) for i in range(frames)]
+    key = digest(*(frame.rgb for frame in shown))
+    return Case(Clip("tiny/walk", "template", shown, 10.0, "CC0 1.0", key), prior, Truth(held, None, key))
+
+
+def _ring_camera(world: torch.Tensor, azimuth: float, width: int, height: int) -> Camera:
+    """A camera that looks at the animal from an azimuth, a little from above."""
+    place = torch.tensor((12 * math.sin(azimuth), 4.0, 12 * math.cos(azimuth), 1.0), dtype=torch.float64)
+    up = torch.nn.functional.normalize(world[:3, 1], dim=0)
+    focal = 1.6 * width
+    intrinsics = torch.tensor(((focal, 0, width / 2), (0, focal, height / 2), (0, 0, 1)), dtype=torch.float64)
+    return Camera(look_at((world @ place)[:3], world[:3, 3], up), intrinsics, width, height)

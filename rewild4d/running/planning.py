@@ -1,0 +1,217 @@
+"""From a table's file to what has to be run for it, and to which records are its rows."""
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any
+
+import msgspec
+
+from rewild4d.config import load_preset, preset_names
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.evaluation.protocol import Protocol, load_protocols
+from rewild4d.leaderboard.records import RunRecord
+from rewild4d.leaderboard.specs import Condition, Line, Spec, load_reported
+from rewild4d.leaderboard.tables import Entrant, Frame
+from rewild4d.leaderboard.variants import is_floor, latest
+from rewild4d.priors.choose import PriorChoice
+from rewild4d.priors.config import PRESETS as PRIOR_PRESETS
+from rewild4d.priors.config import STANDARD
+from rewild4d.registry import load_dataset, load_method, names
+from rewild4d.running.provenance import FROM_TRUTH
+from rewild4d.running.runner import Entry
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What the command line may change in a table.
+
+    Attributes:
+        preset: of every row that names none; "" leaves the table's.
+        protocol: instead of that of a table with one condition; "" leaves it.
+    """
+
+    preset: str = ""
+    protocol: str = ""
+
+
+def with_choice(name: str, spec: Spec, choice: Choice) -> Spec:
+    """The table after the command line's changes, protocols by their full names.
+
+    Raises:
+        UserError: an unknown protocol, or one for a table of several conditions.
+    """
+    conditions = spec.conditions
+    if choice.protocol:
+        if len(conditions) > 1:
+            raise UserError(f"--protocol: the table '{name}' compares {len(conditions)} conditions of its own.")
+        conditions = (msgspec.structs.replace(conditions[0], protocol=known_protocol(choice.protocol)),)
+    full = tuple(msgspec.structs.replace(one, protocol=newest_protocol(one.protocol)) for one in conditions)
+    return msgspec.structs.replace(spec, conditions=full, preset=choice.preset or spec.preset)
+
+
+def newest_protocol(name: str) -> str:
+    """The full name of a protocol: of a family ("artemis-sweep-256") the highest version; unknown ones are left."""
+    protocols = load_protocols()
+    family = [known for known in protocols if known.rpartition("-v")[0] == name]
+    return max(family, key=lambda known: int(known.rpartition("-v")[2])) if family else name
+
+
+def known_protocol(name: str, recorded: Iterable[str] = ()) -> str:
+    """The full name of a protocol or family that ships or is installed, or of which there are records.
+
+    Raises:
+        UserError: unknown.
+    """
+    full, known = newest_protocol(name), {*load_protocols(), *recorded}
+    if full not in known:
+        raise unknown_name("protocol", name, known)
+    return full
+
+
+def row_entry(table: str, row: Line, spec: Spec, seeds: tuple[int, ...]) -> Entry:
+    """Method and full settings of a row.
+
+    Raises:
+        UserError: an unknown method or preset, or settings that do not fit the method.
+    """
+    if row.method not in names("methods"):
+        raise UserError(f"table '{table}', row '{row.label}': {unknown_name('method', row.method, names('methods'))}")
+    config_type = load_method(row.method).Config
+    preset = (row.preset or spec.preset) if preset_names(row.method) else "default"
+    base = msgspec.to_builtins(load_preset(row.method, config_type, preset))
+    try:
+        config = msgspec.convert(_merged(base, row.settings), type=config_type)
+    except msgspec.ValidationError as error:
+        raise UserError(
+            f"table '{table}', row '{row.label}': the settings do not fit '{row.method}': {error}."
+        ) from error
+    return Entry(row.method, preset, config, seeds)
+
+
+def entries(name: str, spec: Spec, seeds: tuple[int, ...]) -> tuple[Entry, ...]:
+    """What to run for the rows of a table, equal ones once."""
+    found: list[Entry] = []
+    for row in spec.rows:
+        entry = row_entry(name, row, spec, seeds)
+        if all((entry.method, entry.config) != (other.method, other.config) for other in found):
+            found.append(entry)
+    return tuple(found)
+
+
+def grounds(spec: Spec) -> dict[tuple[str, str], tuple[str, ...]]:
+    """(protocol, prior) of the conditions, each once, with the patterns of cases that any of them wants, () for all."""
+    found: dict[tuple[str, str], tuple[str, ...]] = {}
+    for one in spec.conditions:
+        key = one.protocol, one.prior
+        whole = not one.cases or (key in found and not found[key])
+        found[key] = () if whole else (*found.get(key, ()), *one.cases)
+    return found
+
+
+def frame(name: str, spec: Spec) -> Frame:
+    """Titles and columns of a table."""
+    several = len(spec.conditions) > 1
+    titles = tuple(one.title or one.protocol if several else "" for one in spec.conditions)
+    where = ", ".join(dict.fromkeys(f"`{one.protocol}`" for one in spec.conditions))
+    caption = " ".join([*spec.description.split(), f"Preset {spec.preset}; {where}."])
+    return Frame(name, spec.title, caption, titles, spec.scores)
+
+
+def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[Entrant], list[str]]:
+    """The rows of a table with their records, then the floors of its protocols, and sentences on records left out."""
+    kept, remarks = latest([r for r in records if any(_is_under(r, condition, spec) for condition in spec.conditions)])
+    kept = [_beside_equals(record) for record in kept]
+    under = [tuple(r for r in kept if _is_under(r, condition, spec)) for condition in spec.conditions]
+    rows = []
+    for row in spec.rows:
+        notes = (row.note,) if row.note else ()
+        try:
+            entry = row_entry(name, row, spec, ())
+        except UserError as error:
+            rows.append(Entrant(row.label, ((),) * len(under), str(error), notes))
+            continue
+        own = tuple(
+            tuple(r for r in found if r.method == entry.method and _equals(r.config, entry.config)) for found in under
+        )
+        rows.append(Entrant(row.label, own, "", notes))
+    shown = {row.method for row in spec.rows}
+    # A floor has no rows of its own: it stands beside the cases that the rows were run on.
+    cases = [{r.case for row in rows for r in row.records[index]} for index in range(len(under))]
+    floors = dict.fromkeys(r.method for found in under for r in found if is_floor(r) and r.method not in shown)
+    for floor in floors:
+        own = tuple(
+            tuple(r for r in found if r.method == floor and r.case in cases[index]) for index, found in enumerate(under)
+        )
+        if any(own):
+            rows.append(Entrant(floor, own))
+    return rows, [*remarks, *_missing(spec, cases)]
+
+
+def reported(spec: Spec) -> Any:
+    """What the paper printed in this table's place, or None."""
+    return load_reported(spec.paper) if spec.paper else None
+
+
+def protocol_of(spec: Spec, name: str) -> Protocol:
+    """The protocol of a condition.
+
+    Raises:
+        UserError: unknown, or made for another data set.
+    """
+    protocols = load_protocols()
+    if name not in protocols:
+        raise unknown_name("protocol", name, protocols)
+    if protocols[name].dataset != spec.dataset:
+        raise UserError(f"protocol '{name}' is for the data set '{protocols[name].dataset}', not for '{spec.dataset}'.")
+    return protocols[name]
+
+
+def _is_under(record: RunRecord, condition: Condition, spec: Spec) -> bool:
+    choice = record.prior.get("choice", record.prior.get("name"))
+    wanted = spec.dataset, condition.protocol, condition.prior
+    fits = not condition.cases or any(fnmatchcase(record.case, pattern) for pattern in condition.cases)
+    effort = record.prior.get("config")  # records from before it was written have none
+    known_cameras = record.protocol.get("selection", {}).get("cameras") != "unknown"
+    asked = PriorChoice(condition.prior, PRIOR_PRESETS.get(spec.preset, STANDARD)).settings_under(known_cameras)
+    same_effort = effort is None or _equals(effort, asked)
+    same_points = record.prior.get("keypoints", "none") == getattr(load_dataset(spec.dataset), "keypoint_use", "none")
+    return (record.dataset, record.protocol["name"], choice) == wanted and fits and same_effort and same_points
+
+
+def _missing(spec: Spec, cases: Sequence[Collection[str]]) -> list[str]:
+    """A sentence on the cases that the table's file names and no row has; conditions without any say so in the cells.
+
+    Args:
+        spec: the table.
+        cases: that the rows were run on, under each condition.
+    """
+    absent = [
+        pattern
+        for condition, found in zip(spec.conditions, cases, strict=True)
+        for pattern in condition.cases
+        if found and not any(fnmatchcase(case, pattern) for case in found)
+    ]
+    names = ", ".join(dict.fromkeys(absent))
+    return [f"Missing: there is no record here of {names}, which the table's file names too."] if absent else []
+
+
+def _beside_equals(record: RunRecord) -> RunRecord:
+    """Without the mark of a prior made from the truth: a condition names its prior, and all rows have the same."""
+    return msgspec.structs.replace(record, marks=[mark for mark in record.marks if mark != FROM_TRUTH])
+
+
+def _equals(settings: Any, wanted: msgspec.Struct) -> bool:
+    """Whether a record's settings are these; those that came later than the record have their defaults in it."""
+    try:
+        return msgspec.convert(settings, type=type(wanted)) == wanted
+    except msgspec.ValidationError:
+        return False
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested settings with some of them changed; a name that is not there is kept, so that reading it complains."""
+    merged = dict(base)
+    for name, value in changes.items():
+        merged[name] = _merged(merged.get(name, {}), value) if isinstance(value, dict) else value
+    return merged

@@ -1,0 +1,88 @@
+"""What a record says of a run beside its scores: data, prior, inputs, marks and the method's own figures."""
+
+import json
+from typing import Any
+
+import msgspec
+
+from rewild4d.contracts import DatasetReader, Reconstruction
+from rewild4d.evaluation.measuring import input_psnr
+from rewild4d.priors.choose import PriorChoice
+from rewild4d.priors.config import STANDARD
+from rewild4d.registry import load_method
+from rewild4d.types import Clip, Prior
+
+FROM_TRUTH = "upper bound: its prior was made from the truth"
+
+
+def reading(reader: DatasetReader, clip: Clip) -> dict[str, str]:
+    """How the data was read: the reader's settings, what it left out, what it was rendered from, if anything."""
+    settings, recipe = getattr(reader, "settings", {}), getattr(reader, "recipe", None)
+    found = {
+        "settings": json.dumps(settings) if settings else "",
+        "notes": "; ".join(clip.notes),
+        "recipe": recipe(clip.name) if recipe else "",
+    }
+    return {name: text for name, text in found.items() if text}
+
+
+def prior_of(prior: Prior | None) -> dict[str, Any]:
+    """The prior that was made, if any was."""
+    if prior is None:
+        return {"name": "none"}
+    said = {"name": prior.name, "provenance": prior.provenance, "digest": prior.digest, "quality": prior.quality}
+    return said | ({"notes": list(prior.notes)} if prior.notes else {})
+
+
+def left_out(clip: Clip, shown: Clip | None) -> dict[str, list[int]]:
+    """Rows of the frames that the method was not shown, because the prior does not know their cameras, if any."""
+    times = set(clip.times if shown is None else shown.times)
+    rows = [row for row, time in enumerate(clip.times) if time not in times]
+    return {"left_out": rows} if rows else {}
+
+
+def shown_of(clip: Clip, prior: dict[str, Any]) -> Clip:
+    """What a record's method was shown of its clip; ``prior`` as the record has it."""
+    missing = set(prior.get("left_out", ()))
+    return clip.only([row for row in range(len(clip.frames)) if row not in missing]) if missing else clip
+
+
+def keypoints(choice: PriorChoice, clip: Clip) -> dict[str, str]:
+    """Which annotated keypoints the fit of the prior saw, where the clip has any."""
+    if choice.mapping is None or all(frame.keypoints is None for frame in clip.frames):
+        return {}
+    return {"keypoints": choice.use, "mapping": choice.mapping}
+
+
+def diagnostics(reconstruction: Reconstruction, shown: Clip, background: float) -> dict[str, Any]:
+    """What the method says of its result, if it does, and how closely that fits what the method was shown.
+
+    Args:
+        reconstruction: of the clip.
+        shown: what the method saw.
+        background: of the protocol.
+    """
+    describe = getattr(reconstruction, "diagnostics", None)
+    fits = input_psnr(reconstruction, shown, background)
+    return (describe() if describe else {}) | {"input_psnr_db": fits.value}
+
+
+def inputs(method: str, config: msgspec.Struct, case: str) -> dict[str, str]:
+    """What decides a result beside the settings: files that a method reads, if it says so."""
+    asked = getattr(load_method(method), "inputs", None)
+    return {"inputs": asked(config, case)} if asked else {}
+
+
+def marks(method: str, prior: str, reconstruction: Reconstruction) -> list[str]:
+    """What stands beside the numbers in every table, and keeps a row out of the ranking.
+
+    Args:
+        method: its name.
+        prior: what `--prior` said.
+        reconstruction: it may have marks of its own.
+    """
+    info = load_method(method).info
+    found = [info.mark] if info.mark else []
+    if info.uses_prior and PriorChoice(prior, STANDARD).is_from_truth:
+        found.append(FROM_TRUTH)
+    return found + list(getattr(reconstruction, "marks", ()))

@@ -1,0 +1,343 @@
+"""From a plan to records: load, prior, fit, evaluate, write; finished runs are skipped, killed ones resume."""
+
+import contextlib
+import json
+import os
+import shutil
+import sys
+import time
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from fnmatch import fnmatchcase
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import torch
+
+from rewild4d.contracts import DatasetReader, Reconstruction
+from rewild4d.errors import UserError, unknown_name
+from rewild4d.evaluation.coverage import coverage
+from rewild4d.evaluation.measuring import evaluate
+from rewild4d.evaluation.networks import may_be_scored_now
+from rewild4d.evaluation.protocol import Protocol
+from rewild4d.evaluation.refining import ready_to_score
+from rewild4d.files import held, remove_leftovers, write_text
+from rewild4d.leaderboard.records import FILE, SCHEMA, RunRecord, Timing, make_run_id, read_record, write_record
+from rewild4d.machine import code_of, machine, peak_memory_mib
+from rewild4d.priors.choose import PriorChoice, make_prior
+from rewild4d.priors.placing import known_frames, with_cameras
+from rewild4d.progress import Progress
+from rewild4d.rasterizer import pick_rasterizer
+from rewild4d.registry import load_method
+from rewild4d.running import provenance
+from rewild4d.running.workers import Workers, share_cores, this_process
+from rewild4d.types import Case, Clip, Prior, Truth
+from rewild4d.visualize.original_view import original_frames
+from rewild4d.visualize.run_pictures import save_pictures
+
+STAMP = "fit.json"
+"""Beside a saved reconstruction: how long the fit took, written last."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row of a plan: a method with its settings, and the seeds to run it with."""
+
+    method: str
+    preset: str
+    config: msgspec.Struct
+    seeds: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that decides what is run; the same plan gives the same run ids.
+
+    `jobs` rows run at a time, each in a process where torch has `threads` threads; our kernels take the cores that no
+    fit needs. Two fits side by side finish sooner than one on two cores. `rasterizer`: rewild4d.rasterizer.BACKENDS.
+    """
+
+    dataset: str
+    reader: DatasetReader
+    root: Path
+    cases: tuple[str, ...]
+    protocol: Protocol
+    entries: tuple[Entry, ...]
+    prior: PriorChoice
+    device: torch.device
+    out: Path
+    jobs: int = 1
+    threads: int = 1
+    rasterizer: str = "auto"
+
+
+def choose_cases(names: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]:
+    """The cases that any of the wanted names or patterns ("wolf/*") names; all where none is given.
+
+    Raises:
+        UserError: a name that fits no case.
+    """
+    for pattern in wanted:
+        if not any(fnmatchcase(name, pattern) for name in names):
+            raise unknown_name("case", pattern, names)
+    return tuple(name for name in names if not wanted or any(fnmatchcase(name, pattern) for pattern in wanted))
+
+
+def execute(plan: Plan) -> list[RunRecord]:
+    """Run all that the plan lists and has no finished record; give every record, in the plan's order.
+
+    A run that fails leaves a record with its message and does not stop the others; nor does a case that cannot be read,
+    which has no records.
+
+    Raises:
+        UserError: none of the cases can be read or the rasterizer cannot be used, before anything is fitted.
+    """
+    plan = _readable(replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device)))
+    plan.out.mkdir(parents=True, exist_ok=True)
+    parts = [(name, entry, seed) for name in plan.cases for entry in plan.entries for seed in entry.seeds]
+    floors = [entry.method in plan.protocol.floors for _, entry, _ in parts]
+    # A floor is done at once, unless sets of novel views are scored: those take minutes of every row.
+    long = len(parts) if plan.protocol.novel else floors.count(False)
+    jobs = min(plan.jobs, max(len(plan.cases), long))
+    threads = share_cores(plan.threads, min(jobs, floors.count(False)), plan.device)
+    if jobs <= 1:
+        records = []
+        with this_process(threads, plan.rasterizer):
+            for name in plan.cases:
+                _prepare(plan, name)
+                records += _run_case(plan, name)
+        return records
+    with Workers(jobs, threads, plan.rasterizer) as workers:
+        # Every fit of a case starts from its prior, so the priors come first.
+        workers.map(_prepare, [(plan, name) for name in plan.cases], lambda *_: None)
+        # Fits first: the floors fill the time that they leave.
+        order = sorted(range(len(parts)), key=floors.__getitem__)
+        made = workers.map(_run_part, [(plan, *parts[i]) for i in order], _lost_part)
+        return [record for _, record in sorted(zip(order, made, strict=True), key=itemgetter(0))]
+
+
+def _readable(plan: Plan) -> Plan:
+    """The plan without the cases that cannot be read; notes and faults are told.
+
+    Raises:
+        UserError: none can be read.
+    """
+    notes: list[str] = []
+    faults: dict[str, UserError] = {}
+    for name in plan.cases:
+        try:
+            notes += [f"{name}: {note}" for note in plan.reader.load(name, plan.protocol.selection)[0].notes]
+        except UserError as error:
+            faults[name] = error
+    if faults and len(faults) == len(plan.cases):
+        raise next(iter(faults.values()))
+    for line in (*notes, *(f"{name}: left out: {error}" for name, error in faults.items())):
+        print(line, file=sys.stderr)
+    return replace(plan, cases=tuple(name for name in plan.cases if name not in faults))
+
+
+def pieces(plan: Plan) -> list["Job"]:
+    """All that the plan lists and can be read, in its order, finished or not; nothing is run."""
+    plan = _readable(replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device)))
+    return [job for name in plan.cases for job in _jobs(plan, name, *plan.reader.load(name, plan.protocol.selection))]
+
+
+def _prepare(plan: Plan, name: str) -> None:
+    """Make the prior of a case where a fit still needs it, and tell its notes; faults are told by those fits."""
+    clip, truth = plan.reader.load(name, plan.protocol.selection)
+    if not all(job.finished() for job in _jobs(plan, name, clip, truth)):
+        with contextlib.suppress(UserError, FloatingPointError):
+            for note in _prior(plan, clip, truth).notes:
+                print(f"{name}: prior: {note}", file=sys.stderr)
+
+
+def _run_part(plan: Plan, name: str, entry: Entry, seed: int) -> RunRecord:
+    (record,) = _run_case(_part(plan, entry, seed), name)
+    return record
+
+
+def _lost_part(plan: Plan, name: str, entry: Entry, seed: int) -> RunRecord:
+    """The record of a run whose process is gone without a word."""
+    (job,) = _jobs(_part(plan, entry, seed), name, *plan.reader.load(name, plan.protocol.selection))
+    return job.fail("the process ended: killed, perhaps for memory")
+
+
+def _part(plan: Plan, entry: Entry, seed: int) -> Plan:
+    return replace(plan, entries=(replace(entry, seeds=(seed,)),))
+
+
+def _run_case(plan: Plan, name: str) -> list[RunRecord]:
+    clip, truth = plan.reader.load(name, plan.protocol.selection)
+    jobs = _jobs(plan, name, clip, truth)
+    if all(job.finished() for job in jobs):
+        return [job.record() for job in jobs]
+    try:
+        prior = _prior(plan, clip, truth)
+        case = Case(with_cameras(known_frames(clip, prior), prior), prior, truth)
+    except (UserError, FloatingPointError) as error:
+        return [job.record() if job.finished() else job.fail(str(error)) for job in jobs]
+    seen = coverage(clip, truth)
+    return [job.run(case, seen) for job in jobs]
+
+
+def _jobs(plan: Plan, name: str, clip: Clip, truth: Truth) -> list["Job"]:
+    prior_id = plan.prior.identity(clip, truth)
+    folder = plan.out / plan.protocol.name / name.replace("/", "__")
+    return [Job(plan, entry, seed, clip, truth, prior_id, folder) for entry in plan.entries for seed in entry.seeds]
+
+
+def _prior(plan: Plan, clip: Clip, truth: Truth) -> Prior:
+    progress = Progress(f"{clip.name}: prior")
+    try:
+        path = plan.out / "priors" / f"{plan.prior.identity(clip, truth)}.npz"
+        return make_prior(plan.prior, clip, truth, path, progress)
+    finally:
+        progress.close()
+
+
+class Job:
+    """One method on one case with one seed."""
+
+    def __init__(self, plan: Plan, entry: Entry, seed: int, clip: Clip, truth: Truth, prior_id: str, folder: Path):
+        self.plan, self.entry, self.seed, self.clip, self.truth = plan, entry, seed, clip, truth
+        self.run_id = make_run_id(
+            method=entry.method, config=entry.config, clip=clip.digest, truth=truth.digest, prior=prior_id,
+            protocol=plan.protocol.digest, seed=seed, code=code_of(entry.method), device=plan.device.type,
+            rasterizer=plan.rasterizer, **provenance.inputs(entry.method, entry.config, clip.name),
+        )  # fmt: skip
+        self.folder = folder / f"{entry.method}-{entry.preset}-seed{seed}-{self.run_id[:8]}"
+        self.title = f"{clip.name}: {entry.method}"
+        self.started = datetime.now(UTC).isoformat(timespec="seconds")
+
+    def finished(self) -> bool:
+        """Whether a good record is there: a failed one is tried again, and so is scoring that lacked a network that
+        has come since."""
+        if not self._is_good():
+            return False
+        return not (self._is_fitted() and may_be_scored_now(self.record().scores))
+
+    def record(self) -> RunRecord:
+        """The record that is there."""
+        return read_record(self.folder / FILE)
+
+    def run(self, case: Case, seen: dict[str, float]) -> RunRecord:
+        """What is there, if it is finished; else fit, evaluate, draw, record. One process at a time."""
+        with held(self.folder, f"{self.title}: waiting for another process that makes {self.folder.name}"):
+            if self.finished():
+                return self.record()
+            remove_leftovers(self.folder)
+            return self._run(case, seen)
+
+    def _run(self, case: Case, seen: dict[str, float]) -> RunRecord:
+        try:
+            reconstruction, fit_seconds = self._fit(case)
+            begin = time.perf_counter()
+            whole = with_cameras(self.clip, case.prior)  # also the frames that the fit was not shown
+            progress = Progress(f"{self.title}: refine on held-out frames")
+            reconstruction, clip, truth = ready_to_score(reconstruction, whole, case.truth, case.clip, progress)
+            progress.close()
+            progress = Progress(f"{self.title}: evaluate")
+            found = evaluate(reconstruction, clip, truth, self.plan.protocol, progress, self.plan.device)
+            progress.close()
+            seconds = time.perf_counter() - begin
+            pictures = save_pictures(
+                reconstruction, clip, truth, self.folder,
+                original_frames(self.plan.reader, clip, self.plan.protocol.selection),
+            )  # fmt: skip
+            record = self._record(
+                case, "ok", "", **found.keep(self.folder), coverage=seen, pictures=pictures,
+                diagnostics=provenance.diagnostics(reconstruction, case.clip, self.plan.protocol.background),
+                marks=provenance.marks(self.entry.method, self.plan.prior.name, reconstruction),
+                timing=self._timing(fit_seconds, seconds),
+            )  # fmt: skip
+            path = write_record(record, self.folder)
+        except UserError as error:
+            return self.fail(str(error), case)
+        except Exception as error:  # a bug or a diverged fit: the record keeps the message, the terminal the traceback
+            traceback.print_exc(file=sys.stderr)
+            return self.fail(f"{type(error).__name__}: {error}", case)
+        shutil.rmtree(self.folder / "work", ignore_errors=True)
+        return read_record(path)
+
+    def fail(self, message: str, case: Case | None = None) -> RunRecord:
+        """Record a failure: it is a finding too, but not in the place of a good record."""
+        print(f"{self.title}: failed: {message}", file=sys.stderr)
+        if self._is_good():
+            return self.record()
+        record = self._record(case, "failed", message, timing=self._timing(0.0, 0.0))
+        return read_record(write_record(record, self.folder))
+
+    def _fit(self, case: Case) -> tuple[Reconstruction, float]:
+        """The reconstruction, saved; a run killed while scoring reads it back instead of fitting again."""
+        method = load_method(self.entry.method)
+        saved = self.folder / "reconstruction"
+        if not self._is_fitted():
+            work = self.folder / "work"
+            work.mkdir(parents=True, exist_ok=True)
+            progress = Progress(f"{self.title}: fit", self.folder / "log.jsonl")
+            begin = time.perf_counter()
+            reconstruction = method.fit(
+                case.clip, case.prior, config=self.entry.config, seed=self.seed, device=self.plan.device,
+                log=progress, workdir=work,
+            )  # fmt: skip
+            progress.close()
+            save_reconstruction(reconstruction, saved)
+            stamp = json.dumps({"seconds_since_last_start": time.perf_counter() - begin}) + "\n"
+            write_text(self.folder / STAMP, stamp)
+        return method.load(saved, self.plan.device), fit_seconds(self.folder)
+
+    def _is_good(self) -> bool:
+        return (self.folder / FILE).is_file() and self.record().status == "ok"
+
+    def _is_fitted(self) -> bool:
+        return (self.folder / "reconstruction").is_dir() and (self.folder / STAMP).is_file()
+
+    def _timing(self, fit: float, evaluation: float) -> Timing:
+        return Timing(self.started, round(fit, 2), round(evaluation, 2), round(peak_memory_mib(), 1))
+
+    def _record(self, case: Case | None, status: str, error: str, **found: Any) -> RunRecord:
+        plan = self.plan
+        fields: dict[str, Any] = {
+            "schema": SCHEMA, "run_id": self.run_id, "method": self.entry.method, "dataset": plan.dataset,
+            "case": self.clip.name, "seed": self.seed, "preset": self.entry.preset, "status": status, "error": error,
+            "scores": {}, "coverage": {}, "items": [], "pictures": [], "diagnostics": {},
+            "config": msgspec.to_builtins(self.entry.config),
+            "data": {"root": str(plan.root), "licence": self.clip.licence, "clip": self.clip.digest,
+                     "truth": self.truth.digest, **provenance.reading(plan.reader, self.clip)},
+            "prior": {"choice": plan.prior.name, "config": msgspec.to_builtins(plan.prior.settings(self.clip)),
+                      **provenance.keypoints(plan.prior, self.clip),
+                      **provenance.prior_of(case.prior if case else None),
+                      **provenance.left_out(self.clip, case.clip if case else None)},
+            "protocol": {"digest": plan.protocol.digest, **msgspec.to_builtins(plan.protocol)},
+            "code": code_of(self.entry.method), "machine": machine(plan.device, plan.rasterizer),
+        }  # fmt: skip
+        return RunRecord(**{**fields, **found})
+
+
+def fit_seconds(folder: Path) -> float:
+    """How long the finished fit in a run's folder took since its last start."""
+    try:
+        return float(json.loads((folder / STAMP).read_text())["seconds_since_last_start"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{folder / STAMP}: expected the time of a finished fit, got a damaged file ({error})."
+        ) from error
+
+
+def save_reconstruction(reconstruction: Reconstruction, folder: Path) -> None:
+    """Save into a folder that appears only when it is complete."""
+    building = folder.with_name(f".{folder.name}.{os.getpid()}")
+    shutil.rmtree(building, ignore_errors=True)
+    try:
+        building.mkdir(parents=True)
+        reconstruction.save(building)
+        shutil.rmtree(folder, ignore_errors=True)
+        building.rename(folder)
+    except OSError as error:
+        raise UserError(f"{folder}: the reconstruction could not be written: {error.strerror or error}.") from error
+    finally:
+        shutil.rmtree(building, ignore_errors=True)

@@ -1,0 +1,1 @@
+"""Draw pictures and films of a run."""

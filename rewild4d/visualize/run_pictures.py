@@ -1,0 +1,98 @@
+"""Pictures of a run: what went in, what came out, what the method never saw."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from rewild4d.cameras.input_view import input_camera
+from rewild4d.cameras.recropping import all_moments
+from rewild4d.contracts import Reconstruction
+from rewild4d.transforms import look_at
+from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Splats, Truth
+from rewild4d.visualize.original_view import save_original_view
+from rewild4d.visualize.pictures import PANEL, beside, film_rate, header, over, save_mp4, save_png, widen
+from rewild4d.visualize.turntable import find_stance, four_views, turn
+
+ROWS = 4
+"""Moments shown in the comparison picture."""
+
+
+def save_pictures(
+    reconstruction: Reconstruction,
+    clip: Clip,
+    truth: Truth,
+    folder: Path,
+    originals: Iterable[np.ndarray] | None = None,
+) -> list[str]:
+    """Write all pictures of a run into ``folder`` and return their names.
+
+    comparison.png  rows are moments; input, render, held-out truth, held-out render
+    canonical.png   canonical Gaussians coloured by skinning weight (methods that have them)
+    input.mp4       input beside render, in the input view
+    orbit.mp4       one turn around the moving animal, upright
+    orbit.png       the animal from four sides
+    original.mp4    original frame beside the render over its background, held-out frames too (crops of a video)
+    original.png    the same at six moments
+
+    Args:
+        reconstruction: of the clip.
+        clip: what the method saw.
+        truth: what it did not see.
+        folder: of the run.
+        originals: the whole frames that the images of both were cut from, uint8 [h, w, 3], in the order of time; None:
+            the renders in the original frame are laid on white.
+    """
+    names = ["comparison.png", "input.mp4", "orbit.mp4", "orbit.png"]
+    save_png(comparison(reconstruction, clip, truth), folder / names[0])
+    fps = film_rate(clip.fps)
+    save_mp4((beside(frame.over(1.0), _shot(reconstruction, frame)) for frame in clip.frames), folder / names[1], fps)
+    stance = find_stance(reconstruction, clip, truth.up)
+    save_mp4(turn(reconstruction, clip, stance), folder / names[2], fps)
+    save_png(four_views(reconstruction, clip, stance), folder / names[3])
+    names += save_original_view(reconstruction, all_moments(clip, truth), originals, folder)
+    if hasattr(reconstruction, "canonical") and hasattr(reconstruction, "weights"):
+        save_png(canonical(reconstruction.canonical(), reconstruction.weights), folder / "canonical.png")
+        names.append("canonical.png")
+    return names
+
+
+def comparison(reconstruction: Reconstruction, clip: Clip, truth: Truth) -> Tensor:
+    """The comparison picture, [3, H, W]."""
+    panels, times = [], [frame.time for frame in truth.held_out]
+    for row in range(ROWS):
+        frame = clip.frames[row * len(clip.frames) // ROWS]
+        held = [i for i, time in enumerate(times) if abs(time - frame.time) < 1e-6]
+        images = [frame.over(1.0), _shot(reconstruction, frame)]
+        if held:
+            other = truth.held_out[held[(len(held) // 3 + row * len(held) // (2 * ROWS)) % len(held)]]
+            images += [other.over(1.0), _shot(reconstruction, other)]
+        panels.append(torch.cat([widen(image) for image in images], dim=2))
+    titles = ["input", "render", "held-out truth", "held-out render"]
+    return torch.cat([header(titles[: len(images)], panels[0].shape[2]), *panels], dim=1)
+
+
+def canonical(splats: Splats, weights: Tensor) -> Tensor:
+    """Canonical Gaussians from the side, obliquely, the front and above, each part in its own colour, [3, H, W]."""
+    hues = np.array([[((part * 97) % 180, 200, 235) for part in range(weights.shape[1])]], np.uint8)
+    palette = torch.from_numpy(cv2.cvtColor(hues, cv2.COLOR_HSV2RGB)[0]).to(weights) / 255
+    colored = Splats(splats.means, splats.quats, splats.scales, splats.opacities, (weights @ palette)[:, None])
+    center = splats.means.double().median(0).values.cpu()
+    up, ahead = torch.tensor((0.0, 1.0, 0.0)).double(), torch.tensor((0.0, 0.0, 1.0)).double()
+    focal = PANEL * 1.9
+    intrinsics = torch.tensor(((focal, 0, PANEL / 2), (0, focal, PANEL / 2), (0, 0, 1.0))).double()
+    panels = []
+    for direction, top in (((1, 0.1, 0), up), ((0.8, 0.4, 0.8), up), ((0, 0.1, 1), up), ((0, 1, 0), ahead)):
+        toward = torch.nn.functional.normalize(torch.tensor(direction).double(), dim=0)
+        camera = Camera(look_at(center + 2.4 * OBJECT_DIAGONAL * toward, center, top), intrinsics, PANEL, PANEL)
+        panels.append(over(colored, camera))
+    return torch.cat([header(["side", "oblique", "front", "above"], 4 * PANEL), torch.cat(panels, dim=2)], dim=1)
+
+
+def _shot(reconstruction: Reconstruction, frame: Frame) -> Tensor:
+    """The reconstruction as the frame's camera sees it, on white."""
+    camera = input_camera(reconstruction, frame)
+    return torch.ones_like(frame.rgb) if camera is None else over(reconstruction.at(frame.time), camera)

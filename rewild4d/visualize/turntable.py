@@ -1,0 +1,176 @@
+"""Once around the animal, upright and in the middle: a film in which time runs, and a still from four sides.
+
+Axes are the animal's own, x left, y up, z ahead, where somebody knows them: the reconstruction, if it is a skinned
+shape, or the prior, which is the world of a video whose camera nobody knows. Else up is the data set's or the input
+cameras', and "ahead" is unknown: the still then shows quarter turns from the input camera.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from scipy.signal import savgol_filter
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from rewild4d.cameras.input_view import input_camera, world_up
+from rewild4d.cameras.orbit import first_across, orbit_cameras
+from rewild4d.contracts import Articulated, Reconstruction
+from rewild4d.types import Camera, Clip, Splats
+from rewild4d.visualize.pictures import PANEL, header, over
+
+STEPS = 72
+"""Frames of one turn."""
+FIELD_OF_VIEW = math.radians(25)
+ELEVATIONS = (0.0, math.radians(30))
+"""The input cameras' elevation is kept between these: from below or straight above a person sees little."""
+INSIDE = 0.998
+"""Share of the solid Gaussians that are inside the picture; the rest are stray."""
+MARGIN = 1.03
+"""Of the picture around them."""
+STEADY = 0.8
+"""Share of the moments from which on the camera has a side of its own; less, and it walked around the animal."""
+WINDOW = 9
+"""Moments over which the middle is smoothed; odd."""
+
+
+@dataclass(frozen=True)
+class Stance:
+    """Where the animal stands and how large it is.
+
+    Attributes:
+        middles: at each of the clip's moments, world, float64, [T, 3].
+        axes: left, up and ahead at each moment, unit rows, world, float64, [T, 3, 3].
+        known: whether "ahead" is the animal's.
+        radius: of a ball around it, world units.
+        azimuth: of the input camera about up, from ahead towards left, radians.
+        steady: share of the moments at which the input camera stood on the side where it stood on the whole.
+        elevation: of the input camera, within `ELEVATIONS`, radians.
+    """
+
+    middles: Tensor
+    axes: Tensor
+    known: bool
+    radius: float
+    azimuth: float
+    steady: float
+    elevation: float
+
+    def camera(self, moment: int, azimuth: float) -> Camera:
+        """A camera on the circle, looking at the middle."""
+        left, up, ahead = self.axes[moment]
+        focal = PANEL / 2 / math.tan(FIELD_OF_VIEW / 2)
+        intrinsics = torch.tensor(((focal, 0, PANEL / 2), (0, focal, PANEL / 2), (0, 0, 1))).double()
+        (camera,) = orbit_cameras(
+            self.middles[moment], self.radius / math.sin(FIELD_OF_VIEW / 2), self.elevation, intrinsics=intrinsics,
+            width=PANEL, height=PANEL, up=up, ahead=math.cos(azimuth) * ahead + math.sin(azimuth) * left, views=1,
+        )  # fmt: skip
+        return camera
+
+
+def find_stance(reconstruction: Reconstruction, clip: Clip, up: Tensor | None) -> Stance | None:
+    """Where the animal stands; None where there are no Gaussians or no camera.
+
+    Args:
+        reconstruction: of the clip.
+        clip: its input.
+        up: of the world, where the data set knows it, [3].
+    """
+    cameras = [camera for frame in clip.frames if (camera := input_camera(reconstruction, frame)) is not None]
+    clouds = [_solid(reconstruction.at(time)) for time in clip.times]
+    if not cameras or not all(len(means) for means, _ in clouds):
+        return None
+    # the median lies in the trunk; a picture is centred on the middle of the whole, legs and head included
+    middles = _smooth(torch.stack([_box_middle(means) for means, _ in clouds]))
+    axes, known = _axes(reconstruction, clip, cameras, middles, up)
+    reaches = [(means - middle).norm(dim=1) + reach for (means, reach), middle in zip(clouds, middles, strict=True)]
+    radius = max(float(torch.quantile(reach, INSIDE)) for reach in reaches)
+    offsets = torch.stack(
+        [axes[i] @ (camera.center - middles[i]) for i, camera in enumerate(_per_moment(cameras, clip))]
+    )
+    offset = normalize(offsets, dim=1).mean(0)
+    elevation = math.atan2(float(offset[1]), float(offset[[0, 2]].norm()))
+    azimuth = math.atan2(float(offset[0]), float(offset[2]))
+    steady = float((offsets[:, 0] * offset[0] > 0).double().mean())
+    elevation = min(max(elevation, ELEVATIONS[0]), ELEVATIONS[1])
+    return Stance(middles, axes, known, max(MARGIN * radius, 1e-6), azimuth, steady, elevation)
+
+
+def turn(reconstruction: Reconstruction, clip: Clip, stance: Stance | None) -> Iterator[Tensor]:
+    """Images [3, PANEL, PANEL] of one turn from the input camera on while time runs; one white image without stance."""
+    for step in range(STEPS if stance else 1):
+        moment = step % len(clip.times)
+        if stance is None:
+            yield torch.ones(3, PANEL, PANEL)
+        else:
+            camera = stance.camera(moment, stance.azimuth + 2 * math.pi * step / STEPS)
+            yield over(reconstruction.at(clip.times[moment]), camera)
+
+
+def four_views(reconstruction: Reconstruction, clip: Clip, stance: Stance | None) -> Tensor:
+    """The side that the camera saw, the front, the other side and behind, at the clip's middle, [3, H, 4 PANEL]."""
+    if stance is None:
+        titles, images = ["no Gaussians, or no camera"], [torch.ones(3, PANEL, PANEL)] * 4
+    else:
+        moment = len(clip.times) // 2
+        splats = reconstruction.at(clip.times[moment])
+        sides = _sides(stance)
+        titles = list(sides)
+        images = [over(splats, stance.camera(moment, azimuth)) for azimuth in sides.values()]
+    return torch.cat([header(titles, 4 * PANEL), torch.cat(images, dim=2)], dim=1)
+
+
+def _sides(stance: Stance) -> dict[str, float]:
+    """Title -> azimuth of each still view."""
+    quarter = math.pi / 2
+    if not stance.known:
+        return {
+            "input camera": stance.azimuth, "a quarter turn on": stance.azimuth + quarter,
+            "half a turn": stance.azimuth + 2 * quarter, "three quarters": stance.azimuth + 3 * quarter,
+        }  # fmt: skip
+    is_left = math.sin(stance.azimuth) > 0
+    seen, other = ("left", "right") if is_left else ("right", "left")
+    side = quarter if is_left else -quarter
+    said = " (the camera's)" if stance.steady >= STEADY else ""
+    return {f"{seen} side{said}": side, "front": 0.0, f"{other} side": -side, "behind": math.pi}
+
+
+def _axes(
+    reconstruction: Reconstruction, clip: Clip, cameras: list[Camera], middles: Tensor, up: Tensor | None
+) -> tuple[Tensor, bool]:
+    """Left, up and ahead at each moment, [T, 3, 3], and whether they are the animal's own."""
+    if isinstance(reconstruction, Articulated):
+        worlds = torch.stack([reconstruction.articulation(time)[1][:3, :3].double().cpu() for time in clip.times])
+        return normalize(worlds, dim=1).transpose(1, 2), True
+    count = len(clip.times)
+    if all(frame.crop is not None for frame in clip.frames):  # footage: the prior's object frame is the world
+        return torch.eye(3).double().expand(count, 3, 3), True
+    up = world_up(clip, cameras, up)
+    toward = first_across((cameras[0].center - middles[0])[None], up)
+    ahead = normalize(toward - (toward @ up) * up, dim=0)
+    return torch.stack((torch.linalg.cross(up, ahead), up, ahead)).expand(count, 3, 3), False
+
+
+def _per_moment(cameras: list[Camera], clip: Clip) -> list[Camera]:
+    """A camera for each moment; where some are unknown, the first one stands for them."""
+    return cameras if len(cameras) == len(clip.times) else [cameras[0]]
+
+
+def _solid(splats: Splats) -> tuple[Tensor, Tensor]:
+    """Centres and reach of the Gaussians that can be seen, float64, [n, 3] and [n]; of all where none can."""
+    shown = splats.opacities.detach().cpu() > 0.1
+    means, reach = splats.means.detach().double().cpu(), 2 * splats.scales.detach().double().cpu().amax(-1)
+    return (means[shown], reach[shown]) if bool(shown.any()) else (means, reach)
+
+
+def _smooth(middles: Tensor) -> Tensor:
+    """A straight line through the neighbouring moments of each, so that a stride does not shake the picture, [T, 3]."""
+    window = min(WINDOW, len(middles) - 1 + len(middles) % 2)
+    return middles if window < 3 else torch.from_numpy(savgol_filter(middles.numpy(), window, 1, axis=0))
+
+
+def _box_middle(cloud: Tensor) -> Tensor:
+    """The middle of the box that holds all but stray points, [3]."""
+    ends = torch.tensor(((1 - INSIDE) / 2, (1 + INSIDE) / 2), dtype=torch.float64)
+    return torch.quantile(cloud, ends, dim=0).mean(0)

@@ -1,0 +1,118 @@
+"""Held-out frames of a video whose camera only the reconstruction knows."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import moving
+import pytest
+import torch
+from test_wild import SELECTION, cache  # noqa: F401
+
+from rewild4d.baselines.empty import EmptyReconstruction
+from rewild4d.datasets.video.online import Online
+from rewild4d.errors import UserError
+from rewild4d.evaluation import novel_views
+from rewild4d.evaluation.measuring import evaluate
+from rewild4d.evaluation.protocol import NovelViews, Protocol, find_protocol
+from rewild4d.types import Camera, Clip, Splats, Truth
+from rewild4d.visualize.run_pictures import save_pictures
+
+CPU = torch.device("cpu")
+SCORES = ("psnr", "psnr_fg", "iou")
+PROTOCOL = Protocol(
+    name="test-v1", dataset="online", title="", description="", background=1.0, scores=SCORES, floors=(),
+    selection=SELECTION,
+)  # fmt: skip
+
+
+@pytest.fixture
+def case(tmp_path: Path) -> tuple[Clip, Truth]:
+    moving.frames(tmp_path / "clip" / "frames", 24, step=0.5)
+    moving.masks(tmp_path / "clip" / "masks", 24, step=0.5)
+    return Online(tmp_path / "clip", fps=10).load("clip", SELECTION)
+
+
+class Plate:
+    """The pixels of one frame as Gaussians on a plane that faces a camera, at twice the size of the image asked for."""
+
+    def __init__(self, clip: Clip, knows: bool = True) -> None:
+        self.frame, self.knows = clip.frames[0], knows
+        self.asked: list[float] = []
+
+    def at(self, time: float) -> Splats:
+        rows, columns = torch.nonzero(self.frame.mask[0] > 0.5, as_tuple=True)
+        middle = torch.stack(((columns + 0.5) / 32 - 1, (rows + 0.5) / 32 - 1, torch.full(rows.shape, 2.0)), dim=1)
+        count = len(rows)
+        return Splats(middle, torch.tensor((1.0, 0, 0, 0)).expand(count, 4), torch.full((count, 3), 0.012),
+                      torch.full((count,), 0.95), self.frame.rgb[:, rows, columns].T[:, None].contiguous())  # fmt: skip
+
+    def camera(self, time: float) -> Camera | None:
+        self.asked.append(time)
+        intrinsics = torch.tensor(((128.0, 0, 64), (0, 128, 64), (0, 0, 1)), dtype=torch.float64)
+        return Camera(torch.eye(4, dtype=torch.float64), intrinsics, 128, 128) if self.knows else None
+
+    def save(self, folder: Path) -> None: ...
+
+
+def test_held_out_frames_are_seen_with_the_reconstructions_camera(case: tuple[Clip, Truth]) -> None:
+    clip, truth = case
+    plate = Plate(clip)
+    found = evaluate(plate, clip, truth, PROTOCOL, lambda *_: None, CPU)
+    assert plate.asked == [frame.time for frame in truth.held_out]
+    assert not set(plate.asked) & set(clip.times)
+    assert (found.scores["iou"].value or 0) > 0.8
+    empty = evaluate(EmptyReconstruction(), clip, truth, PROTOCOL, lambda *_: None, CPU)
+    assert (found.scores["psnr"].value or 0) > (empty.scores["psnr"].value or 0) + 3
+    shares = [float(frame.mask.mean()) for frame in truth.held_out]
+    errors = [float((frame.over(1.0) - 1).square().mean()) for frame in truth.held_out]
+    assert empty.scores["psnr"].per_item == pytest.approx([-10 * math.log10(error) for error in errors], abs=1e-4)
+    assert min(shares) > 0.1 and empty.scores["iou"].value == 0
+
+
+def test_without_any_camera_it_says_so(case: tuple[Clip, Truth]) -> None:
+    clip, truth = case
+    with pytest.raises(UserError, match="the frame at 0.2000 s needs a camera, but neither the data set nor"):
+        evaluate(Plate(clip, knows=False), clip, truth, PROTOCOL, lambda *_: None, CPU)
+
+
+def nothing(splats: Splats, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.zeros(3, 1, 1), torch.zeros(1, 1, 1)
+
+
+def test_the_orbit_starts_at_the_reconstructions_camera(case: tuple[Clip, Truth]) -> None:
+    clip = case[0]
+    orbit = novel_views._Orbit(Plate(clip), clip, 1.0, nothing, NovelViews(upright=True), None)
+    assert (orbit.cameras[0].width, orbit.cameras[0].height) == (64, 64)
+    middle = orbit._middle()
+    distances = torch.stack([(camera.center - middle).norm() for camera in orbit.cameras])
+    assert torch.allclose(distances, middle.norm().expand(16))
+    heights = torch.stack([camera.center[1] - middle[1] for camera in orbit.cameras])
+    assert torch.allclose(heights, heights[:1])  # footage's y points up: a level circle
+    blank = novel_views._Orbit(EmptyReconstruction(), clip, 1.0, nothing, NovelViews(upright=True), None)
+    assert len(blank.cameras) == 16
+
+
+def test_pictures_are_drawn_with_it(case: tuple[Clip, Truth], tmp_path: Path) -> None:
+    clip, truth = case
+    assert "orbit.mp4" in save_pictures(Plate(clip), clip, truth, tmp_path)
+    assert (tmp_path / "comparison.png").stat().st_size > 1000
+
+
+def test_a_protocol_for_cameras_is_refused(case: tuple[Clip, Truth], tmp_path: Path) -> None:
+    reader = Online(tmp_path / "clip")
+    with pytest.raises(UserError, match="expected a protocol for videos"):
+        reader.load("clip", replace_selection())
+
+
+def replace_selection():  # type: ignore[no-untyped-def]
+    return find_protocol("artemis", "artemis-sweep-256-v1").selection
+
+
+def test_digests_of_older_protocols_stay() -> None:
+    """A setting that came later and is left out changes no digest."""
+    old = find_protocol("artemis", "artemis-sweep-256-v1")
+    assert old.selection.split is None
+    assert find_protocol("davis", None).digest != find_protocol("davis", "davis-256-v2").digest
+    clip = Clip("a", "b", (), 1.0, "", "", ())
+    assert replace(clip, notes=("x",)).digest == clip.digest
