@@ -5,7 +5,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from rewild4d.kernels.halves import AVAILABLE
+from rewild4d.kernels.halves import available
 from rewild4d.ours.config import Count, Whole
 from rewild4d.ours.pose import seed_linears
 
@@ -74,7 +74,7 @@ class DeformationNetwork(nn.Module):
         """
         place = octave_code(points.detach(), self.config.place_octaves)
         moment = self.time_out(torch.relu(self.time_in(octave_code(time.reshape(1), self.config.time_octaves))))
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.config.half and AVAILABLE and points.is_cpu):
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.config.half and available() and points.is_cpu):
             hidden = self._hidden(place, moment)
         move, turn, grow = self.heads(hidden.to(place)).split((3, 4, 3), dim=-1)
         return move, turn, grow

@@ -4,11 +4,10 @@ import torch
 from torch import Tensor, nn
 
 from rewild4d.baselines.splatting import Shape
-from rewild4d.kernels.arrays import fits
 from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.config import Skinning
-from rewild4d.ours.fused.field import sample_grid
-from rewild4d.ours.fused.skinning import skin_both
+from rewild4d.ours.fused.field import RESIDUAL_FIELD, sample_grid
+from rewild4d.ours.fused.skinning import GART_SKINNING, skin_both
 from rewild4d.ours.losses.regularizers import tv_loss
 from rewild4d.ours.skinning import build_field
 from rewild4d.transforms import skin_points, skin_quats
@@ -45,7 +44,7 @@ class ResidualField(nn.Module):
         """
         with torch.no_grad():
             base = self.field.sample(self.base, points)
-        if not fits(points):
+        if not RESIDUAL_FIELD.takes(points, owner=self):
             return base + self.field.sample(self.residual, points), self._variation() if variation else points.sum() * 0
         place = (points, self.field.origin, self.field.pitch, self.field.resolution)
         added, total = sample_grid(self.residual, *place, BEND if variation else None)
@@ -74,7 +73,7 @@ def posed(own: Gaussians, weights: Tensor, quats: Tensor, transforms: Tensor) ->
         transforms: rest -> posed, [J, 4, 4].
     """
     scales = own.scales(own.scales_log())
-    if fits(own.means):
+    if GART_SKINNING.takes(own.means):
         return Shape(*skin_both(own.means, own.quats, weights, transforms, quats)[:2], scales)
     rest = nn.functional.normalize(own.quats, dim=-1)
     return Shape(skin_points(own.means, weights, transforms), skin_quats(rest, weights, quats), scales)

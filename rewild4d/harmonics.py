@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from rewild4d.kernels.arrays import fits
 from rewild4d.kernels.harmonics import C0 as C0
-from rewild4d.kernels.harmonics import C1, C2, C3, shade, turn
+from rewild4d.kernels.harmonics import C1, C2, C3, HARMONICS, shade, turn
 from rewild4d.products import products
 from rewild4d.types import Splats
 
@@ -98,7 +97,7 @@ def rotated(coefficients: Tensor, rotations: Tensor) -> Tensor:
 def _for_kernels(*tensors: Tensor) -> bool:
     """Whether the kernels take them: they give no gradients."""
     wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    return not wanted and all(map(fits, tensors))
+    return not wanted and HARMONICS.takes(*tensors)
 
 
 @cache

@@ -13,6 +13,7 @@ import torch
 from rewild4d import __version__
 from rewild4d.errors import UserError
 from rewild4d.files import digest
+from rewild4d.kernels.switch import describe_kernels
 from rewild4d.kernels.threads import thread_count
 from rewild4d.registry import load_method
 
@@ -75,6 +76,7 @@ def machine(device: torch.device, rasterizer: str) -> dict[str, str]:
         "processor": _processor(),
         **({"gpu": torch.cuda.get_device_name(device)} if device.type == "cuda" else {}),
         "rasterizer": rasterizer,
+        "kernels": describe_kernels(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "threads": str(torch.get_num_threads()),

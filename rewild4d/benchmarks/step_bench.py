@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 from rewild4d.benchmarks import probes
+from rewild4d.benchmarks.kernel_rows import kernel_rows
 from rewild4d.benchmarks.results import OURS, Row, timed_row
 from rewild4d.benchmarks.scenes import posed_clip, step_config, training
 from rewild4d.benchmarks.timing import measure, per, progress
@@ -44,7 +45,13 @@ OPERATORS = 12
 
 
 def bench_step(
-    count: int, sizes: Sequence[int], repeats: int, preset: str, probe: bool = True, device: torch.device = CPU
+    count: int,
+    sizes: Sequence[int],
+    repeats: int,
+    preset: str,
+    probe: bool = True,
+    device: torch.device = CPU,
+    kernels: bool = False,
 ) -> list[Row]:
     """Time steps at every image side, in turns; profile them; render the result.
 
@@ -55,6 +62,7 @@ def bench_step(
         preset: of `ours`.
         probe: measure memory too (on the CPU), in processes of their own.
         device: CPU, or a CUDA GPU.
+        kernels: time the step with each fused kernel switched off too (on the CPU).
 
     Raises:
         UserError: no such preset.
@@ -71,7 +79,8 @@ def bench_step(
         rows += stepper.operators(min(repeats, PROFILED))
         if probe and device.type == "cpu":
             rows.append(probes.step_row(count, size, preset))
-    return rows + render_rows(count, max(sizes), repeats, preset, device)
+    rows += render_rows(count, max(sizes), repeats, preset, device)
+    return rows + (kernel_rows(Stepper, repeats) if kernels and device.type == "cpu" else [])
 
 
 class Stepper:

@@ -1,8 +1,12 @@
 """Markdown tables of a result; ratios are made here, from the rows."""
 
+import math
 from collections.abc import Sequence
 
 from rewild4d.benchmarks.results import BOTH, FLOOR, FORWARD, OURS, Result, Row
+
+KERNELS = "step, preset "
+"""How quantities begin that are timed with fused kernels switched off."""
 
 
 def markdown(result: Result) -> str:
@@ -68,7 +72,7 @@ def _against(rows: Sequence[Row], peer: str, place: tuple[int | None, int | None
 
 def _step_tables(rows: Sequence[Row]) -> list[str]:
     """Times of a step and of a frame, with steps or frames a second; then the operators of each image side."""
-    timed = [row for row in rows if row.unit == "ms"]
+    timed = [row for row in rows if row.unit == "ms" and not row.quantity.startswith(KERNELS)]
     times = _table(
         ["what", "whose", "Gaussians", "image", "ms", "least, ms", "quartiles apart, ms", "a second"],
         [
@@ -84,7 +88,21 @@ def _step_tables(rows: Sequence[Row]) -> list[str]:
         lines = [[row.subject, f"{100 * (row.value or 0):.1f} %", row.note] for row in chosen]
         tables.append(_table([f"operator, at {size}²", "own time", "how often"], lines))
     memory = [row for row in rows if row.quantity == "peak memory"]
+    switched = [row for row in rows if row.quantity.startswith(KERNELS)]
+    tables += [_kernel_table(group) for name in dict.fromkeys(row.quantity for row in switched)
+               if (group := [row for row in switched if row.quantity == name])]  # fmt: skip
     return [times, *tables, *([_list(memory)] if memory else [])]
+
+
+def _kernel_table(rows: Sequence[Row]) -> str:
+    """Whole steps of one preset with each fused kernel switched off alone, and what it saves."""
+    base = rows[0].value or math.nan
+    lines = [
+        [row.subject, *_scene(_place_of(row)), _number(row), f"{(row.value or math.nan) - base:+.2f}",
+         f"{(row.value or math.nan) / base:.2f} x"]
+        for row in rows
+    ]  # fmt: skip
+    return _table([rows[0].quantity, "Gaussians", "image", "ms", "more than with all, ms", "of all kernels"], lines)
 
 
 def _list(rows: Sequence[Row]) -> str:

@@ -65,6 +65,7 @@ class StepOptions:
         preset: of `ours`; its image size and number of Gaussians are those above.
         device: cpu or cuda.
         probes: measure peak memory too (on the CPU), in processes of their own.
+        kernels: time the step with each fused kernel switched off too, at presets quick and paper (on the CPU).
         threads: that compute; torch's own number where it is left out.
         out: file for the data; results/speed/step-<processor>-<day>.json where it is left out.
         json: print the data as JSON, and nothing else, to standard output.
@@ -76,6 +77,7 @@ class StepOptions:
     preset: str = "paper"
     device: str = "cpu"
     probes: bool = True
+    kernels: bool = True
     threads: int | None = None
     out: Path | None = None
     json: bool = False
@@ -118,7 +120,9 @@ def _step(arguments: list[str]) -> int:
     device = pick_device(options.device)
     return _report(
         arguments, options, settings, {}, device,
-        lambda: bench_step(options.gaussians, options.sizes, options.repeats, options.preset, options.probes, device),
+        lambda: bench_step(
+            options.gaussians, options.sizes, options.repeats, options.preset, options.probes, device, options.kernels
+        ),
     )  # fmt: skip
 
 

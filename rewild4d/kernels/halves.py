@@ -3,18 +3,63 @@
 A word is two bfloat16 numbers in the bits of a float32, the first in the lower half. Sums stay in single precision.
 """
 
+import contextlib
+import logging
+import os
+import subprocess
+import sys
+from functools import cache
 from typing import Any
 
+import llvmlite
+import numba
 import numpy as np
 from llvmlite import binding, ir
 from numba.core.typing import signature
 
+from rewild4d.files import cache_folder, write_text
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.matrix import ROWS, matrix_tile, tile_width
 from rewild4d.kernels.simd import INTEGERS, LANES, VECTOR, intrinsic, lanes_type, load, store
 
-AVAILABLE = bool(binding.get_host_cpu_features().get("avx512bf16", False))
-"""Whether this machine multiplies pairs; elsewhere `add_product` of kernels/matrix.py does the work."""
+logger = logging.getLogger(__name__)
+
+IN_PROBE = "REWILD4D_IN_PROBE"
+"""Set in the process that tries to compile the instruction."""
+
+
+@cache
+def available() -> bool:
+    """Tell whether this machine multiplies pairs and this numba compiles that; elsewhere single precision is used.
+
+    Some versions of LLVM end the process when they meet the instruction (numba 0.61), so it is tried once a version in
+    a process of its own, and the answer is kept in the cache folder.
+    """
+    if not binding.get_host_cpu_features().get("avx512bf16", False):
+        return False
+    if os.environ.get(IN_PROBE):
+        return True
+    answer = cache_folder() / "kernels" / f"bfloat16-numba-{numba.__version__}-llvmlite-{llvmlite.__version__}"
+    with contextlib.suppress(OSError):
+        return answer.read_text() == "yes"
+    child = [sys.executable, "-c", f"from {__name__} import probe; probe()"]
+    works = subprocess.run(child, env=os.environ | {IN_PROBE: "1"}, capture_output=True).returncode == 0
+    if not works:
+        logger.warning(
+            "numba %s cannot compile products of bfloat16 pairs: single precision is used.", numba.__version__
+        )
+    with contextlib.suppress(OSError):
+        write_text(answer, "yes" if works else "no")
+    return works
+
+
+def probe() -> None:
+    """Compile one product of pairs and check it: 16 x 16 words of ones give sums of 32."""
+    ones = np.full((16, 16), np.uint32(0x3F803F80)).view(np.float32)
+    product = np.zeros((16, 16), np.float32)
+    add_pair_product(ones.ravel(), 0, 16, ones.ravel(), 0, 16, 16, product.ravel(), 0, 16, 16, 16)
+    if not (product == 32).all():
+        raise ArithmeticError(f"expected sums of 32, got {product.min()} to {product.max()}")
 
 
 class _BFloat(ir.Type):
@@ -29,7 +74,7 @@ _PAIRS = ir.VectorType(_BFloat(), 2 * LANES)
 
 def _multiply_add(builder: Any, left: Any, right: Any, total: Any) -> Any:
     """Total plus, lane by lane, the sum of the two products of a pair; only compiled where the machine has it."""
-    if not AVAILABLE:
+    if not available():
         return total
     pairs = [builder.bitcast(word, _PAIRS) for word in (left, right)]
     kind = ir.FunctionType(VECTOR, [VECTOR, _PAIRS, _PAIRS])

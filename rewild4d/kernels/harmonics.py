@@ -13,7 +13,18 @@ from torch import Tensor
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
+from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.threads import run, thread_count
+
+HARMONICS = Kernel(
+    "harmonics of splats",
+    "5ed69d8eccae",
+    "rewild4d.harmonics:rotated",
+    "rewild4d.harmonics:seen_colors",
+    "rewild4d.harmonics:basis",
+    "rewild4d.harmonics:_band",
+    "rewild4d.harmonics:_table",
+)
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199

@@ -7,10 +7,8 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from rewild4d.harmonics import C0, basis, rotated
-from rewild4d.kernels.arrays import fits
 from rewild4d.ours.config import Canonical
-from rewild4d.ours.fused.harmonics import seen_rgb
-from rewild4d.ours.fused.scales import blurred_scales
+from rewild4d.ours.fused.harmonics import COLORS, seen_rgb
 from rewild4d.priors.motion import quats_from_normals, sample_surface
 from rewild4d.transforms import quat_multiply, quat_to_matrix
 from rewild4d.types import OBJECT_DIAGONAL, Prior, Splats
@@ -57,8 +55,6 @@ class Gaussians(nn.Module):
 
     def scales(self, log_scales: Tensor) -> Tensor:
         """Standard deviations with the blur, [n, 3] -> [n, 3]."""
-        if fits(log_scales):
-            return blurred_scales(log_scales, self.blur.item())
         return ((2 * log_scales).exp() + self.blur.square()).sqrt()
 
     def opacities(self) -> Tensor:
@@ -83,7 +79,7 @@ class Gaussians(nn.Module):
         """
         if degree == 0:
             return self.rgb()
-        if fits(means):
+        if COLORS.takes(means, owner=self):
             return seen_rgb(self.colors, means, quats, self.quats, eye, degree, REST_GAIN)
         directions = normalize(means.detach() - eye.to(means), dim=-1)
         canonical = torch.einsum("na,nab->nb", directions, self.turns(quats.detach()))

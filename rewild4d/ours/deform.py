@@ -5,10 +5,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from rewild4d.kernels.arrays import fits
 from rewild4d.kernels.simd import LANES
 from rewild4d.ours.config import Deform as DeformConfig
-from rewild4d.ours.fused.deformation import deform
+from rewild4d.ours.fused.deformation import DEFORMATION, deform
 from rewild4d.ours.fused.folding import Layers, fold
 from rewild4d.ours.fused.queries import Reach
 from rewild4d.ours.pose import seed_linears
@@ -67,7 +66,7 @@ class DeformNetwork(nn.Module):
             Deformed Gaussians.
         """
         weights = weights.detach()
-        if fits(posed.means) and (anchors is None or anchors.shape[1] <= LANES):
+        if DEFORMATION.takes(posed.means, owner=self) and (anchors is None or anchors.shape[1] <= LANES):
             return Posed(*self._fused(features, weights, anchors, posed, strength, offset))
         parts = weights if anchors is None else weights @ anchors
         query = torch.cat((parts, self._place(posed)), dim=-1)

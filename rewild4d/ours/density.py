@@ -3,10 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from rewild4d.kernels.arrays import fits
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.config import Density
-from rewild4d.ours.fused.views import collect
 from rewild4d.rasterizer import RasterInfo
 from rewild4d.transforms import quat_to_matrix
 from rewild4d.types import OBJECT_DIAGONAL
@@ -28,13 +26,10 @@ class DensityControl:
     def observe(self, info: RasterInfo, side: float, longest: int) -> None:
         """Add one view after its backward pass; ``side`` is the animal's box, ``longest`` the image's side, pixels."""
         assert info.means2d.grad is not None, "observe comes after backward"
-        slopes, radii, own = info.means2d.grad[0], info.radii[0], (self.gradient, self.seen, self.radius)
-        if all(map(fits, (slopes, radii, *own))):
-            collect(slopes, radii, side / 2, longest, *own)
-            return
+        radii = info.radii[0]
         drawn = radii > 0
-        slope = slopes.norm(dim=-1) * (side / 2)
-        self.gradient += torch.where(drawn, slope, 0.0)
+        grad_norms = info.means2d.grad[0].norm(dim=-1) * (side / 2)
+        self.gradient += torch.where(drawn, grad_norms, 0.0)
         self.seen += drawn
         self.radius = torch.maximum(self.radius, radii / longest)
 

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from rewild4d.contracts import Log
 from rewild4d.kernels.threads import torch_on_one
-from rewild4d.ours.adam import Adam
 from rewild4d.ours.canonical import NAMES
 from rewild4d.ours.checkpoint import fit_digest, load_checkpoint, save_checkpoint
 from rewild4d.ours.coloring import initial_colors
@@ -46,8 +45,8 @@ class Training:
     def __init__(self, model: Model, supervision: Supervision, config: Config, generator: torch.Generator) -> None:
         self.model, self.supervision, self.config, self.generator = model, supervision, config, generator
         own, rates = model.gaussians, config.rates
-        self.gaussian_optimizer = Adam(
-            [{"params": [getattr(own, name)], "lr": _fixed_rate(rates, name)} for name in NAMES], eps=1e-15
+        self.gaussian_optimizer = torch.optim.Adam(
+            [{"params": [getattr(own, name)], "lr": _fixed_rate(rates, name)} for name in NAMES], eps=1e-15, fused=True
         )
         self.groups = {
             "skinning": list(model.field.parameters()),
@@ -55,7 +54,9 @@ class Training:
             "deform": list(model.deform.parameters()),
         }
         model.field.logits.requires_grad_(config.skinning.learn)
-        self.network_optimizer = Adam([{"params": group} for group in self.groups.values()], eps=1e-8)
+        self.network_optimizer = torch.optim.Adam(
+            [{"params": group} for group in self.groups.values()], eps=1e-8, fused=True
+        )
         self.density = DensityControl(config.density, len(own), own.means.device)
         self.near: Tensor | None = None
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from rewild4d.kernels.pointers import packed
-from rewild4d.ours.fused.gradients import measure, scale
+from rewild4d.ours.fused.gradients import GRADIENTS, measure, scale
 
 
 def clip_gradients(parameters: list[nn.Parameter], limit: float) -> float:
@@ -13,7 +13,7 @@ def clip_gradients(parameters: list[nn.Parameter], limit: float) -> float:
     As `torch.nn.utils.clip_grad_norm_`, whose norms of many small tensors are slow on a CPU.
     """
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
-    fused = all(packed(gradient) for gradient in gradients)
+    fused = GRADIENTS.takes(*gradients) and all(map(packed, gradients))
     norm = measure(gradients)[0] if fused else _norm(gradients)
     if norm > limit:
         factor = limit / (norm + 1e-6)
@@ -27,7 +27,7 @@ def clip_gradients(parameters: list[nn.Parameter], limit: float) -> float:
 def all_finite(parameters: list[nn.Parameter]) -> bool:
     """Whether no gradient holds an infinity or a NaN."""
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
-    if all(packed(gradient) for gradient in gradients):
+    if GRADIENTS.takes(*gradients) and all(map(packed, gradients)):
         return measure(gradients)[1]
     return bool(_flat(gradients).isfinite().all())  # one look: each would wait for a GPU
 

@@ -3,11 +3,10 @@
 import torch
 from torch import Tensor, nn
 
-from rewild4d.kernels.arrays import fits
 from rewild4d.ours.canonical import Gaussians, initial_gaussians
 from rewild4d.ours.config import Config
 from rewild4d.ours.deform import DeformNetwork, Posed
-from rewild4d.ours.fused.skinning import skin_both
+from rewild4d.ours.fused.skinning import SKINNING, skin_both
 from rewild4d.ours.pose import Pose, PoseNetwork, joint_transforms, time_code
 from rewild4d.ours.skinning import SkinningField, build_field
 from rewild4d.ours.symmetry import Key
@@ -75,7 +74,7 @@ class Model(nn.Module):
             transforms: rest -> posed, [J, 4, 4].
         """
         own, log_scales = self.gaussians, self.gaussians.scales_log()
-        if fits(own.means):
+        if SKINNING.takes(own.means, owner=self):
             live_means, live_quats, means, turned = skin_both(own.means, own.quats, weights, transforms, quats)
             live = Posed(live_means, live_quats, log_scales)
             return live, Posed(means, turned, log_scales) if self.config.loss.isolated else live

@@ -7,11 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rewild4d.kernels.arrays import fits
 from rewild4d.ours.config import Pose as PoseConfig
 from rewild4d.ours.fused.pose_layers import fits_sizes, sizes_of
-from rewild4d.ours.fused.poses import blend, distance
-from rewild4d.ours.fused.posing import codes, poses
+from rewild4d.ours.fused.posing import POSE_NETWORK, codes, poses
 from rewild4d.transforms import mirror_points, mirror_quats, quat_to_matrix, rigid
 from rewild4d.types import OBJECT_DIAGONAL
 
@@ -49,7 +47,7 @@ def time_code(time: Tensor, group: Tensor, view: Tensor, frequencies: int, expli
     Returns:
         [B, 2 + 2 frequencies (+ 1)].
     """
-    if fits(time):
+    if POSE_NETWORK.takes(time):
         return codes(time, group, view, frequencies, explicit_group)
     tau = (time * group)[:, None]
     angles = tau * 2.0 ** torch.arange(frequencies, dtype=tau.dtype, device=tau.device)
@@ -88,7 +86,11 @@ class PoseNetwork(nn.Module):
             flipped: which of them are wanted with left and right exchanged, [B]; none by default.
             mirror: joint on the other side, [J]; needed with ``flipped``.
         """
-        if fits(self.anchors) and fits_sizes(self.config.width, self.config.heads) and not code.requires_grad:
+        if (
+            POSE_NETWORK.takes(self.anchors, owner=self)
+            and fits_sizes(self.config.width, self.config.heads)
+            and not code.requires_grad
+        ):
             return self._fused(code, flipped, mirror)
         pose = self._plain(code)
         if flipped is None or mirror is None:
@@ -179,8 +181,6 @@ def blend_poses(pose: Pose, quats: Tensor, shifts: Tensor, weight: float) -> Pos
     """
     if weight == 0:
         return pose
-    if fits(pose.quats):
-        return Pose(*blend(pose.quats, pose.shifts, quats, shifts, weight), pose.features)
     mixed = (1 - weight) * pose.quats + weight * aligned(quats, pose.quats)
     return Pose(nn.functional.normalize(mixed, dim=-1), (1 - weight) * pose.shifts + weight * shifts, pose.features)
 
@@ -192,7 +192,5 @@ def aligned(quats: Tensor, reference: Tensor) -> Tensor:
 
 def pose_distance(pose: Pose, quats: Tensor, shifts: Tensor) -> Tensor:
     """Mean over joints of |q^ - q|^2 + |d^ - d|^2 / diagonal^2: how far poses are from others, scalar."""
-    if fits(pose.quats):
-        return distance(pose.quats, pose.shifts, quats, shifts, OBJECT_DIAGONAL)
     turn = (pose.quats - aligned(quats, pose.quats).detach()).square().sum(-1)
     return (turn + (pose.shifts - shifts).square().sum(-1) / OBJECT_DIAGONAL**2).mean()

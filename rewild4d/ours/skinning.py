@@ -5,10 +5,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from rewild4d.kernels.arrays import fits
 from rewild4d.ours.config import Skinning
-from rewild4d.ours.fused.field import sample_grid
-from rewild4d.ours.fused.simplex import softmax
+from rewild4d.ours.fused.field import FIELD, sample_grid
 from rewild4d.ours.losses.regularizers import tv_loss
 
 
@@ -43,11 +41,11 @@ class SkinningField(nn.Module):
         logits: Tensor = self.logits
         if self.tied:
             logits = 0.5 * (logits + logits[self.flipped][:, self.mirror])
-        return softmax(logits) if fits(logits) else logits.softmax(dim=-1)
+        return logits.softmax(dim=-1)
 
     def sample_and_vary(self, probabilities: Tensor, points: Tensor, delta: float | None) -> tuple[Tensor, Tensor]:
         """Weights of points as `sample` gives them, and L_tv of the field (zero where ``delta`` is None)."""
-        if fits(probabilities):
+        if FIELD.takes(probabilities, owner=self):
             return sample_grid(probabilities, points, self.origin, self.pitch, self.resolution, delta)
         weights = self.sample(probabilities, points)
         if delta is None:
@@ -64,7 +62,7 @@ class SkinningField(nn.Module):
         Returns:
             Rows on the simplex, [n, J].
         """
-        if fits(probabilities):
+        if FIELD.takes(probabilities, owner=self):
             return sample_grid(probabilities, points, self.origin, self.pitch, self.resolution)[0]
         last = self.resolution - 1
         place = ((points.detach() - self.origin) / self.pitch).clamp(0, last)

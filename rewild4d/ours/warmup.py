@@ -8,7 +8,6 @@ import math
 import torch
 from torch import Tensor, nn
 
-from rewild4d.ours.adam import Adam
 from rewild4d.ours.config import Config
 from rewild4d.ours.losses.images import blurred
 from rewild4d.ours.losses.skeleton import neighbour_keys, skeleton_losses
@@ -38,7 +37,7 @@ class WarmUp:
         self.generator = generator
         stage = config.warmup
         self.total = stage.regress + stage.iterations
-        self.optimizer = Adam(model.network.parameters(), lr=stage.rate)
+        self.optimizer = torch.optim.Adam(model.network.parameters(), lr=stage.rate, fused=True)
         surface = sample_surface(prior, stage.samples, generator)
         self.points, self.scale = surface.points.to(model.pivots.device), surface.radius
         with torch.no_grad():

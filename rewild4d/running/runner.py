@@ -26,6 +26,7 @@ from rewild4d.evaluation.networks import may_be_scored_now
 from rewild4d.evaluation.protocol import Protocol
 from rewild4d.evaluation.refining import ready_to_score
 from rewild4d.files import held, remove_leftovers, write_text
+from rewild4d.kernels.switch import chosen_kernels
 from rewild4d.leaderboard.records import FILE, SCHEMA, RunRecord, Timing, make_run_id, read_record, write_record
 from rewild4d.machine import code_of, machine, peak_memory_mib
 from rewild4d.priors.choose import PriorChoice, make_prior
@@ -207,7 +208,7 @@ class Job:
         self.run_id = make_run_id(
             method=entry.method, config=entry.config, clip=clip.digest, truth=truth.digest, prior=prior_id,
             protocol=plan.protocol.digest, seed=seed, code=code_of(entry.method), device=plan.device.type,
-            rasterizer=plan.rasterizer, **provenance.inputs(entry.method, entry.config, clip.name),
+            rasterizer=plan.rasterizer, **chosen_kernels(), **provenance.inputs(entry.method, entry.config, clip.name),
         )  # fmt: skip
         self.folder = folder / f"{entry.method}-{entry.preset}-seed{seed}-{self.run_id[:8]}"
         self.title = f"{clip.name}: {entry.method}"

@@ -19,7 +19,7 @@ from rewild4d.baselines.splatting import reset_opacities, surface_gaussians
 from rewild4d.baselines.volume import SCENE_HALF, common_volume, random_points, scene_frame
 from rewild4d.config import load_preset, preset_names
 from rewild4d.errors import UserError
-from rewild4d.kernels.halves import AVAILABLE
+from rewild4d.kernels.halves import available
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.config import Canonical
 from rewild4d.registry import load_method
@@ -232,7 +232,7 @@ def test_the_network_is_the_originals() -> None:
     assert sizes == [(256, 256)] * 7
 
 
-@pytest.mark.skipif(not AVAILABLE, reason="this CPU does not multiply bfloat16 pairs")
+@pytest.mark.skipif(not available(), reason="this CPU does not multiply bfloat16 pairs")
 def test_the_network_in_bfloat16_is_that_of_single_precision() -> None:
     """But for what eight bits of a number lose: a percent of the outputs; gradients point the same way."""
     points, time = torch.rand(200, 3, generator=torch.Generator().manual_seed(2)) * 2 - 1, torch.tensor(-0.4)

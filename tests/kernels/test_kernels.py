@@ -10,7 +10,7 @@ from torch import nn
 
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.doubles import floor, load_columns, log2, root, spread, store_columns, where_gt
-from rewild4d.kernels.halves import AVAILABLE, add_pair_product, pair_matrix, pair_rows, pair_vectors
+from rewild4d.kernels.halves import add_pair_product, available, pair_matrix, pair_rows, pair_vectors
 from rewild4d.kernels.matrix import add_product, matrix_tile, multiply_add, transpose_tile
 from rewild4d.kernels.memory import keep_freed_memory
 from rewild4d.kernels.rows import add_scaled, sum_rows
@@ -69,7 +69,7 @@ def _pair_product(a: np.ndarray, b: np.ndarray, c: np.ndarray, rows: int, depth:
     add_pair_product(left.view(np.float32), 0, half, right, 0, columns, half, c, 0, columns, rows, columns)
 
 
-@pytest.mark.skipif(not AVAILABLE, reason="this CPU multiplies no bfloat16 pairs (AVX512_BF16)")
+@pytest.mark.skipif(not available(), reason="this CPU multiplies no bfloat16 pairs (AVX512_BF16)")
 @pytest.mark.parametrize(("rows", "depth", "columns"), [(8, 2, 16), (16, 8, 48), (64, 54, 80), (24, 48, 112)])
 def test_products_of_pairs_are_those_of_the_rounded_factors(rows: int, depth: int, columns: int) -> None:
     a, b, before = numbers(rows, depth, seed=1), numbers(depth, columns, seed=2), numbers(rows, columns, seed=3)

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 from twins import Make, check_twins, leaves, normal, unit
 
-from rewild4d.kernels.halves import AVAILABLE
+from rewild4d.kernels.halves import available
 from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.config import Config, Deform, Loss, Skinning
 from rewild4d.ours.deform import DeformNetwork, Posed
@@ -56,7 +56,7 @@ def test_deformation_with_few_octaves(frequencies: int) -> None:
     check_twins(deformation(33, Deform(width=16, heads=2, frequencies=frequencies, half=False)))
 
 
-@pytest.mark.skipif(not AVAILABLE, reason="this CPU multiplies no bfloat16 pairs (AVX512_BF16)")
+@pytest.mark.skipif(not available(), reason="this CPU multiplies no bfloat16 pairs (AVX512_BF16)")
 def test_deformation_in_bfloat16_is_the_same_to_its_rounding() -> None:
     make, slopes, values = deformation(600, Deform(width=32), spread=0.15), [], []
     for dtype in (torch.float64, torch.float32):

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor, nn
 from twins import check_twins, leaves, normal
 
-from rewild4d.ours.adam import Adam
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.config import Density
 from rewild4d.ours.density import DensityControl
@@ -16,91 +15,6 @@ from rewild4d.ours.losses.images import union_window
 from rewild4d.ours.losses.regularizers import _disagreement, _normals
 from rewild4d.ours.skinning import SkinningField
 from rewild4d.rasterizer import RasterInfo
-
-SHAPES = ((40_000, 3), (5,), (), (33, 7), (2, 1, 3))
-"""The first takes several chunks and threads."""
-
-
-def optimizers(dtype: torch.dtype = torch.float32) -> tuple[torch.optim.Adam, Adam]:
-    """Torch's and ours over the same values, in two groups."""
-    made = []
-    for kind, more in ((torch.optim.Adam, {"fused": True}), (Adam, {})):
-        values = [nn.Parameter(normal(*shape, seed=i).to(dtype)) for i, shape in enumerate(SHAPES)]
-        groups = [{"params": values[:2], "lr": 1e-2, "eps": 1e-15}, {"params": values[2:], "betas": (0.8, 0.99)}]
-        made.append(kind(groups, lr=3e-3, **more))
-    return made[0], made[1]
-
-
-def values(optimizer: torch.optim.Optimizer) -> list[nn.Parameter]:
-    return [parameter for group in optimizer.param_groups for parameter in group["params"]]
-
-
-def move(optimizer: torch.optim.Optimizer, steps: range) -> None:
-    """Steps with gradients of many sizes; the second tensor has none in every third step, and a rate changes."""
-    for step in steps:
-        optimizer.zero_grad(set_to_none=True)
-        for i, parameter in enumerate(values(optimizer)):
-            if i != 1 or step % 3:
-                parameter.grad = (10.0 ** (-i) * normal(*parameter.shape, seed=100 * step + i)).to(parameter)
-        optimizer.param_groups[0]["lr"] = 1e-2 / (1 + step)
-        optimizer.step()
-
-
-def check_same(wanted: torch.optim.Optimizer, got: torch.optim.Optimizer) -> None:
-    for a, b in zip(values(wanted), values(got), strict=True):
-        pairs = [(a, b), *((wanted.state[a][name], got.state[b][name]) for name in ("exp_avg", "exp_avg_sq", "step"))]
-        assert all((x - y).norm() <= 1e-6 * x.norm() for x, y in pairs)
-
-
-def test_adam_is_torchs() -> None:
-    wanted, got = optimizers()
-    for each in (wanted, got):
-        move(each, range(60))
-    check_same(wanted, got)
-    assert [float(got.state[each]["step"]) for each in values(got)] == [60, 40, 60, 60, 60]
-
-
-def test_adam_and_torchs_continue_each_other() -> None:
-    wanted, got = optimizers()
-    for each in (wanted, got):
-        move(each, range(5))
-    kept, other = wanted.state_dict(), got.state_dict()
-    wanted.load_state_dict(other)
-    got.load_state_dict(kept)
-    for each in (wanted, got):
-        move(each, range(5, 20))
-    check_same(wanted, got)
-
-
-def test_adam_in_double_precision_is_torchs() -> None:
-    wanted, got = optimizers(torch.float64)
-    for each in (wanted, got):
-        move(each, range(5))
-    assert all(torch.equal(a, b) for a, b in zip(values(wanted), values(got), strict=True))
-
-
-def test_adam_is_the_same_bits_for_any_number_of_threads() -> None:
-    before, found = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 4):
-            torch.set_num_threads(threads)
-            _, own = optimizers()
-            move(own, range(3))
-            found.append(values(own))
-    finally:
-        torch.set_num_threads(before)
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
-
-
-def test_adam_refuses_a_state_of_another_size() -> None:
-    parameter = nn.Parameter(torch.zeros(4))
-    own = Adam([parameter])
-    parameter.grad = torch.ones(4)
-    own.step()
-    own.state[parameter]["exp_avg"] = torch.zeros(3)
-    with pytest.raises(ValueError, match=r"^Adam's state is of \[3\], the parameter of \[4\]\.$"):
-        own.step()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -16,7 +16,10 @@ from rewild4d.kernels.columns import BLOCK, four_rows, read_columns, write_colum
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.matrix import add_product, transpose
 from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
+from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.threads import run, thread_count
+
+COMPACTNESS = Kernel("compactness", "c5224f5d75ac", "rewild4d.ours.losses.regularizers:compact_loss")
 
 CHUNK = 16 * BLOCK
 """Gaussians a unit of work holds; sums are added over these, whatever the number of threads."""

@@ -12,13 +12,23 @@ from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
-from rewild4d.kernels.halves import AVAILABLE
+from rewild4d.kernels.halves import available
 from rewild4d.kernels.powers import LOG2_E, exp2
 from rewild4d.kernels.simd import LANES, divide, fma, load, maximum, minimum, splat, square_root, store, take_ticket
+from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.threads import run, thread_count
 from rewild4d.ours.fused.layers import BLOCK, Factors, Layout, backward_block, forward_block, pair_layers, round_up
 from rewild4d.ours.fused.queries import Reach, mix_back, read_query
 from rewild4d.ours.fused.sampled_rows import sample_rows
+
+DEFORMATION = Kernel(
+    "deformation",
+    "ce3470813534",
+    "rewild4d.ours.deform:DeformNetwork.forward",
+    "rewild4d.ours.deform:DeformNetwork._place",
+    "rewild4d.ours.deform:DeformNetwork._attend",
+    "rewild4d.ours.deform:DeformNetwork._attention",
+)
 
 CHUNK = 11 * BLOCK
 """Gaussians a unit of work holds; parameter gradients are summed over these, whatever the number of threads."""
@@ -206,7 +216,7 @@ def deform(
     Returns:
         Means [n, 3], quats [n, 4] and log scales [n, 3].
     """
-    half = half and AVAILABLE
+    half = half and available()
     return _Deform.apply(flat, anchors, means, quats, log_scales, weights, sizes, reach, half, sampled, offset)
 
 

@@ -14,8 +14,24 @@ from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.rows import add_scaled
 from rewild4d.kernels.simd import LANES, fma, maximum, minimum, splat, take_ticket
+from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.tails import lanes_sum, load_first, store_first
 from rewild4d.kernels.threads import run, thread_count
+
+FIELD = Kernel(
+    "skinning field",
+    "bbcf56220f1f",
+    "rewild4d.ours.skinning:SkinningField.sample",
+    "rewild4d.ours.skinning:SkinningField.sample_and_vary",
+    "rewild4d.ours.losses.regularizers:tv_loss",
+)
+RESIDUAL_FIELD = Kernel(
+    "skinning field of GART",
+    "5d431183bbb7",
+    "rewild4d.baselines.gart_skinning:ResidualField.forward",
+    "rewild4d.baselines.gart_skinning:ResidualField._variation",
+    "rewild4d.ours.losses.regularizers:tv_loss",
+)
 
 CHUNK = 1024
 """Gaussians a unit of work holds."""

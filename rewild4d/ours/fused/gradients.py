@@ -8,7 +8,17 @@ from torch import Tensor
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.pointers import floats_at
 from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
+from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.threads import run, thread_count
+
+GRADIENTS = Kernel(
+    "norms of gradients",
+    "31dcb7f87689",
+    "rewild4d.ours.gradients:clip_gradients",
+    "rewild4d.ours.gradients:all_finite",
+    "rewild4d.ours.gradients:_norm",
+    "rewild4d.ours.gradients:_flat",
+)
 
 CHUNK = 65536
 """Numbers a unit of work holds; sums are added over these, whatever the number of threads."""

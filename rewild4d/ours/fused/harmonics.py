@@ -15,8 +15,16 @@ from rewild4d.kernels.columns import BLOCK, four_rows, read_columns, write_colum
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.harmonics import set_band
 from rewild4d.kernels.simd import LANES, divide, fma, load, maximum, select_gt, splat, square_root, store, take_ticket
+from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.threads import run, thread_count
 from rewild4d.ours.fused.quaternions import dot, times_back
+
+COLORS = Kernel(
+    "colours from harmonics",
+    "0848b962f5dd",
+    "rewild4d.ours.canonical:Gaussians.seen_rgb",
+    "rewild4d.ours.canonical:Gaussians.turns",
+)
 
 CHUNK = 8 * BLOCK
 """Gaussians a unit of work holds."""

@@ -14,7 +14,17 @@ from torch.autograd.function import once_differentiable
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.simd import LANES, divide, fma, keep_where_ge, load, maximum, splat, store, take_ticket
+from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.threads import run, thread_count
+
+COLOUR_LOSSES = Kernel(
+    "colour losses",
+    "0a0096d03ed4",
+    "rewild4d.ours.losses.images:colour_losses",
+    "rewild4d.ours.losses.images:ssim_map",
+    "rewild4d.ours.losses.images:blur_matrix",
+)
+SILHOUETTE = Kernel("silhouette loss", "ce00e8a2cb44", "rewild4d.ours.losses.images:silhouette_loss")
 
 STRIP = 24
 """Rows of a unit of work; sums are added strip by strip, whatever the number of threads."""

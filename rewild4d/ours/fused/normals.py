@@ -14,8 +14,16 @@ from torch.autograd.function import once_differentiable
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import LANES, absolute, fma, load, select_gt, splat, store
+from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.tails import store_first
 from rewild4d.ours.fused.quaternions import unit_row, unit_slope
+
+NORMALS = Kernel(
+    "normals",
+    "817867c6a5af",
+    "rewild4d.ours.losses.regularizers:_normals",
+    "rewild4d.ours.losses.regularizers:_disagreement",
+)
 
 
 @kernel

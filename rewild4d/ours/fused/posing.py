@@ -16,9 +16,19 @@ from torch.autograd.function import once_differentiable
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import take_ticket
+from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.threads import run, thread_count
 from rewild4d.ours.fused.pose_layers import Sizes, backward_unit, forward_unit, outputs
 from rewild4d.ours.fused.quaternions import unit, unit_slope
+
+POSE_NETWORK = Kernel(
+    "pose network",
+    "558c5ae3e3ae",
+    "rewild4d.ours.pose:PoseNetwork._plain",
+    "rewild4d.ours.pose:PoseNetwork.forward",
+    "rewild4d.ours.pose:Block.forward",
+    "rewild4d.ours.pose:time_code",
+)
 
 
 @kernel

@@ -13,7 +13,12 @@ from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
+from rewild4d.kernels.switch import Kernel
 from rewild4d.ours.fused.quaternions import dot, rotation, rotation_slope, side, unit, unit_slope
+
+STANCE = Kernel(
+    "stance", "3b43920b19d4", "rewild4d.ours.losses.skeleton:stance", "rewild4d.ours.losses.skeleton:skeleton_losses"
+)
 
 
 class Weights(NamedTuple):

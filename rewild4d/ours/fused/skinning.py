@@ -16,8 +16,24 @@ from rewild4d.kernels.columns import BLOCK, four_rows, read_columns, write_colum
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.matrix import add_product, transpose
 from rewild4d.kernels.simd import LANES, fma, load, store, take_ticket
+from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.threads import run, thread_count
 from rewild4d.ours.fused.quaternions import back_times, times, times_back, unit_lanes, unit_slope
+
+SKINNING = Kernel(
+    "skinning",
+    "6c5e2f94d72b",
+    "rewild4d.ours.model:Model.skin",
+    "rewild4d.transforms:skin_points",
+    "rewild4d.transforms:skin_quats",
+)
+GART_SKINNING = Kernel(
+    "skinning of GART",
+    "5a6cf6814df5",
+    "rewild4d.baselines.gart_skinning:posed",
+    "rewild4d.transforms:skin_points",
+    "rewild4d.transforms:skin_quats",
+)
 
 CHUNK = 16 * BLOCK
 """Gaussians a unit of work holds; gradients of the joints are summed over these, whatever the number of threads."""

@@ -11,9 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy
 
-from rewild4d.kernels.arrays import fits
-from rewild4d.ours.fused.images import colour_means, matte_loss
-from rewild4d.ours.fused.views import extent
+from rewild4d.ours.fused.images import COLOUR_LOSSES, SILHOUETTE, colour_means, matte_loss
 from rewild4d.ours.symmetry import Target
 
 WINDOW, SIGMA = 11, 1.5
@@ -39,8 +37,6 @@ def union_window(alphas: list[Tensor], margin: int) -> Window:
 
 def _extent(alphas: list[Tensor]) -> tuple[tuple[int, int], tuple[int, int]]:
     """First and last row and column where any matte is above zero."""
-    if all(map(fits, alphas)):
-        return extent(alphas)
     union = torch.stack([alpha[0].detach() for alpha in alphas]).amax(0) > 0
     ends = []
     for marks in (union.any(dim=1), union.any(dim=0)):
@@ -52,7 +48,7 @@ def _extent(alphas: list[Tensor]) -> tuple[tuple[int, int], tuple[int, int]]:
 
 def silhouette_loss(alpha: Tensor, target: Target, window: Window) -> Tensor:
     """BCE + Dice of a rendered matte, alpha [1, h, w] clamped at 1e-5, Dice smoothing 1; scalar."""
-    if fits(alpha):
+    if SILHOUETTE.takes(alpha):
         return matte_loss(alpha, target.mask, _corner_and_size(window), target.side**2)
     rendered, truth = alpha[:, *window], target.mask[:, *window]
     bce = binary_cross_entropy(rendered.clamp(1e-5, 1 - 1e-5), truth, reduction="sum") / target.side**2
@@ -77,7 +73,7 @@ def colour_losses(
     """
     area = 3 * target.side**2
     inner = _inner(window, alpha)
-    if fits(rgb):
+    if COLOUR_LOSSES.takes(rgb):
         bounds = (inner[0].start, inner[0].stop, inner[1].start, inner[1].stop)
         return colour_means(rgb, alpha, target.rgb, target.mask, background, _corner_and_size(window), bounds, area)
     behind = background[:, None, None]

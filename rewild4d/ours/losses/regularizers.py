@@ -9,10 +9,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
-from rewild4d.kernels.arrays import fits
 from rewild4d.ours.deform import Posed
-from rewild4d.ours.fused.compactness import compactness
-from rewild4d.ours.fused.normals import disagreement, smallest_axes
+from rewild4d.ours.fused.compactness import COMPACTNESS, compactness
+from rewild4d.ours.fused.normals import NORMALS, disagreement, smallest_axes
 from rewild4d.ours.pose import Pose, aligned
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import look_at, quat_multiply, quat_to_matrix
@@ -48,7 +47,7 @@ def compact_loss(clouds: Sequence[Tensor], weights: Tensor, opacities: Tensor, p
         opacities: [n].
         power: exponent on the weights.
     """
-    if all(map(fits, clouds)):
+    if COMPACTNESS.takes(*clouds):
         return compactness(clouds, weights, opacities, power)
     mass = weights.detach() ** power * opacities.detach()[:, None]
     total = mass.sum(0)
@@ -96,7 +95,7 @@ def smooth_loss(posed: Posed, opacities: Tensor, size: int, generator: torch.Gen
 
 def _normals(quats: Tensor, log_scales: Tensor, means: Tensor, eye: Tensor) -> Tensor:
     """The axis of each Gaussian's smallest scale, turned towards ``eye`` [3], [n, 3]."""
-    if fits(quats):
+    if NORMALS.takes(quats):
         return smallest_axes(quats, log_scales, means, eye)
     axis = log_scales.argmin(-1)[:, None, None].expand(-1, 3, 1)
     normals = quat_to_matrix(quats).gather(-1, axis)[..., 0]
@@ -106,7 +105,7 @@ def _normals(quats: Tensor, log_scales: Tensor, means: Tensor, eye: Tensor) -> T
 
 def _disagreement(image: Tensor, matte: Tensor) -> Tensor:
     """Mean of 1 - |cos| between neighbouring pixels' vectors [3, h, w], weighted by both mattes [h, w]; scalar."""
-    if fits(image):
+    if NORMALS.takes(image):
         return disagreement(image, matte)
     # torch's own norm over the channels takes longer than the rest of this function.
     field = image / (image.square().sum(0) + 1e-24).sqrt()

@@ -4,9 +4,8 @@ import math
 
 from torch import Tensor
 
-from rewild4d.kernels.arrays import fits
 from rewild4d.ours.config import Geometry
-from rewild4d.ours.fused.skeleton import Weights, stand
+from rewild4d.ours.fused.skeleton import STANCE, Weights, stand
 from rewild4d.ours.losses.regularizers import attach_loss, limit_loss, sagittal_losses, still_loss, temporal_loss
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import Pose
@@ -48,7 +47,7 @@ def stance(model: Model, poses: Pose, rows: list[int], config: Geometry) -> tupl
     """
     triples = len(poses.quats) == 3 * len(rows)
     skeleton = model.pivots, model.parents, model.mirror
-    if fits(poses.quats):
+    if STANCE.takes(poses.quats):
         *own, transforms, total = stand(*poses, rows, *skeleton, _weights(config, triples))
         return Pose(*own), transforms, total
     transforms = model.transforms(poses)
@@ -66,7 +65,7 @@ def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geomet
         config: the weights.
         triples: whether the poses are those of triples of neighbouring frames; of others no step is known.
     """
-    if fits(pose.quats):
+    if STANCE.takes(pose.quats):
         return stand(*pose, [], model.pivots, model.parents, model.mirror, _weights(config, triples))[-1]
     total = pose.shifts.sum() * 0.0
     if config.limit:

@@ -1,0 +1,161 @@
+"""The kernel switch: off means off for every kernel, and an edited twin is never computed by the old kernel."""
+
+import importlib
+import importlib.util
+import logging
+import os
+import pkgutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from numba.core.registry import CPUDispatcher
+
+import rewild4d.ours.fused
+from rewild4d.benchmarks.scenes import training
+from rewild4d.errors import UserError
+from rewild4d.kernels import switch
+from rewild4d.kernels.switch import (
+    KERNELS,
+    Kernel,
+    kernel_mode,
+    set_kernels,
+    source_digest,
+    twin_digest,
+    without_kernels,
+)
+from rewild4d.ours.config import Deform
+from rewild4d.ours.deform import DeformNetwork, Posed
+from rewild4d.ours.losses import regularizers
+
+for module in pkgutil.iter_modules(rewild4d.ours.fused.__path__, "rewild4d.ours.fused."):
+    importlib.import_module(module.name)
+importlib.import_module("rewild4d.harmonics")
+
+
+@pytest.fixture(autouse=True)
+def mode(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Each test starts with fused kernels and forgets what it was told."""
+    monkeypatch.setenv(switch.VARIABLE, "auto")
+    yield
+    switch._verdict.cache_clear()
+
+
+@pytest.mark.parametrize("name", sorted(KERNELS))
+def test_every_kernel_was_written_for_the_twins_that_are_here(name: str) -> None:
+    kernel = KERNELS[name]
+    found = twin_digest(kernel)
+    hint = "compare kernel and twins (tests/ours/test_ours_fused*.py), then write this digest beside the kernel"
+    assert not kernel.twins or kernel.digest == found, f"{name}: {found}: {hint}"
+
+
+def test_layout_comments_docstrings_and_annotations_do_not_count(tmp_path: Path) -> None:
+    sources = [
+        'def f(x: int) -> int:\n    """Add one."""\n    return x + 1  # one\n',
+        "def f(x):\n    return (x +\n            1)\n",
+        "def f(x):\n    return x + 2\n",
+    ]
+    digests = []
+    for index, source in enumerate(sources):
+        file = tmp_path / f"source_{index}.py"
+        file.write_text(source)
+        spec = importlib.util.spec_from_file_location(file.stem, file)
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        digests.append(source_digest((module.f.__code__,)))
+    assert digests[0] == digests[1] != digests[2] and all(digests)
+
+
+def test_an_unknown_mode_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UserError, match="unknown mode of --kernels 'touch'. Did you mean 'torch'?"):
+        set_kernels("touch")
+    monkeypatch.setenv(switch.VARIABLE, "numba")
+    with pytest.raises(UserError, match="REWILD4D_KERNELS: expected auto or torch, got 'numba'"):
+        kernel_mode()
+
+
+def test_torch_means_torch_for_every_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With every compiled function of the training step broken, a step runs in torch and does not run fused."""
+    step, index = training(32, 60, "quick")
+
+    def broken(*_: Any) -> None:
+        raise ZeroDivisionError
+
+    for module in pkgutil.iter_modules(rewild4d.ours.fused.__path__, "rewild4d.ours.fused."):
+        loaded = importlib.import_module(module.name)
+        for name, value in vars(loaded).items():
+            if isinstance(value, CPUDispatcher):
+                monkeypatch.setattr(loaded, name, broken)
+    with pytest.raises(ZeroDivisionError):
+        step.step(index)
+    monkeypatch.setenv(switch.VARIABLE, "torch")
+    assert step.step(index)["loss"] > 0
+
+
+def network() -> tuple[DeformNetwork, tuple[Any, ...]]:
+    generator = torch.Generator().manual_seed(0)
+    made = DeformNetwork(4, 8, Deform(width=32, heads=4), generator)
+    posed = Posed(torch.rand(6, 3), torch.nn.functional.normalize(torch.rand(6, 4), dim=-1), torch.rand(6, 3))
+    return made, (torch.rand(4, 8), torch.full((6, 4), 0.25), None, posed, 1.0)
+
+
+def test_a_replaced_torch_body_is_never_ignored(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    made, given = network()
+    made(*given)
+
+    def attend(self: DeformNetwork, query: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(DeformNetwork, "_attend", attend)
+    with caplog.at_level(logging.WARNING), pytest.raises(ZeroDivisionError):
+        made(*given)
+    with pytest.raises(ZeroDivisionError):
+        made(*given)
+    assert [record.message.count("'deformation'") for record in caplog.records] == [1]  # told once
+    assert "torch for deformation (edited)" in switch.describe_kernels()
+
+
+def test_a_subclass_that_overrides_a_layer_gets_its_own_code() -> None:
+    class Louder(DeformNetwork):
+        def _attend(self, query: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
+            raise ZeroDivisionError
+
+    made, given = network()
+    made(*given)
+    made.__class__ = Louder
+    with pytest.raises(ZeroDivisionError):
+        made(*given)
+
+
+def test_one_kernel_can_be_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: Any) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(regularizers, "compactness", broken)
+    clouds, weights, opacities = (torch.rand(40, 3),), torch.full((40, 2), 0.5), torch.ones(40)
+    with pytest.raises(ZeroDivisionError):
+        regularizers.compact_loss(clouds, weights, opacities, 1.0)
+    with without_kernels("compactness"):
+        assert regularizers.compact_loss(clouds, weights, opacities, 1.0) > 0
+    with pytest.raises(ZeroDivisionError):
+        regularizers.compact_loss(clouds, weights, opacities, 1.0)
+
+
+def test_children_get_the_mode(monkeypatch: pytest.MonkeyPatch) -> None:
+    set_kernels("torch")
+    assert os.environ[switch.VARIABLE] == "torch" and kernel_mode() == "torch"
+    assert switch.chosen_kernels() == {"kernels": "torch"}
+    set_kernels("auto")
+    assert switch.chosen_kernels() == {}
+
+
+def test_a_kernel_without_source_is_taken_as_it_is() -> None:
+    code = compile("def f(x):\n    return x\n", "<no file>", "exec").co_consts[0]
+    assert source_digest((code,)) == ""
+    lone = Kernel("lone", "0" * 12)
+    assert lone.is_current() and KERNELS.pop("lone") is lone
