@@ -120,8 +120,9 @@ class External:
         if not config.folder:
             return program_digest(config.command, _file_name(case))
         folder = _folder(config, case)
-        return digest(*(part for path in sorted(folder.rglob("*")) if path.is_file()
-                        for part in (str(path.relative_to(folder)), path.read_bytes())))  # fmt: skip
+        paths = sorted(folder.rglob("*"), key=lambda path: path.parts)  # Windows would sort without case
+        return digest(*(part for path in paths if path.is_file()
+                        for part in (path.relative_to(folder).as_posix(), path.read_bytes())))  # fmt: skip
 
     def require(self, config: ExternalConfig, cases: Sequence[str]) -> None:
         """Say what no case could be made with before any is (`Method`).
@@ -186,7 +187,7 @@ def _run(work: Path, clip: Clip, prior: Prior, profile: Profile, config: Externa
     """Run the program, unless it has already run in this folder on the same input to its end."""
     identity = digest(msgspec.json.encode(config), clip.digest, prior.digest, str(seed))
     done = work / DONE
-    if done.is_file() and json.loads(done.read_text()) == identity:
+    if done.is_file() and json.loads(done.read_text(encoding="utf-8")) == identity:
         return
     for name in ("clip", "out"):
         shutil.rmtree(work / name, ignore_errors=True)

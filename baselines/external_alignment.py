@@ -197,7 +197,7 @@ def place_fauna(pose: Path, box: tuple[float, float, float], camera: Camera, dep
         UserError: the file is missing or holds something else, or its mesh does not lie before its camera.
     """
     try:
-        numbers = torch.tensor([float(word) for word in pose.read_text().split()], dtype=torch.float64)
+        numbers = torch.tensor([float(word) for word in pose.read_text(encoding="utf-8").split()], dtype=torch.float64)
     except OSError as error:
         raise UserError(f"{pose}: expected 3D-Fauna's camera, but: {error.strerror}.") from error
     except ValueError as error:

@@ -4,7 +4,6 @@ import json
 import math
 import os
 import re
-import shlex
 import shutil
 import signal
 import string
@@ -21,7 +20,7 @@ from torch.nn.functional import interpolate
 
 from rewild4d.baselines.external_profiles import Profile
 from rewild4d.errors import UserError
-from rewild4d.files import digest, write_text
+from rewild4d.files import command_words, digest, write_text
 from rewild4d.priors.io import save_prior
 from rewild4d.types import Clip, Frame, Prior
 
@@ -94,7 +93,7 @@ def crop_box(mask: Tensor) -> tuple[float, float, float]:
 def program_digest(command: str, case: str) -> str:
     """Digest of the files that a command names, in a word or in a part of one ("--config=FILE"); "" for none."""
     try:
-        words = {*shlex.split(command), *re.split(r"[\s='\";]+", command)}
+        words = {*command_words(command), *re.split(r"[\s='\";]+", command)}
     except ValueError:  # a quote that does not end is said when the program is to start
         return ""
     named = sorted(word.replace("{case}", case) for word in words)
@@ -152,17 +151,25 @@ def run_program(command: str, *, clip: Path, out: Path, case: str, seed: int, ti
             ) from error
         finally:
             if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
+                _kill_with_children(process)
     if status != 0:
         raise UserError(f"{words[0]}: ended with status {status}; its last words: '{_last_words(log)}' (log: {log}).")
+
+
+def _kill_with_children(process: subprocess.Popen[bytes]) -> None:
+    """Kill a program that was started in a session of its own; Windows has none, and its children go on."""
+    if hasattr(os, "killpg"):
+        os.killpg(process.pid, signal.SIGKILL)
+    else:
+        process.kill()
+    process.wait()
 
 
 def _words(command: str, given: Mapping[str, str]) -> list[str]:
     """A command's words with what {clip}, {out}, {case} and {seed} stand for; bare names only, as `str.format` would
     look up attributes."""
     try:
-        words = shlex.split(command)
+        words = command_words(command)
         fields = [field for word in words for field in string.Formatter().parse(word) if field[1] is not None]
     except ValueError as error:  # a quote or a brace that does not end
         raise UserError(f"--command: expected whole words and braces, got '{command}': {error}.") from error

@@ -190,7 +190,7 @@ def _video(source: Path, place: Path) -> str:
              "-vf", f"scale='min({VIDEO_WIDTH},iw)':-2", "-c:v", "libx264", "-crf", "30", "-preset", "slow",
              "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-map_metadata", "-1", "-fflags", "+bitexact",
              str(target)]  # fmt: skip
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
     if done.returncode:
         raise UserError(f"{film}: the film could not be made smaller: {(done.stderr.splitlines() or ['?'])[-1]}.")
     return target.name

@@ -1,5 +1,6 @@
 """The command line: a thin skin over callables. Results go to standard output, everything else to standard error."""
 
+import io
 import os
 import sys
 from collections.abc import Callable
@@ -51,6 +52,7 @@ def usage() -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point. Exit status: 0 done, 1 a run failed, 2 bad input."""
+    _print_utf8()
     words = sys.argv[1:] if arguments is None else arguments
     if not words or words[0] in ("-h", "--help", "help"):
         print(usage())
@@ -73,3 +75,9 @@ def main(arguments: list[str] | None = None) -> None:
         print("rewild4d-bench: stopped; the same command goes on where this one was.", file=sys.stderr)
         status = 130
     sys.exit(status)
+
+
+def _print_utf8() -> None:
+    """Encode standard output as UTF-8: tables hold arrows, and Windows gives files and pipes an older code page."""
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.encoding.lower() != "utf-8":
+        sys.stdout.reconfigure(encoding="utf-8")

@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import os
 import re
+import shlex
 import shutil
 import sys
 import tempfile
@@ -123,9 +124,9 @@ def held(folder: Path, waiting: str) -> Iterator[None]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write text atomically."""
+    """Write text atomically, the same bytes on every system."""
     with atomic(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
 def save_tensors(state: Any, path: Path) -> None:
@@ -164,6 +165,19 @@ def file_state(path: Path) -> str:
     except OSError as error:
         raise UserError(f"{path}: expected a file that can be read, but: {error.strerror}.") from error
     return f"{path.resolve()} {state.st_size} {state.st_mtime_ns}"
+
+
+def command_words(command: str) -> list[str]:
+    """Split a command line into words as a POSIX shell does; on Windows a backslash is part of a path.
+
+    Raises:
+        ValueError: a quote does not end.
+    """
+    lexer = shlex.shlex(command, posix=True)
+    lexer.whitespace_split, lexer.commenters = True, ""
+    if os.name == "nt":
+        lexer.escape = ""
+    return list(lexer)
 
 
 def natural(path: Path) -> list[str | int]:

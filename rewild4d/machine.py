@@ -2,7 +2,6 @@
 
 import os
 import platform
-import resource
 import sys
 from functools import cache
 from importlib import metadata, resources
@@ -61,7 +60,7 @@ def _sources(package: str) -> str:
     files = [(folder, file) for folder in folders for file in folder.rglob("*") if file.suffix in (".py", ".toml")]
     if not folders and module.__file__:
         files = [(Path(module.__file__).parent, Path(module.__file__))]
-    named = sorted((str(file.relative_to(folder)), file.read_bytes()) for folder, file in files)
+    named = sorted((file.relative_to(folder).as_posix(), file.read_bytes()) for folder, file in files)
     return digest(*(part for pair in named for part in pair))[:16]
 
 
@@ -86,8 +85,13 @@ def machine(device: torch.device, rasterizer: str) -> dict[str, str]:
 
 
 def peak_memory_mib() -> float:
-    """Largest resident memory of this process so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    """Largest resident memory of this process so far; 0 on Windows, where Python's library does not tell it."""
+    try:
+        import resource
+    except ImportError:
+        return 0.0
+    unit = 2**20 if sys.platform == "darwin" else 2**10  # of ru_maxrss: bytes on macOS, KiB elsewhere
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
 def pick_device(name: str) -> torch.device:
@@ -108,7 +112,7 @@ def pick_device(name: str) -> torch.device:
 def _processor() -> str:
     info = Path("/proc/cpuinfo")
     if info.is_file():
-        for line in info.read_text().splitlines():
+        for line in info.read_text(encoding="utf-8", errors="replace").splitlines():
             if line.startswith("model name"):
                 return f"{line.split(':', 1)[1].strip()}, {os.cpu_count()} cores"
-    return f"{platform.processor()}, {os.cpu_count()} cores"
+    return f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"

@@ -135,11 +135,14 @@ class ArtemisWriter:
         save_tensors(torch.from_numpy(self._voxels), volumes / "coords_init.pth")
         save_tensors(torch.from_numpy(self._indices), volumes / "volume_indices.pth")
         save_tensors(torch.from_numpy(self._weights), volumes / "volume_weights.pth")
-        (volumes / "radius.txt").write_text(" ".join(f"{value:.9g}" for value in self._radius) + "\n")
-        (build / "sequences").write_text("".join(f"{name} {count}\n" for name, count in self._frames.items()))
+        (volumes / "radius.txt").write_text(" ".join(f"{value:.9g}" for value in self._radius) + "\n", encoding="utf-8")
+        listing = "".join(f"{name} {count}\n" for name, count in self._frames.items())
+        (build / "sequences").write_text(listing, encoding="utf-8")
         if self._licence:
             (build / "licence.txt").write_text(self._licence + "\n", encoding="utf-8")
         if self._recipe is not None:
             write_recipe(build, self._recipe)
         os.chmod(build, 0o755)
+        if self.folder.exists():
+            self.folder.rmdir()  # Windows moves nothing onto a folder, not even onto an empty one
         os.replace(build, self.folder)

@@ -5,7 +5,6 @@ frames/00000.png, ..., it writes masks/00000.png, ..., and a command line joins 
 """
 
 import math
-import shlex
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
@@ -17,7 +16,7 @@ import numpy as np
 
 from rewild4d.datasets.masking.masks import list_images, match_masks, open_masks
 from rewild4d.errors import UserError
-from rewild4d.files import atomic
+from rewild4d.files import atomic, command_words
 
 Box = tuple[float, float, float, float]
 """Left, top, width, height in pixels."""
@@ -78,7 +77,7 @@ def run_program(command: str) -> MaskMaker:
         UserError: a command without {frames} or {masks}, or with another name in braces.
     """
     try:
-        words = shlex.split(command)
+        words = command_words(command)
         said = [word.format(**dict.fromkeys(PLACES, Path())) for word in words]
     except (KeyError, IndexError, ValueError, AttributeError, TypeError) as error:
         names = ", ".join(f"{{{name}}}" for name in PLACES)
@@ -95,7 +94,7 @@ def run_program(command: str) -> MaskMaker:
             for stem, image in zip(stems, source.images(), strict=True):
                 _write(places["frames"] / f"{stem}.png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
             lines = [f"{index} {' '.join(f'{x:g}' for x in box)}\n" for index, box in sorted(source.boxes.items())]
-            places["boxes"].write_text("".join(lines))
+            places["boxes"].write_text("".join(lines), encoding="utf-8")
             _call([word.format(**places) for word in words])
             written = list_images(places["masks"])
             if not written:

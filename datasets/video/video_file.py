@@ -53,7 +53,7 @@ def read_video(path: Path) -> Iterator[np.ndarray]:
     Raises:
         UserError: ffmpeg cannot read the file.
     """
-    with tempfile.TemporaryFile("w+") as log:
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as log:
         yield from _frames(path, log)
 
 
@@ -73,7 +73,7 @@ def video_facts(path: Path) -> VideoFacts:
 @lru_cache(maxsize=8)
 def _facts(path: Path, size: int, changed: int) -> VideoFacts:
     count, width, height, has_alpha = 0, 0, 0, False
-    with tempfile.TemporaryFile("w+") as log:
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as log:
         for frame in _frames(path, log):
             count, (height, width) = count + 1, frame.shape[:2]
             has_alpha = has_alpha or bool((frame[..., 3] < 255).any())

@@ -284,11 +284,11 @@ def _fill(video: Video, layout: Layout, size: int, folder: Path) -> None:
 
 def _write_layout(path: Path, layout: Layout) -> None:
     with atomic(path) as temporary:
-        temporary.write_text(json.dumps(asdict(layout)))
+        temporary.write_text(json.dumps(asdict(layout)), encoding="utf-8")
 
 
 def _read_layout(path: Path) -> Layout:
-    parts = json.loads(path.read_text())
+    parts = json.loads(path.read_text(encoding="utf-8"))
     crops = tuple(Crop(**values) for values in parts.pop("crops"))
     return Layout(crops=crops, **{name: tuple(values) for name, values in parts.items()})
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from numba.core.codegen import get_host_cpu_features
 
 from rewild4d.files import cache_folder
 
@@ -22,6 +23,16 @@ def _sources_digest(folder: Path) -> str:
 
 _config: Any = numba.config
 _CACHE = Path(_config.CACHE_DIR or cache_folder() / "kernels")
+
+
+@cache
+def compiled_for(feature: str) -> bool:
+    """Whether kernels may use a feature of the processor, by LLVM's name ("avx512f").
+
+    By default those of this machine; NUMBA_CPU_NAME, NUMBA_CPU_FEATURES and NUMBA_ENABLE_AVX choose others.
+    """
+    chosen = _config.CPU_FEATURES
+    return f"+{feature}" in (get_host_cpu_features() if chosen is None else chosen).split(",")
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:

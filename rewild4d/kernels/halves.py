@@ -14,11 +14,11 @@ from typing import Any
 import llvmlite
 import numba
 import numpy as np
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba.core.typing import signature
 
 from rewild4d.files import cache_folder, write_text
-from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.compiling import compiled_for, kernel
 from rewild4d.kernels.matrix import ROWS, matrix_tile, tile_width
 from rewild4d.kernels.simd import INTEGERS, LANES, VECTOR, intrinsic, lanes_type, load, store
 
@@ -35,7 +35,7 @@ def available() -> bool:
     Some versions of LLVM end the process when they meet the instruction (numba 0.61), so it is tried once a version in
     a process of its own, and the answer is kept in the cache folder.
     """
-    if not binding.get_host_cpu_features().get("avx512bf16", False):
+    if not compiled_for("avx512bf16"):
         return False
     if os.environ.get(IN_PROBE):
         return True

@@ -8,14 +8,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba.core import types
 from numba.core.typing import signature
 
-from rewild4d.kernels.compiling import kernel
+from rewild4d.kernels.compiling import compiled_for, kernel
 from rewild4d.kernels.simd import INTEGERS, LANES, VECTOR, intrinsic, llvm_call
 
-ROWS, VECTORS = (8, 3) if binding.get_host_cpu_features().get("avx512f", False) else (4, 1)
+ROWS, VECTORS = (8, 3) if compiled_for("avx512f") else (4, 1)
 """Rows of a tile and vectors in one of them; rows of the left factor and of the result are a multiple of 8.
 
 AVX-512 has 32 registers: 24 sums, 3 loads and 8 broadcasts a step leave the multiplier as the limit. AVX2 has 16 of

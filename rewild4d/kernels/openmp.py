@@ -13,10 +13,16 @@ _FORK_WITHOUT_EXEC = 0x40
 """Linux's PF_FORKNOEXEC."""
 
 
+def after_fork(call: Callable[[], None]) -> None:
+    """Call a function in every child that is forked from this process; Windows has no forks."""
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=call)
+
+
 def _was_forked() -> bool:
     """Whether this process began as a fork, as far as that can be seen: `fork` may come before this module's import."""
     try:
-        with open("/proc/self/stat") as stat:
+        with open("/proc/self/stat", encoding="utf-8", errors="replace") as stat:
             flags = int(stat.read().rpartition(")")[2].split()[6])
     except OSError:
         return False
@@ -32,7 +38,7 @@ def _mark_fork() -> None:
     _forked = True
 
 
-os.register_at_fork(after_in_child=_mark_fork)
+after_fork(_mark_fork)
 
 
 @cache

@@ -1,7 +1,6 @@
 """A small thread pool for kernels that release the GIL: survives fork, nests in any thread, follows torch's setting."""
 
 import atexit
-import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -10,7 +9,7 @@ from typing import Any
 
 import torch
 
-from rewild4d.kernels.openmp import let_idle_threads_go
+from rewild4d.kernels.openmp import after_fork, let_idle_threads_go
 
 _Job = tuple[Callable[..., Any], tuple[Any, ...], "_Outcome"] | None
 """None ends the worker that takes it."""
@@ -44,7 +43,7 @@ def _end_workers() -> None:
     _workers.clear()
 
 
-os.register_at_fork(after_in_child=_forget_workers)
+after_fork(_forget_workers)
 atexit.register(_end_workers)
 
 

@@ -322,7 +322,7 @@ class Job:
 def fit_seconds(folder: Path) -> float:
     """How long the finished fit in a run's folder took since its last start."""
     try:
-        return float(json.loads((folder / STAMP).read_text())["seconds_since_last_start"])
+        return float(json.loads((folder / STAMP).read_text(encoding="utf-8"))["seconds_since_last_start"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{folder / STAMP}: expected the time of a finished fit, got a damaged file ({error})."

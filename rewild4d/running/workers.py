@@ -2,7 +2,6 @@
 
 import multiprocessing
 import os
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -30,7 +29,11 @@ class Threads(NamedTuple):
 
 def usable_cores(device: torch.device) -> int:
     """Processes that a device can keep busy: one for each core that this process may use, one in all on a GPU."""
-    return 1 if device.type == "cuda" else len(os.sched_getaffinity(0))
+    if device.type == "cuda":
+        return 1
+    if hasattr(os, "sched_getaffinity"):  # Linux alone can tell which cores a process may use
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def share_cores(threads: int, fits: int, device: torch.device) -> Threads:
@@ -62,7 +65,7 @@ class Workers:
     """
 
     def __init__(self, jobs: int, threads: Threads, rasterizer: str) -> None:
-        self._jobs, self._setup = jobs, (threads, rasterizer, os.getpid())
+        self._jobs, self._setup = jobs, (threads, rasterizer)
         self._free: SimpleQueue[ProcessPoolExecutor] = SimpleQueue()
         for _ in range(jobs):
             self._free.put(self._pool())
@@ -102,13 +105,14 @@ class Workers:
         return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), start_worker, self._setup)
 
 
-def start_worker(threads: Threads, rasterizer: str, parent: int) -> None:
+def start_worker(threads: Threads, rasterizer: str) -> None:
     """Threads of its own, and an end with its parent: an orphan would write into the folder of the next start."""
     _settle(threads, rasterizer)
 
     def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.2)
+        parent = multiprocessing.parent_process()  # not os.getppid: on Windows the number stays when the parent ends
+        assert parent is not None
+        parent.join()
         os._exit(1)
 
     Thread(target=watch, daemon=True).start()

@@ -170,7 +170,7 @@ def test_kernels_take_the_cores_that_no_fit_needs(
 
 def test_worker_processes_render_with_the_rasterizer_of_the_plan() -> None:
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, context, start_worker, (Threads(1, 1), "reference", os.getpid())) as pool:
+    with ProcessPoolExecutor(1, context, start_worker, (Threads(1, 1), "reference")) as pool:
         assert pool.submit(resolve, "auto", torch.device("cpu"), torch.float32).result() == "reference"
 
 
