@@ -1,7 +1,6 @@
 """The Gaussian competitors: the contract of all four at tiny size, resuming after a kill, and what they share."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,8 @@ from rewild4d.running.conformance import check_method, tiny_case
 from rewild4d.transforms import camera_in_object
 from rewild4d.types import Case
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 CPU = torch.device("cpu")
 SHORT: dict[str, Any] = {
     "image_size": 64,
@@ -44,15 +45,6 @@ TINY = {
     "gart": msgspec.convert(SHORT | GRID, GartConfig),
     "gart-star": msgspec.convert(SHORT | GRID | {"refine": {"steps": 3}}, GartStarConfig),
 }
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Tiny tensors on a busy machine: threads only wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
 """Small images and clips on disk, and a command that refuses them."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -7,6 +8,9 @@ import numpy as np
 import pytest
 
 from rewild4d import cli
+
+Call = Callable[..., dict]  # type: ignore[type-arg]
+"""`score` with these words, and what it prints."""
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
@@ -28,6 +32,9 @@ def flat(*color: int, size: tuple[int, int] = (40, 48), dtype: type = np.uint8) 
 
 def noise(seed: int, size: tuple[int, int] = (40, 48)) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)
+
+
+GREY = noise(0)[..., :1]
 
 
 def write(path: Path, image: np.ndarray) -> Path:

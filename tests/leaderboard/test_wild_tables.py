@@ -23,13 +23,10 @@ from rewild4d.priors.config import FOOTAGE, QUICK, STANDARD, PriorConfig
 from rewild4d.running import planning
 from rewild4d.running.planning import Choice
 
+pytestmark = pytest.mark.usefixtures("cache")
+
 NAMES = ("input-view", "novel-view")
 COMMITTED = Path(__file__).resolve().parents[2] / "results" / "2026-11-23-davis-standard"
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("REWILD4D_CACHE", str(tmp_path / "cache"))
 
 
 def davis(root: Path, *sequences: str) -> Path:

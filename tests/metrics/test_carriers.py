@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import SHARED
 
 from rewild4d.errors import UserError
 from rewild4d.metrics import carriers, weights
@@ -113,8 +112,8 @@ def test_the_real_table_is_whole() -> None:
         assert file.form in carriers.READERS and file.layout in carriers.LAYOUTS
 
 
-def test_the_pinned_hashes_are_the_published_ones() -> None:
-    path = SHARED / "design" / "weights_known_hashes.json"
+def test_the_pinned_hashes_are_the_published_ones(shared: Path) -> None:
+    path = shared / "design" / "weights_known_hashes.json"
     if not path.is_file():
         pytest.skip(f"the table of published hashes is not here ({path})")
     published = {name.rpartition("/")[2]: entry for name, entry in json.loads(path.read_text()).items()}

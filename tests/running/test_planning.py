@@ -7,13 +7,13 @@ from typing import Any
 
 import msgspec
 import pytest
+from one_case import OneCase
 from records_for_tests import PROTOCOL, psnr, record
 
 from rewild4d import cli
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig
 from rewild4d.commands import run_table, table
 from rewild4d.config import load_preset
-from rewild4d.contracts import Selection
 from rewild4d.errors import UserError
 from rewild4d.leaderboard.records import FILE, RunRecord, write_record
 from rewild4d.leaderboard.specs import Condition, Line, Spec, load_reported, load_specs
@@ -25,7 +25,6 @@ from rewild4d.registry import load_method
 from rewild4d.running import planning
 from rewild4d.running.conformance import tiny_case
 from rewild4d.running.provenance import FROM_TRUTH
-from rewild4d.types import Case, Clip, Truth
 
 
 def spec(rows: Sequence[Line], **changes: Any) -> Spec:
@@ -176,24 +175,6 @@ def test_a_protocol_can_be_chosen_only_for_a_single_condition() -> None:
         planning.with_choice("protocols", many, planning.Choice(protocol="artemis-sweep-128-v1"))
     one = planning.with_choice("artemis", load_specs()["artemis"], planning.Choice(protocol="artemis-random-128"))
     assert one.conditions[0].protocol.startswith("artemis-random-128-v")
-
-
-class OneCase:
-    """A reader of the tiny case."""
-
-    licence = "CC0 1.0"
-
-    def __init__(self, case: Case) -> None:
-        self.case = case
-
-    def cases(self, selection: Selection) -> list[str]:
-        return [self.case.clip.name]
-
-    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
-        return self.case.clip, self.case.truth
-
-    def check(self) -> list[Any]:
-        return []
 
 
 @pytest.fixture

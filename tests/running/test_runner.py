@@ -11,11 +11,11 @@ from typing import Any
 import msgspec
 import pytest
 import torch
+from one_case import OneCase
 
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig
 from rewild4d.commands.evaluate import Options as EvaluateOptions
 from rewild4d.commands.evaluate import score_again
-from rewild4d.contracts import Selection
 from rewild4d.errors import UserError
 from rewild4d.evaluation.coverage import coverage, visible
 from rewild4d.evaluation.protocol import NovelViews, find_protocol
@@ -28,7 +28,7 @@ from rewild4d.registry import load_method
 from rewild4d.running import runner
 from rewild4d.running.conformance import check_method, tiny_case
 from rewild4d.running.workers import Threads, share_cores, start_worker
-from rewild4d.types import Camera, Case, Clip, Truth
+from rewild4d.types import Camera, Case, Truth
 
 SETTINGS = PriorOnlyConfig(gaussians=2000)
 
@@ -36,24 +36,6 @@ SETTINGS = PriorOnlyConfig(gaussians=2000)
 @pytest.fixture(scope="module")
 def case() -> Case:
     return tiny_case()
-
-
-class OneCase:
-    """A reader of the tiny case."""
-
-    licence = "CC0 1.0"
-
-    def __init__(self, case: Case) -> None:
-        self.case = case
-
-    def cases(self, selection: Selection) -> list[str]:
-        return [self.case.clip.name]
-
-    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
-        return self.case.clip, self.case.truth
-
-    def check(self) -> list[Any]:
-        return []
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import dying
 import msgspec
 import pytest
 import torch
-from external_program import OneCase
+from one_case import OneCase
 
 from rewild4d import registry
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig, PriorOnlyReconstruction
