@@ -7,9 +7,9 @@ import torch
 from rewild4d.ours.config import Canonical, Config, Deform, Density, Geometry, Skinning, WarmUp
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.motion import quats_from_normals, sample_surface
-from rewild4d.priors.template import MIRROR, PARENTS, quadruped
+from rewild4d.priors.template import PARENTS, posed_prior, quadruped
 from rewild4d.rasterizer import rasterize
-from rewild4d.transforms import look_at, mirror_camera, mirror_transforms, skin_points
+from rewild4d.transforms import look_at, skin_points
 from rewild4d.types import Camera, Clip, Frame, Prior
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 5
@@ -48,27 +48,10 @@ def swing(amplitude: float) -> torch.Tensor:
 
 def make_toy() -> tuple[Clip, Prior]:
     """A clip of the animal, and a prior of the right shape that does not move."""
-    template, mirror = quadruped(), torch.tensor(MIRROR)
-    cameras = tuple(camera(index) for index in range(FRAMES))
-    still = swing(0.0)
-    prior = Prior(
-        name="toy",
-        provenance="toy",
-        vertices=template.vertices,
-        faces=template.faces,
-        weights=template.weights,
-        bones=template.bones,
-        parents=torch.tensor(PARENTS),
-        mirror=mirror,
-        times=torch.arange(FRAMES, dtype=torch.float64) / 10,
-        object_to_world=torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1),
-        cameras=cameras,
-        transforms=still,
-        cameras_flip=tuple(mirror_camera(each) for each in cameras),
-        transforms_flip=mirror_transforms(still, mirror),
-        quality={},
-        digest="toy",
-    )
+    cameras = [camera(index) for index in range(FRAMES)]
+    still = torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)
+    times = torch.arange(FRAMES, dtype=torch.float64) / 10
+    prior = posed_prior(quadruped(), swing(0.0), still, cameras, times, name="toy", provenance="toy", digest="toy")
     surface = sample_surface(prior, 800, torch.Generator().manual_seed(1))
     front = surface.points[:, 2:] > 0
     colors = torch.where(front, torch.tensor((0.8, 0.3, 0.1)), torch.tensor((0.1, 0.4, 0.7)))
