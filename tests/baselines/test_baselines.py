@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 import torch
+from dying import Killed, kill_late
 
 from rewild4d.baselines.d3dgs import D3dgs, D3dgsConfig, D3dgsStar, D3dgsStarConfig, random_gaussians
 from rewild4d.baselines.d3dgs_network import DeformationNetwork, NetworkShape, octave_code
@@ -69,13 +70,6 @@ def test_the_contract_is_kept(name: str, monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.parametrize("name", TINY)
 def test_a_killed_fit_resumes_to_the_same_bits(name: str, case: Case, tmp_path: Path) -> None:
-    class Killed(Exception):
-        pass
-
-    def kill_late(step: int, total: int, values: object) -> None:
-        if step == total:
-            raise Killed
-
     whole = fitted(name, case)
     with pytest.raises(Killed):
         fitted(name, case, log=kill_late, workdir=tmp_path)

@@ -3,10 +3,10 @@
 import json
 
 import pytest
+from calling import output
 from extractors import LinearNetwork, LinearVideoNetwork, SquaredError
 from pictures import Call
 
-from rewild4d import cli
 from rewild4d.commands import score as command
 from rewild4d.evaluation.networks import Networks
 
@@ -24,10 +24,6 @@ def score(networks: Networks, capsys: pytest.CaptureFixture[str]) -> Call:
     """Call `score --json` and give what it prints."""
 
     def call(*words: object) -> dict:  # type: ignore[type-arg]
-        with pytest.raises(SystemExit) as stop:
-            cli.main(["score", *map(str, words), "--json"])
-        out, err = capsys.readouterr()
-        assert stop.value.code == 0, err
-        return json.loads(out)
+        return json.loads(output(capsys, "score", *words, "--json"))
 
     return call

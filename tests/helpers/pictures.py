@@ -6,8 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-
-from rewild4d import cli
+from calling import call
 
 Call = Callable[..., dict]  # type: ignore[type-arg]
 """`score` with these words, and what it prints."""
@@ -15,10 +14,9 @@ Call = Callable[..., dict]  # type: ignore[type-arg]
 
 def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     """The one sentence that a refused command leaves on standard error (behind its progress)."""
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["score", *map(str, words)])
+    code = call("score", *words)
     out, err = capsys.readouterr()
-    assert (stop.value.code, out) == (2, "")
+    assert (code, out) == (2, "")
     assert "Traceback" not in err
     said = err[err.index("rewild4d-bench: ") :].strip()
     assert len(said.splitlines()) == 1

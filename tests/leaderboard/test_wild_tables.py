@@ -9,9 +9,9 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from calling import call
 from records_for_tests import record
 
-from rewild4d import cli
 from rewild4d.commands import run_table
 from rewild4d.commands.choice import cases_of, chosen
 from rewild4d.datasets.video.davis import known_sequences
@@ -41,12 +41,6 @@ def davis(root: Path, *sequences: str) -> Path:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 cv2.imwrite(str(path), picture)
     return root
-
-
-def call(*words: str) -> int:
-    with pytest.raises(SystemExit) as stop:
-        cli.main(list(words))
-    return int(stop.value.code or 0)
 
 
 def run_of(protocol: str, case: str, prior: PriorConfig, preset: str = "standard", **changes: Any) -> RunRecord:

@@ -2,29 +2,18 @@
 
 import io
 import json
-import os
 import pickle
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from tiny_weights import Calls
 
 from rewild4d.errors import UserError
 from rewild4d.metrics import carriers, weights
 
 KERNEL = np.ones((2, 3, 4, 5), np.float32)
-
-
-class Calls:
-    """Unpickled by a careless reader, it makes a file."""
-
-    def __init__(self, marker: Path) -> None:
-        self.marker = marker
-
-    def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
-        return os.system, (f"touch {self.marker}",)
 
 
 @pytest.mark.parametrize("tree", [{"a": 1}, [KERNEL], {"a": KERNEL.astype(object)}, "text"])

@@ -8,6 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import torch
+from dying import Killed, kill_late
 from toys import FRAMES, HEIGHT, TINY, WIDTH
 
 from rewild4d.errors import UserError
@@ -121,14 +122,6 @@ def test_a_change_of_scale_by_the_deformation_costs_its_square(toy: tuple[Clip, 
 
 def test_a_killed_fit_resumes_to_the_same_bits_on_more_threads(toy: tuple[Clip, Prior], tmp_path: Path) -> None:
     whole = train(*toy, TINY, 0, CPU, quiet, None)
-
-    class Killed(Exception):
-        pass
-
-    def kill_late(step: int, total: int, values: object) -> None:
-        if step == total:
-            raise Killed
-
     # The last log comes after the last checkpoint but one: everything since then is lost and done again.
     with pytest.raises(Killed):
         train(*toy, TINY, 0, CPU, kill_late, tmp_path)

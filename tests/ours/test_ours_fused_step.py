@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from torch import Tensor, nn
-from twins import check_twins, leaves, normal
+from twins import check_twins, leaves, normal, same_on_any_threads
 
 from rewild4d.ours.adam import Adam
 from rewild4d.ours.canonical import NAMES, Gaussians
@@ -80,17 +80,12 @@ def test_adam_in_double_precision_is_torchs() -> None:
 
 
 def test_adam_is_the_same_bits_for_any_number_of_threads() -> None:
-    before, found = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 4):
-            torch.set_num_threads(threads)
-            _, own = optimizers()
-            move(own, range(3))
-            found.append(values(own))
-    finally:
-        torch.set_num_threads(before)
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+    def make() -> list[Tensor]:
+        _, own = optimizers()
+        move(own, range(3))
+        return values(own)
+
+    same_on_any_threads(make)
 
 
 def test_adam_refuses_a_state_of_another_size() -> None:

@@ -12,6 +12,7 @@ import msgspec
 import pytest
 import torch
 from one_case import OneCase
+from records_for_tests import still
 
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig
 from rewild4d.commands.evaluate import Options as EvaluateOptions
@@ -19,7 +20,7 @@ from rewild4d.commands.evaluate import score_again
 from rewild4d.errors import UserError
 from rewild4d.evaluation.coverage import coverage, visible
 from rewild4d.evaluation.protocol import NovelViews, find_protocol
-from rewild4d.leaderboard.records import FILE, RunRecord, Timing
+from rewild4d.leaderboard.records import FILE
 from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import STANDARD
 from rewild4d.priors.io import save_prior
@@ -53,11 +54,6 @@ def plan(case: Case, tmp_path: Path) -> runner.Plan:
         device=torch.device("cpu"),
         out=tmp_path / "runs",
     )  # fmt: skip
-
-
-def still(record: RunRecord) -> RunRecord:
-    """A record without what may differ between two equal runs."""
-    return msgspec.structs.replace(record, timing=Timing("", 0, 0, 0))
 
 
 def test_a_run_scores_the_exact_prior_well(plan: runner.Plan) -> None:
