@@ -186,8 +186,8 @@ def fvd_f(
 
     Settings are the keywords of `clip_distances`, but for the suffix.
     """
-    sides = ([frame_clips(matrix) for matrix in side] for side in (prediction, truth))
-    return clip_distances(*sides, extractor, suffix="-F", **settings)
+    predicted, true = ([frame_clips(matrix) for matrix in side] for side in (prediction, truth))
+    return clip_distances(predicted, true, extractor, suffix="-F", **settings)
 
 
 def fvd_diag(
@@ -197,8 +197,8 @@ def fvd_diag(
 
     Settings are the keywords of `clip_distances`, but for the suffix.
     """
-    sides = ([diagonal_clips(matrix) for matrix in side] for side in (prediction, truth))
-    return clip_distances(*sides, extractor, suffix="-Diag", **settings)
+    predicted, true = ([diagonal_clips(matrix) for matrix in side] for side in (prediction, truth))
+    return clip_distances(predicted, true, extractor, suffix="-Diag", **settings)
 
 
 def i3d_dist(prediction: Features, truth: Features, *, conditions: Conditions = Conditions()) -> Distance:
