@@ -9,7 +9,7 @@ A reflection is never an alignment.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -104,35 +104,15 @@ def cube_starts() -> dict[str, Tensor]:
     return turns
 
 
-def align(
-    source: Tensor,
-    target: Tensor,
-    *,
-    up: Tensor | None = None,
-    starts: Mapping[str, Tensor] | None = None,
-    trim: float = TRIM,
-    scale_clamp: tuple[float, float] = SCALE_CLAMP,
-    iterations: int = 100,
-    tolerance: float = 1e-6,
-    seed: int = 0,
-) -> Alignment:
+def align(source: Tensor, target: Tensor, **settings: Any) -> Alignment:
     """Lay one cloud on another: `align_sequence` of one moment, with the same keywords.
 
     Args:
         source: finite, [n, 3].
         target: finite, [m, 3].
+        settings: the keywords of `align_sequence`.
     """
-    return align_sequence(
-        [source],
-        [target],
-        up=up,
-        starts=starts,
-        trim=trim,
-        scale_clamp=scale_clamp,
-        iterations=iterations,
-        tolerance=tolerance,
-        seed=seed,
-    )
+    return align_sequence([source], [target], **settings)
 
 
 def align_sequence(

@@ -10,7 +10,7 @@ dominated by bias below a few hundred clips; the kernel distance on the same fea
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -180,37 +180,25 @@ def feature_distances(
 
 
 def fvd_f(
-    prediction: Sequence[ImageMatrix],
-    truth: Sequence[ImageMatrix],
-    extractor: VideoExtractor,
-    *,
-    paired: bool,
-    conditions: Conditions = Conditions(),
-    progress: Progress | None = None,
-    seed: int = 0,
+    prediction: Sequence[ImageMatrix], truth: Sequence[ImageMatrix], extractor: VideoExtractor, **settings: Any
 ) -> list[Distance]:
-    """FVD-F and its companions (`clip_distances`) over every view of every image matrix, one matrix a sequence."""
+    """FVD-F and its companions over every view of every image matrix, one matrix a sequence.
+
+    Settings are the keywords of `clip_distances`, but for the suffix.
+    """
     predicted, true = ([frame_clips(matrix) for matrix in side] for side in (prediction, truth))
-    return clip_distances(
-        predicted, true, extractor, paired=paired, suffix="-F", conditions=conditions, progress=progress, seed=seed
-    )
+    return clip_distances(predicted, true, extractor, suffix="-F", **settings)
 
 
 def fvd_diag(
-    prediction: Sequence[ImageMatrix],
-    truth: Sequence[ImageMatrix],
-    extractor: VideoExtractor,
-    *,
-    paired: bool,
-    conditions: Conditions = Conditions(),
-    progress: Progress | None = None,
-    seed: int = 0,
+    prediction: Sequence[ImageMatrix], truth: Sequence[ImageMatrix], extractor: VideoExtractor, **settings: Any
 ) -> list[Distance]:
-    """FVD-Diag and its companions (`clip_distances`) over every diagonal; the views must be a closed, uniform orbit."""
+    """FVD-Diag and its companions over every diagonal; the views must be a closed, uniform orbit.
+
+    Settings are the keywords of `clip_distances`, but for the suffix.
+    """
     predicted, true = ([diagonal_clips(matrix) for matrix in side] for side in (prediction, truth))
-    return clip_distances(
-        predicted, true, extractor, paired=paired, suffix="-Diag", conditions=conditions, progress=progress, seed=seed
-    )
+    return clip_distances(predicted, true, extractor, suffix="-Diag", **settings)
 
 
 def i3d_dist(prediction: Features, truth: Features, *, conditions: Conditions = Conditions()) -> Distance:

@@ -1,7 +1,9 @@
-"""Guards: the repository root must not shadow other people's packages, and the package must be installed."""
+"""Guards: the repository root must not shadow other people's packages, and the package must be installed. And fixtures
+that tests of several folders use."""
 
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,22 +16,54 @@ try:
 except ImportError:
     pytest.exit("rewild4d is not installed: run `make test`, or `pip install -e . -c constraints.txt`.", returncode=2)
 
-SHARED = Path(os.environ.get("REWILD4D_SHARED", ROOT.parent / "shared"))
-
 
 @pytest.fixture
-def rigs() -> Path:
-    """Folder of real rigged animals, outside the repository; tests that need it skip where it is absent."""
-    folder = SHARED / "data" / "rigs"
+def shared() -> Path:
+    """Folder of data outside the repository, which may be absent."""
+    return Path(os.environ.get("REWILD4D_SHARED", ROOT.parent / "shared"))
+
+
+def real_data(shared: Path, name: str) -> Path:
+    """Folder of real data; tests that need it skip where it is absent."""
+    folder = shared / "data" / name
     if not folder.is_dir():
-        pytest.skip(f"real rigs are not here ({folder}); set REWILD4D_SHARED to the folder that holds data/rigs")
+        pytest.skip(f"real data are not here ({folder}); set REWILD4D_SHARED to the folder that holds data/{name}")
     return folder
 
 
 @pytest.fixture
-def davis() -> Path:
-    """A real DAVIS folder, outside the repository; tests that need it skip where it is absent."""
-    folder = SHARED / "data" / "davis"
-    if not folder.is_dir():
-        pytest.skip(f"DAVIS is not here ({folder}); set REWILD4D_SHARED to the folder that holds data/davis")
-    return folder
+def rigs(shared: Path) -> Path:
+    """Real rigged animals."""
+    return real_data(shared, "rigs")
+
+
+@pytest.fixture
+def davis(shared: Path) -> Path:
+    """A real DAVIS folder."""
+    return real_data(shared, "davis")
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache folder of this test's own."""
+    monkeypatch.setenv("REWILD4D_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """On tiny tensors threads only wait for each other, and on a busy machine for long."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def tiny_footage(one_thread: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Priors of footage are fitted in a few steps."""
+    from films import TINY
+
+    monkeypatch.setattr("rewild4d.priors.choose.FOOTAGE", TINY)

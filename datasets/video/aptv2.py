@@ -10,18 +10,15 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 
-import numpy as np
-
 from rewild4d.contracts import Finding, Selection
 from rewild4d.datasets.masking.makers import Unmasked
 from rewild4d.datasets.masking.masks import open_masks
 from rewild4d.datasets.video.apt_files import UNLISTED, Annotations, Sighting, Subject, image_places, read_annotations
 from rewild4d.datasets.video.frame_files import image_size, read_images, read_masks
-from rewild4d.datasets.video.mask_check import check_videos
 from rewild4d.datasets.video.parts import with_parts
-from rewild4d.datasets.video.wild import LEAST_FRAMES, Moment, Video, files_identity, original_images, split_video
+from rewild4d.datasets.video.reader import VideoDataset
+from rewild4d.datasets.video.wild import LEAST_FRAMES, Moment, Video, files_identity
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.types import Clip, Truth
 
 FPS = 10.0
 """The clips were thinned and nobody says how much: this is assumed."""
@@ -30,10 +27,8 @@ PRIMATES = ("chimpanzee", "gorilla", "howling monkey", "monkey", "noisy night mo
 """Species that a four-legged template does not fit."""
 
 
-class AptV2:
+class AptV2(VideoDataset):
     """APTv2 and APT-36K: short real clips with keypoints.
-
-    Keeps contracts.DatasetReader.
 
     Args:
         root: the folder that holds the annotations.
@@ -44,25 +39,16 @@ class AptV2:
         UserError: no such folder.
     """
 
+    licence = LICENCE
     options = ("masks", "parts")
     keypoint_mapping, keypoint_use = "aptv2", "all"
 
     def __init__(self, root: Path, masks: Path | None = None, parts: str = "auto") -> None:
         self.root, self.parts = root, parts
-        self.masks = Path(masks) if masks else root / "masks"
-        for folder in (root, *([self.masks] if masks else [])):
+        self.masks = Path(masks) if masks and Path(masks) != root / "masks" else None
+        for folder in (root, *([Path(masks)] if masks else [])):
             if not folder.is_dir():
                 raise UserError(f"{folder}: expected a folder, got no such folder.")
-
-    @property
-    def licence(self) -> str:
-        return LICENCE
-
-    @property
-    def settings(self) -> dict[str, str]:
-        """The options that differ from their defaults, for the record."""
-        masks = {} if self.masks == self.root / "masks" else {"masks": str(self.masks.resolve())}
-        return masks | ({"parts": self.parts} if self.parts != "auto" else {})
 
     def cases(self, selection: Selection) -> list[str]:
         """Every animal that is annotated in enough frames of a clip.
@@ -82,28 +68,7 @@ class AptV2:
         chosen = [name for name in names if subjects[name].species not in PRIMATES and self._masked(subjects[name])]
         return chosen or names
 
-    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
-        """Decode one case.
-
-        Raises:
-            UserError: no such case, no masks for it, or files that cannot be used.
-        """
-        return split_video(self.video(case), selection)
-
-    def originals(self, case: str, selection: Selection) -> Iterator[np.ndarray]:
-        """The whole frames that the images of a clip were cut from, uint8 [h, w, 3]; for pictures alone.
-
-        Raises:
-            UserError: as `load`.
-        """
-        return original_images(self.video(case), selection)
-
     def video(self, case: str) -> Video:
-        """The frames, masks and keypoints of a case.
-
-        Raises:
-            UserError: as `load`.
-        """
         subjects = self._annotations.subjects
         if case not in subjects:
             raise unknown_name("case", case, subjects)
@@ -146,7 +111,7 @@ class AptV2:
     def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
         """Verify the annotations and some animals that have masks; contact sheets go to ``sheets``."""
         faults = [Finding("warning", str(self.root), fault) for fault in self._annotations.faults]
-        return faults + check_videos(self, cases, sheets)
+        return faults + super().check(cases, sheets)
 
     def unmasked(self, case: str) -> Unmasked:
         """The frames of a case and the annotated box in each, for programs that make masks.
@@ -190,8 +155,9 @@ class AptV2:
 
     def _mask_places(self, subject: Subject, sighting: Sighting) -> Iterator[Path]:
         clip, stem = sighting.file.parent, sighting.file.stem
-        yield self.masks / subject.name / f"{stem}.png"
-        yield self.masks / clip / f"{stem}_{subject.track}.png"
+        masks = self.masks or self.root / "masks"
+        yield masks / subject.name / f"{stem}.png"
+        yield masks / clip / f"{stem}_{subject.track}.png"
 
     def _masked(self, subject: Subject) -> bool:
         return any(self._mask(subject, sighting) for sighting in subject.sightings)

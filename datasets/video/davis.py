@@ -10,24 +10,22 @@ BADJA's joints are read where they lie beside it.
 """
 
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cached_property, partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from rewild4d.contracts import Finding, Selection
+from rewild4d.contracts import Selection
 from rewild4d.datasets.keypoints.files import read_keypoints
 from rewild4d.datasets.keypoints.keypoints import read_badja
 from rewild4d.datasets.masking.masks import MaskFiles, list_images, match_masks, open_masks
 from rewild4d.datasets.video.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
-from rewild4d.datasets.video.mask_check import check_videos
 from rewild4d.datasets.video.parts import with_parts
-from rewild4d.datasets.video.wild import Moment, Video, files_identity, original_images, split_video
+from rewild4d.datasets.video.reader import VideoDataset
+from rewild4d.datasets.video.wild import Moment, Video, files_identity
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.types import Clip, Keypoints, Truth
+from rewild4d.types import Keypoints
 
 FPS = 24.0
 RESOLUTIONS = ("480p", "1080p", "Full-Resolution")
@@ -44,10 +42,8 @@ def known_sequences() -> dict[str, Facts]:
     return tomllib.loads((resources.files("rewild4d.datasets.video") / "davis.toml").read_text(encoding="utf-8"))
 
 
-class Davis:
+class Davis(VideoDataset):
     """DAVIS 2016 and 2017: real videos with true masks.
-
-    Keeps contracts.DatasetReader.
 
     Args:
         root: the folder that holds JPEGImages (or a folder DAVIS that does).
@@ -60,6 +56,7 @@ class Davis:
         UserError: no such folder, or no frames in it.
     """
 
+    licence = LICENCE
     options = ("masks", "keypoints", "parts")
     keypoint_mapping, keypoint_use = "badja", "none"
 
@@ -75,17 +72,6 @@ class Davis:
             raise UserError(f"{images}: expected frames in one of {', '.join(RESOLUTIONS)}, got none.")
         if self.masks is not None and not self.masks.is_dir():
             raise UserError(f"{self.masks}: expected a folder of masks, got no such folder.")
-
-    @property
-    def licence(self) -> str:
-        return LICENCE
-
-    @property
-    def settings(self) -> dict[str, str]:
-        """The options that differ from their defaults, for the record."""
-        given = {"masks": self.masks, "keypoints": self.keypoints}
-        paths = {name: str(path.resolve()) for name, path in given.items() if path is not None}
-        return paths | ({"parts": self.parts} if self.parts != "auto" else {})
 
     def cases(self, selection: Selection) -> list[str]:
         """Every sequence with masks; where it has several objects, "<sequence>@<id>" for each of them too."""
@@ -105,28 +91,7 @@ class Davis:
         chosen = [case for case in fit if not self._strangers(case)]
         return chosen or list(single)
 
-    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
-        """Decode one case.
-
-        Raises:
-            UserError: no such case, or files of it that cannot be used.
-        """
-        return split_video(self.video(case), selection)
-
-    def originals(self, case: str, selection: Selection) -> Iterator[np.ndarray]:
-        """The whole frames that the images of a clip were cut from, uint8 [h, w, 3]; for pictures alone.
-
-        Raises:
-            UserError: as `load`.
-        """
-        return original_images(self.video(case), selection)
-
     def video(self, case: str) -> Video:
-        """The frames and masks of a case.
-
-        Raises:
-            UserError: as `load`.
-        """
         if case not in self._table:
             raise unknown_name("case", case, self._table)
         sequence, object_id = self._table[case]
@@ -152,10 +117,6 @@ class Davis:
         # what DAVIS itself calls one object is one
         is_named = given is None or (object_id is None and len(given.ids) > 1)
         return with_parts(video, self.parts, is_named)
-
-    def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
-        """Verify some sequences, each file decoded; contact sheets go to ``sheets``."""
-        return check_videos(self, cases, sheets)
 
     @cached_property
     def _table(self) -> dict[str, tuple[str, int | None]]:

@@ -12,18 +12,18 @@ from pathlib import Path
 
 import numpy as np
 
-from rewild4d.contracts import Finding, Selection
+from rewild4d.contracts import Selection
 from rewild4d.datasets.keypoints.files import read_keypoints
 from rewild4d.datasets.masking import masks as mask_files
 from rewild4d.datasets.masking.makers import Unmasked
 from rewild4d.datasets.masking.masks import MaskFiles, fit_size, match_masks, open_masks, read_transparency
 from rewild4d.datasets.video.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
-from rewild4d.datasets.video.mask_check import check_videos
 from rewild4d.datasets.video.parts import with_parts
+from rewild4d.datasets.video.reader import VideoDataset
 from rewild4d.datasets.video.video_file import ASSUMED_FPS, SUFFIXES, read_video, video_facts
-from rewild4d.datasets.video.wild import Masks, Moment, Video, files_identity, original_images, split_video
+from rewild4d.datasets.video.wild import Masks, Moment, Video, files_identity
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.types import Clip, Keypoints, Truth
+from rewild4d.types import Keypoints
 
 FOLDER_FPS = 25.0
 """Of a folder of frames where --fps is left out."""
@@ -51,11 +51,11 @@ class Material:
     notes: tuple[str, ...]
 
 
-class Online:
+class Online(VideoDataset):
     """A person's own video, with masks.
 
-    Keeps contracts.DatasetReader. The case is called like the file or the folder; where masks hold several objects,
-    each is a case of its own too: "clip@2".
+    The case is called like the file or the folder; where masks hold several objects, each is a case of its own too:
+    "clip@2".
 
     Args:
         root: a video file, a folder of frames, or a folder that holds one called frames (and one called masks).
@@ -95,16 +95,6 @@ class Online:
             end = "no end" if self.end is None else f"{self.end:g}"
             raise UserError(f"--start and --end: expected 0 <= start < end, got {self.start or 0:g} and {end}.")
 
-    @property
-    def settings(self) -> dict[str, str]:
-        """The options that differ from their defaults, for the record."""
-        given = {
-            "masks": self.masks and self.masks.resolve(), "start": self.start, "end": self.end, "fps": self.fps,
-            "keypoints": self.keypoints and self.keypoints.resolve(),
-            "parts": None if self.parts == "auto" else self.parts,
-        }  # fmt: skip
-        return {name: str(value) for name, value in given.items() if value is not None}
-
     def cases(self, selection: Selection) -> list[str]:
         """The video's name, and one for each object where its masks hold several."""
         return list(self._table)
@@ -113,28 +103,7 @@ class Online:
         """The whole mask, or each object on its own where there are several."""
         return [case for case, number in self._table.items() if number is not None] or list(self._table)
 
-    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
-        """Decode one case.
-
-        Raises:
-            UserError: no such case, no masks, or files that cannot be used.
-        """
-        return split_video(self.video(case), selection)
-
-    def originals(self, case: str, selection: Selection) -> Iterator[np.ndarray]:
-        """The whole frames that the images of a clip were cut from, uint8 [h, w, 3]; for pictures alone.
-
-        Raises:
-            UserError: as `load`.
-        """
-        return original_images(self.video(case), selection)
-
     def video(self, case: str) -> Video:
-        """The frames and masks of a case.
-
-        Raises:
-            UserError: as `load`.
-        """
         if case not in self._table:
             raise unknown_name("case", case, self._table)
         material, (indices, thinned) = self._material, self._chosen
@@ -179,10 +148,6 @@ class Online:
     def name(self) -> str:
         """Of the video: its file's or folder's name."""
         return self.root.stem if self.root.is_file() else self.root.resolve().name
-
-    def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
-        """Verify the video and its masks; a contact sheet goes to ``sheets``."""
-        return check_videos(self, cases, sheets)
 
     @cached_property
     def _frames_root(self) -> Path:

@@ -20,8 +20,8 @@ from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.race import Race
 from rewild4d.priors.search import facings, mask_rays, single_view, trajectory, up_directions, working_frame
 from rewild4d.priors.silhouettes import overlap
-from rewild4d.priors.template import MIRROR, PARENTS, diagonal, quadruped
-from rewild4d.transforms import camera_in_object, mirror_camera, mirror_transforms, similarity, skin_points
+from rewild4d.priors.template import PARENTS, diagonal, posed_prior, quadruped
+from rewild4d.transforms import camera_in_object, similarity, skin_points
 from rewild4d.types import OBJECT_DIAGONAL, Clip, Frame, Prior
 
 
@@ -126,26 +126,12 @@ def make_prior(animal: Animal, clip: Clip, name: str, provenance: str) -> Prior:
         if frame.camera is None:
             raise UserError(f"{clip.name}: expected a camera for every frame, but {frame.time:g} s has none.")
         cameras.append(camera_in_object(frame.camera, matrix))
-    mirror = torch.tensor(MIRROR)
     posed = skin_points(template.vertices, template.weights, transforms)
     quality = {"mask_iou": overlap(list(posed), template.faces, cameras, [f.mask for f in clip.frames])}
+    times = torch.tensor(clip.times, dtype=torch.float64)
     return seal(
-        Prior(
-            name=name,
-            provenance=provenance,
-            vertices=template.vertices,
-            faces=template.faces,
-            weights=template.weights,
-            bones=template.bones,
-            parents=torch.tensor(PARENTS),
-            mirror=mirror,
-            times=torch.tensor(clip.times, dtype=torch.float64),
-            object_to_world=animal.object_to_world,
-            cameras=tuple(cameras),
-            transforms=transforms,
-            cameras_flip=tuple(mirror_camera(camera) for camera in cameras),
-            transforms_flip=mirror_transforms(transforms, mirror),
+        posed_prior(
+            template, transforms, animal.object_to_world, cameras, times, name=name, provenance=provenance,
             quality=quality | animal.figures,
-            digest="",
         )
-    )
+    )  # fmt: skip

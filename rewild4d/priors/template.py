@@ -20,8 +20,8 @@ from scipy.interpolate import BSpline
 from torch import Tensor
 
 from rewild4d.priors.proportions import Proportions
-from rewild4d.transforms import mirror_points
-from rewild4d.types import OBJECT_DIAGONAL
+from rewild4d.transforms import mirror_camera, mirror_points, mirror_transforms
+from rewild4d.types import OBJECT_DIAGONAL, Camera, Prior
 
 PARENTS = (1, 2, 3, -1, 5, 6, 7, -1, 9, 10, 3, 12, 13, 7, 15, 16, 7, 18, 19, 3)
 MIRROR = (0, 1, 2, 3, 4, 5, 6, 7, 17, 18, 19, 14, 15, 16, 11, 12, 13, 8, 9, 10)
@@ -301,3 +301,27 @@ def quadruped(shape: Proportions | None = None, *, unit: bool = True) -> Templat
 def diagonal(vertices: Tensor) -> Tensor:
     """Length of the bounding-box diagonal, [..., n, 3] -> [...]."""
     return (vertices.amax(-2) - vertices.amin(-2)).norm(dim=-1)
+
+
+def posed_prior(
+    template: Template, transforms: Tensor, object_to_world: Tensor, cameras: Sequence[Camera], times: Tensor, *,
+    name: str, provenance: str, quality: dict[str, float] | None = None, digest: str = "",
+) -> Prior:  # fmt: skip
+    """Make a prior of the template in some poses; its mirrored half is the exact mirror image.
+
+    Args:
+        template: at rest.
+        transforms: rest -> posed, per bone, [T, J, 4, 4].
+        object_to_world: similarities, float64, [T, 4, 4].
+        cameras: in the object frame, T of them.
+        times: in seconds, float64, [T].
+        name, provenance, quality, digest: see `Prior`.
+    """
+    mirror = torch.tensor(MIRROR)
+    return Prior(
+        name=name, provenance=provenance, vertices=template.vertices, faces=template.faces, weights=template.weights,
+        bones=template.bones, parents=torch.tensor(PARENTS), mirror=mirror, times=times,
+        object_to_world=object_to_world, cameras=tuple(cameras), transforms=transforms,
+        cameras_flip=tuple(map(mirror_camera, cameras)), transforms_flip=mirror_transforms(transforms, mirror),
+        quality=quality or {}, digest=digest,
+    )  # fmt: skip

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from rewild4d.rasterizer import backends
 from rewild4d.rasterizer.checks import check_cameras, check_gaussians, check_values
-from rewild4d.rasterizer.conventions import EPS2D, RasterInfo
+from rewild4d.rasterizer.conventions import EPS2D, RasterInput, Rendered
 
 
 def rasterize(
@@ -25,7 +25,7 @@ def rasterize(
     antialias: bool = False,
     near: float = 0.01,
     backend: str = "auto",
-) -> tuple[Tensor, Tensor, RasterInfo]:
+) -> Rendered:
     """Blend 3D Gaussians front to back into images (design note "The one rasterizer"; semantics of gsplat).
 
     Differentiable in every tensor argument. Values and gradients are the same bits for any number of threads.
@@ -73,7 +73,8 @@ def rasterize(
     name = backends.resolve(backend, means.device, means.dtype)
     if name not in backends.CHECK_VALUES:
         check_values(named)
-    return backends.load(name)(
+    given = RasterInput(
         means, quats, scales, opacities, features, world_to_camera, intrinsics,
         int(width), int(height), background, float(eps2d), bool(antialias), float(near),
     )  # fmt: skip
+    return backends.load(name)(given)

@@ -8,10 +8,9 @@ from collections.abc import Callable
 from functools import cache
 
 import torch
-from torch import Tensor
 
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.rasterizer.conventions import RasterInfo
+from rewild4d.rasterizer.conventions import RasterInput, Rendered
 
 logger = logging.getLogger(__name__)
 
@@ -69,7 +68,7 @@ def resolve(backend: str, device: torch.device, dtype: torch.dtype) -> str:
 
 
 @cache
-def load(name: str) -> Callable[..., tuple[Tensor, Tensor, RasterInfo]]:
+def load(name: str) -> Callable[[RasterInput], Rendered]:
     """The `rasterize` of a backend."""
     return importlib.import_module(f"rewild4d.rasterizer.{MODULES[name]}").rasterize
 

@@ -103,24 +103,13 @@ def open_tile(tile_left: int, tile_top: int, width: int, height: int, transmitta
 
 @kernel
 def blend(
-    tickets: np.ndarray,
-    constants: np.ndarray,
-    tiles_x: int,
-    tiles_y: int,
-    starts: np.ndarray,
-    entry_gaussian: np.ndarray,
-    entry_slot: np.ndarray,
-    entry_bits: np.ndarray,
-    pair_bits: np.ndarray,
-    records: np.ndarray,
-    features: np.ndarray,
-    background: np.ndarray,
-    image: np.ndarray,
-    alpha: np.ndarray,
+    tickets: np.ndarray, constants: np.ndarray, tiles_x: int, tiles_y: int, lists: tuple, pair_bits: np.ndarray,
+    records: np.ndarray, features: np.ndarray, background: np.ndarray, image: np.ndarray, alpha: np.ndarray,
     through: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Blend tiles until no ticket is left: fill image [V, C, h, w], alpha [V, 1, h, w] and ``through``, 1 - alpha.
 
+    ``lists`` are starts, entry_gaussian, entry_slot and entry_bits of `start_tiles` and `scatter_pairs`;
     ``records`` and ``features`` are flat. ``entry_bits`` shrinks to the blocks where an entry really contributed or
     closed a pixel; ``pair_bits`` becomes 0 where it did so nowhere, and only there: slots of a Gaussian share a cache
     line, its tiles have different threads.
@@ -130,6 +119,7 @@ def blend(
     """
     views, channels, height, width = image.shape
     count = len(records) // (RECORD * views)
+    starts, entry_gaussian, entry_slot, entry_bits = lists
     left, placed = np.empty(BLOCKS * LANES, np.float32), np.empty(AHEAD * PLACED, np.float32)
     colors = np.empty(BLOCKS * channels * LANES, np.float32)
     while True:
@@ -175,17 +165,9 @@ def _add_channel(weight: Any, features: np.ndarray, feature: int, colors: np.nda
 
 @inlined
 def _blend_entry(
-    bits: int,
-    constants: np.ndarray,
-    log_opacity: Any,
-    features: np.ndarray,
-    feature: int,
-    channels: int,
-    placed: np.ndarray,
-    place: int,
-    left: np.ndarray,
-    colors: np.ndarray,
-) -> tuple:
+    bits: int, constants: np.ndarray, log_opacity: Any, features: np.ndarray, feature: int, channels: int,
+    placed: np.ndarray, place: int, left: np.ndarray, colors: np.ndarray,
+) -> tuple:  # fmt: skip
     """Blend one Gaussian into the blocks of ``bits``; give the blocks that it touched and those that are now closed."""
     zero, least, weakest = splat(np.float32(0)), broadcast(constants, LEAST_LEFT), broadcast(constants, WEAKEST)
     strongest, terms = broadcast(constants, STRONGEST_ALPHA), load_terms(constants, TERMS)
@@ -217,16 +199,9 @@ def _blend_entry(
 
 @inlined
 def _write_tile(
-    view: int,
-    tile_left: int,
-    tile_top: int,
-    left: np.ndarray,
-    colors: np.ndarray,
-    background: np.ndarray,
-    image: np.ndarray,
-    alpha: np.ndarray,
-    through: np.ndarray,
-) -> None:
+    view: int, tile_left: int, tile_top: int, left: np.ndarray, colors: np.ndarray, background: np.ndarray,
+    image: np.ndarray, alpha: np.ndarray, through: np.ndarray,
+) -> None:  # fmt: skip
     _, channels, height, width = image.shape
     pixels, mattes, one = image.reshape(-1), alpha.reshape(-1), splat(np.float32(1))
     for block in range(0, BLOCKS, 4):

@@ -66,24 +66,10 @@ _slot_width = kernel(slot_width)
 
 @kernel
 def blend_backward(
-    tickets: np.ndarray,
-    tiles_x: int,
-    tiles_y: int,
-    starts: np.ndarray,
-    entry_gaussian: np.ndarray,
-    entry_slot: np.ndarray,
-    entry_bits: np.ndarray,
-    records: np.ndarray,
-    features: np.ndarray,
-    background: np.ndarray,
-    image: np.ndarray,
-    alpha: np.ndarray,
-    g_image: np.ndarray,
-    g_alpha: np.ndarray,
-    geometry: bool,
-    crowd: int,
-    sums: np.ndarray,
-) -> None:
+    tickets: np.ndarray, tiles_x: int, tiles_y: int, lists: tuple, records: np.ndarray, features: np.ndarray,
+    background: np.ndarray, image: np.ndarray, alpha: np.ndarray, g_image: np.ndarray, g_alpha: np.ndarray,
+    geometry: bool, crowd: int, sums: np.ndarray,
+) -> None:  # fmt: skip
     """Fill the slots' rows of ``sums`` (`slot_width` numbers each) for tiles until no ticket is left.
 
     Without ``geometry`` only the channels' sums are made; the moments are zero. Tiles of more than ``crowd`` Gaussians
@@ -91,6 +77,7 @@ def blend_backward(
     """
     views, channels, height, width = image.shape
     count = len(records) // (RECORD * views)
+    starts, entry_gaussian, entry_slot, entry_bits = lists
     left, behind = np.empty(BLOCKS * LANES, np.float32), np.empty(BLOCKS * LANES, np.float32)
     placed = np.empty(AHEAD * PLACED, np.float32)
     gradients = np.zeros(BLOCKS * max(channels, FEW) * LANES, np.float32)
@@ -131,16 +118,9 @@ def blend_backward(
 
 @inlined
 def _read_tile(
-    view: int,
-    tile_left: int,
-    tile_top: int,
-    image: np.ndarray,
-    alpha: np.ndarray,
-    g_image: np.ndarray,
-    g_alpha: np.ndarray,
-    behind: np.ndarray,
-    gradients: np.ndarray,
-) -> None:
+    view: int, tile_left: int, tile_top: int, image: np.ndarray, alpha: np.ndarray, g_image: np.ndarray,
+    g_alpha: np.ndarray, behind: np.ndarray, gradients: np.ndarray,
+) -> None:  # fmt: skip
     """Load dL/dimage per block, and the loss's linear share of everything blended: sum of g.out minus T dL/dalpha."""
     _, channels, height, width = image.shape
     pixels, mattes, g_pixels, g_mattes = image.reshape(-1), alpha.reshape(-1), g_image.reshape(-1), g_alpha.reshape(-1)
@@ -168,21 +148,10 @@ def _read_tile(
 
 @inlined
 def _entry_backward(
-    bits: int,
-    log_opacity: Any,
-    features: np.ndarray,
-    feature: int,
-    channels: int,
-    geometry: bool,
-    placed: np.ndarray,
-    place: int,
-    left: np.ndarray,
-    behind: np.ndarray,
-    gradients: np.ndarray,
-    rows: np.ndarray,
-    sums: np.ndarray,
+    bits: int, log_opacity: Any, features: np.ndarray, feature: int, channels: int, geometry: bool, placed: np.ndarray,
+    place: int, left: np.ndarray, behind: np.ndarray, gradients: np.ndarray, rows: np.ndarray, sums: np.ndarray,
     row: int,
-) -> None:
+) -> None:  # fmt: skip
     """Sum one Gaussian's six moments and channel gradients over the blocks of ``bits`` into sums[row:]."""
     # Its constants are literals: the sums leave no registers for them.
     zero, one, least = splat(np.float32(0)), splat(np.float32(1)), splat(_LEAST_LEFT)
@@ -243,18 +212,9 @@ def _entry_backward(
 
 @kernel
 def gather_slots(
-    view: int,
-    begin: int,
-    end: int,
-    slots: np.ndarray,
-    pair_bits: np.ndarray,
-    records: np.ndarray,
-    sums: np.ndarray,
-    width: int,
-    v_means2d: np.ndarray,
-    v_records: np.ndarray,
-    v_features: np.ndarray,
-) -> None:
+    view: int, begin: int, end: int, slots: np.ndarray, pair_bits: np.ndarray, records: np.ndarray, sums: np.ndarray,
+    width: int, v_means2d: np.ndarray, v_records: np.ndarray, v_features: np.ndarray,
+) -> None:  # fmt: skip
     """Add the slots of Gaussians begin..end into the zeroed gradients of means2d, records and features."""
     channels = v_features.shape[1]
     total = np.empty(width, np.float32)

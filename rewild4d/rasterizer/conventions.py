@@ -1,6 +1,10 @@
-"""The constants of the blend, shared by every backend (gsplat's values), and the result type. See CONVENTIONS.md."""
+"""The constants of the blend, shared by every backend (gsplat's values), and what a backend takes and returns.
+
+See CONVENTIONS.md.
+"""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -35,3 +39,33 @@ class RasterInfo:
 
     radii: Tensor
     means2d: Tensor
+
+
+Rendered = tuple[Tensor, Tensor, RasterInfo]
+"""Features [V, C, height, width], alpha [V, 1, height, width], and what densification needs."""
+
+Options = tuple[int, int, float, bool, float]
+"""Width, height, eps2d, antialias, near."""
+
+
+class RasterInput(NamedTuple):
+    """Checked arguments of `rewild4d.rasterizer.rasterize`, as every backend takes them; ``background`` is [V, C]."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    features: Tensor
+    world_to_camera: Tensor
+    intrinsics: Tensor
+    width: int
+    height: int
+    background: Tensor | None
+    eps2d: float
+    antialias: bool
+    near: float
+
+    @property
+    def options(self) -> Options:
+        """What is no tensor."""
+        return self.width, self.height, self.eps2d, self.antialias, self.near

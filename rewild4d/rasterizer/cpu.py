@@ -20,7 +20,7 @@ from rewild4d.kernels.threads import run, spans, thread_count
 from rewild4d.rasterizer.binning import BLOCK_LEFT, BLOCK_TOP
 from rewild4d.rasterizer.blending import CONSTANTS
 from rewild4d.rasterizer.blending_backward import slot_width
-from rewild4d.rasterizer.conventions import RasterInfo
+from rewild4d.rasterizer.conventions import Options, RasterInfo, RasterInput, Rendered
 from rewild4d.rasterizer.crowds import CROWD, NOWHERE
 from rewild4d.rasterizer.projection import RECORD, TILE
 from rewild4d.rasterizer.projection_backward import CAMERA, CHUNK
@@ -35,25 +35,11 @@ MOST_PARTS = 4
 """A view's Gaussians are marked in at most so many parts: one thread adds up the square of that many counts a tile."""
 
 
-def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    world_to_camera: Tensor,
-    intrinsics: Tensor,
-    width: int,
-    height: int,
-    background: Tensor | None,
-    eps2d: float,
-    antialias: bool,
-    near: float,
-) -> tuple[Tensor, Tensor, RasterInfo]:
-    """Same as `rewild4d.rasterizer.rasterize`, on checked float32 CPU input; ``background`` is [V, C]."""
-    options = (width, height, eps2d, antialias, near)
+def rasterize(given: RasterInput) -> Rendered:
+    """Render like `rewild4d.rasterizer.rasterize`, on float32 CPU input."""
+    means, quats, scales, opacities, features, world_to_camera, intrinsics, width, height, background, *_ = given
     means2d, records, radii, *binning = _Project.apply(
-        means, quats, scales, opacities, world_to_camera, intrinsics, options
+        means, quats, scales, opacities, world_to_camera, intrinsics, given.options
     )
     if means2d.requires_grad:
         means2d.retain_grad()
@@ -99,7 +85,7 @@ class _Project(torch.autograd.Function):
         opacities: Tensor,
         world_to_camera: Tensor,
         intrinsics: Tensor,
-        options: tuple[int, int, float, bool, float],
+        options: Options,
     ) -> tuple[Tensor, ...]:
         views, count = world_to_camera.shape[0], means.shape[0]
         room = max(count, WIDTH)
@@ -113,7 +99,7 @@ class _Project(torch.autograd.Function):
         threads = thread_count() if count * views > SERIAL_BELOW else 1
         bounds = _table(spans(room, min(threads, room // WIDTH)), 2)  # `project` takes eight at a time
         call = (
-            phase_counters(2), bounds, *gaussians, *cameras, *options, means2d.numpy().ravel(), records.numpy().ravel(),
+            phase_counters(2), bounds, gaussians, cameras, options, means2d.numpy().ravel(), records.numpy().ravel(),
             radii.numpy(), depths.numpy(), tiles.numpy().ravel(), slots.numpy(), order.numpy(), counts,
             np.empty((len(bounds), views), np.int64), np.empty((views, 2, room), np.int64),
         )  # fmt: skip
@@ -144,8 +130,7 @@ class _Project(torch.autograd.Function):
         v_cameras = np.zeros((len(bounds), views * CAMERA * WIDTH))
         with_cameras = any(ctx.needs_input_grad[4:6])
         call = (
-            np.zeros(1, np.int64), bounds, arrays, *cameras, *ctx.options[:4], with_cameras, *shared, outputs,
-            v_cameras,
+            np.zeros(1, np.int64), bounds, arrays, cameras, ctx.options, with_cameras, *shared, outputs, v_cameras,
         )  # fmt: skip
         run(project_back, [call] * min(thread_count(), len(bounds)))
         v_world_to_camera = v_intrinsics = None
@@ -164,10 +149,8 @@ class _Lists:
     tiles: tuple[int, int]
     slots: np.ndarray
     pair_bits: np.ndarray
-    starts: np.ndarray
-    entry_gaussian: np.ndarray
-    entry_slot: np.ndarray
-    entry_bits: np.ndarray
+    entries: tuple[np.ndarray, ...]
+    """starts, entry_gaussian, entry_slot and entry_bits."""
 
 
 class _Blend(torch.autograd.Function):
@@ -196,17 +179,17 @@ class _Blend(torch.autograd.Function):
         parts = min(threads, MOST_PARTS)
         pairs = int(numbers[-1, -1])
         lists = _Lists(
-            (tiles_x, tiles_y), numbers, np.empty(pairs, np.uint16), np.empty(views * tiles_x * tiles_y + 1, np.int64),
-            np.empty(pairs, np.int32), np.empty(pairs, np.int32), np.empty(pairs, np.uint16),
+            (tiles_x, tiles_y), numbers, np.empty(pairs, np.uint16),
+            (np.empty(views * tiles_x * tiles_y + 1, np.int64), np.empty(pairs, np.int32), np.empty(pairs, np.int32),
+             np.empty(pairs, np.uint16)),
         )  # fmt: skip
         image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
         through = np.empty(alpha.numel() if ctx.needs_input_grad[3] else 0, np.float32)
         call = (
             phase_counters(3), np.zeros(1, np.int64), counts.numpy(), depths.numpy(), order.numpy(), tiles.numpy(),
             numbers, tiles_x, tiles_y, BLOCK_LEFT, BLOCK_TOP, np.empty(pairs, np.int32), lists.pair_bits,
-            np.zeros((parts, parts, views * tiles_x * tiles_y), np.int32), lists.starts, lists.entry_gaussian,
-            lists.entry_slot, lists.entry_bits, CONSTANTS, records.numpy(), array(features).ravel(),
-            array(background), image.numpy(), alpha.numpy(), through,
+            np.zeros((parts, parts, views * tiles_x * tiles_y), np.int32), lists.entries, CONSTANTS, records.numpy(),
+            array(features).ravel(), array(background), image.numpy(), alpha.numpy(), through,
         )  # fmt: skip
         run(bin_and_blend, [call] * threads)
         ctx.save_for_backward(records, features, background, image, alpha)
@@ -226,10 +209,9 @@ class _Blend(torch.autograd.Function):
         threads = _blend_threads(lists)
         call = (
             phase_counters(2), np.zeros(1, np.int64), _table(spans(records.shape[1], threads), 2),
-            *lists.tiles, lists.starts, lists.entry_gaussian, lists.entry_slot, lists.entry_bits, lists.pair_bits,
-            records.numpy(), array(features).ravel(), array(background), image.numpy(), alpha.numpy(), array(g_image),
-            array(g_alpha), any(ctx.needs_input_grad[:2]), ctx.crowd, sums, lists.slots, width,
-            v_means2d.numpy(), v_records.numpy(), v_features.numpy(),
+            *lists.tiles, lists.entries, lists.pair_bits, records.numpy(), array(features).ravel(), array(background),
+            image.numpy(), alpha.numpy(), array(g_image), array(g_alpha), any(ctx.needs_input_grad[:2]), ctx.crowd,
+            sums, lists.slots, width, v_means2d.numpy(), v_records.numpy(), v_features.numpy(),
         )  # fmt: skip
         run(blend_back, [call] * threads)
         v_background = None

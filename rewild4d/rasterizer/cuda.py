@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from rewild4d.rasterizer import triton_blend, triton_project, triton_tiles
 from rewild4d.rasterizer.checks import check_values
-from rewild4d.rasterizer.conventions import RasterInfo
+from rewild4d.rasterizer.conventions import Options, RasterInfo, RasterInput, Rendered
 
 TILE, MOMENTS = triton_blend.SIDE.value, triton_blend.MOMENTS.value
 BLOCK, RECORD, CAMERA = triton_project.BLOCK.value, triton_project.RECORD.value, triton_project.CAMERA.value
@@ -30,30 +30,14 @@ LAUNCHES: dict[str, dict[str, Any]] = {
 MOST_CHANNELS = 16
 """What one program blends; for more of them the tile is walked again."""
 
-Options = tuple[int, int, float, bool, float]
-"""Width, height, eps2d, antialias, near."""
 
-
-def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    world_to_camera: Tensor,
-    intrinsics: Tensor,
-    width: int,
-    height: int,
-    background: Tensor | None,
-    eps2d: float,
-    antialias: bool,
-    near: float,
-) -> tuple[Tensor, Tensor, RasterInfo]:
-    """Same as `rewild4d.rasterizer.rasterize`, on checked float32 input on one GPU; ``background`` is [V, C].
+def rasterize(given: RasterInput) -> Rendered:
+    """Render like `rewild4d.rasterizer.rasterize`, on float32 input on one GPU.
 
     Raises:
         ValueError: a value is not finite or too large; more tiles than sorting keys have room for.
     """
+    means, quats, scales, opacities, features, world_to_camera, intrinsics, width, height, background, *_ = given
     views, across, down = len(world_to_camera), -(-width // TILE), -(-height // TILE)
     if views * across * down >= MOST_TILES:
         raise ValueError(f"expected fewer than {MOST_TILES} tiles of {TILE} x {TILE} pixels in all views together.")
@@ -68,8 +52,7 @@ def rasterize(
     *inputs, features, background = (tensor.contiguous() for tensor in named.values())
     shades = (features.detach(), background.detach())
     with torch.cuda.device_of(means):
-        options = (width, height, eps2d, antialias, near)
-        means2d, rests, records, radii, keys, wides, tiles = _Project.apply(*inputs, shades, options)
+        means2d, rests, records, radii, keys, wides, tiles = _Project.apply(*inputs, shades, given.options)
         if means2d.requires_grad:
             means2d.retain_grad()
         lists = _list_tiles(keys, wides, tiles, views, across, down)

@@ -162,33 +162,19 @@ def _number_slots(view: int, begin: int, end: int, count: int, tiles: np.ndarray
 
 @kernel
 def project(
-    begin: int,
-    end: int,
-    means: np.ndarray,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    opacities: np.ndarray,
-    world_to_camera: np.ndarray,
-    intrinsics: np.ndarray,
-    width: int,
-    height: int,
-    eps2d: float,
-    antialias: bool,
-    near: float,
-    means2d: np.ndarray,
-    records: np.ndarray,
-    radii: np.ndarray,
-    depths: np.ndarray,
-    tiles: np.ndarray,
-    slots: np.ndarray,
-    totals: np.ndarray,
-) -> None:
+    begin: int, end: int, gaussians: tuple, cameras: tuple, options: tuple, means2d: np.ndarray, records: np.ndarray,
+    radii: np.ndarray, depths: np.ndarray, tiles: np.ndarray, slots: np.ndarray, totals: np.ndarray,
+) -> None:  # fmt: skip
     """Fill means2d [V, N, 2], records [V, N, 8], radii, depths [V, N] and tiles [V, N, 4] for Gaussians begin..end.
 
-    At least eight of them. A row of tiles holds the first and one past the last column and row of a Gaussian's bounding
-    rectangle; slots [V, N + 1] numbers the tiles of these rectangles from 0 in each view, and totals [V] says how many
-    there are. All arrays but the cameras' are flat.
+    At least eight of them. ``gaussians`` are means, quats, scales and opacities, ``cameras`` world_to_camera and
+    intrinsics, ``options`` width, height, eps2d, antialias and near. A row of tiles holds the first and one past the
+    last column and row of a Gaussian's bounding rectangle; slots [V, N + 1] numbers the tiles of these rectangles from
+    0 in each view, and totals [V] says how many there are. All arrays but the cameras' are flat.
     """
+    means, quats, scales, opacities = gaussians
+    world_to_camera, intrinsics = cameras
+    width, height, eps2d, antialias, near = options
     views, zero = world_to_camera.shape[0], spread(0.0)
     count = len(opacities)
     for start in range(begin, end, WIDTH):

@@ -117,33 +117,18 @@ def _add_camera(
 
 @kernel
 def project_backward(
-    begin: int,
-    end: int,
-    means: np.ndarray,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    opacities: np.ndarray,
-    world_to_camera: np.ndarray,
-    intrinsics: np.ndarray,
-    width: int,
-    height: int,
-    eps2d: float,
-    antialias: bool,
-    with_cameras: bool,
-    radii: np.ndarray,
-    g_means2d: np.ndarray,
-    g_records: np.ndarray,
-    v_means: np.ndarray,
-    v_quats: np.ndarray,
-    v_scales: np.ndarray,
-    v_opacities: np.ndarray,
-    v_cameras: np.ndarray,
-) -> None:
-    """Fill the v_ arrays for Gaussians begin..end, at least eight; add to this chunk's own zeroed v_cameras.
+    begin: int, end: int, gaussians: tuple, cameras: tuple, options: tuple, with_cameras: bool, radii: np.ndarray,
+    g_means2d: np.ndarray, g_records: np.ndarray, v_gaussians: tuple, v_cameras: np.ndarray,
+) -> None:  # fmt: skip
+    """Fill v_gaussians for Gaussians begin..end, at least eight; add to this chunk's own zeroed v_cameras.
 
     v_cameras is [V, 16, 8], double precision, to be summed over the last axis; left alone unless with_cameras. All
-    arrays but the cameras are flat.
+    arrays but the cameras are flat; the first arguments are those of `project`.
     """
+    means, quats, scales, opacities = gaussians
+    world_to_camera, intrinsics = cameras
+    width, height, eps2d, antialias, _ = options
+    v_means, v_quats, v_scales, v_opacities = v_gaussians
     zero, count = spread(0.0), len(opacities)
     for start in range(begin, end, WIDTH):
         n = min(start, end - WIDTH)  # the last eight overlap those before

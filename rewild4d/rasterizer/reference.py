@@ -7,32 +7,19 @@ import torch
 from torch import Tensor
 
 from rewild4d.rasterizer import ewa
-from rewild4d.rasterizer.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, RasterInfo
+from rewild4d.rasterizer.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, RasterInfo, RasterInput, Rendered
 from rewild4d.transforms import quat_to_matrix
 
 
-def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    world_to_camera: Tensor,
-    intrinsics: Tensor,
-    width: int,
-    height: int,
-    background: Tensor | None,
-    eps2d: float,
-    antialias: bool,
-    near: float,
-) -> tuple[Tensor, Tensor, RasterInfo]:
-    """Same as `rewild4d.rasterizer.rasterize`, on checked input; ``background`` is [V, C]."""
+def rasterize(given: RasterInput) -> Rendered:
+    """Render like `rewild4d.rasterizer.rasterize`."""
+    means, quats, scales, opacities, features, world_to_camera, intrinsics, width, height, background, *_ = given
     still = quats.new_tensor((1.0, 0.0, 0.0, 0.0))
     quats = torch.where((quats == 0).all(-1, keepdim=True), still, quats)  # no length: no rotation, as in the kernels
     half = quat_to_matrix(quats) * scales[:, None, :]
     covariances = half @ half.mT
     projected = [
-        ewa.project(means, covariances, matrix, pinhole, width, height, eps2d)
+        ewa.project(means, covariances, matrix, pinhole, width, height, given.eps2d)
         for matrix, pinhole in zip(world_to_camera, intrinsics, strict=True)
     ]
     means2d = torch.stack([one[0] for one in projected])
@@ -40,8 +27,8 @@ def rasterize(
         means2d.retain_grad()
     images, alphas, radii = [], [], []
     for view, (_, cov2d, depths, compensation) in enumerate(projected):
-        visible_opacities = opacities * compensation if antialias else opacities
-        radii.append(ewa.reach(means2d[view], cov2d, depths, visible_opacities, width, height, near))
+        visible_opacities = opacities * compensation if given.antialias else opacities
+        radii.append(ewa.reach(means2d[view], cov2d, depths, visible_opacities, width, height, given.near))
         image, alpha = _blend(means2d[view], cov2d, depths, visible_opacities, features, radii[view] > 0, width, height)
         if background is not None:
             image = image + (1 - alpha) * background[view][:, None, None]

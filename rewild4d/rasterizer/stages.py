@@ -26,10 +26,9 @@ def _join_numbers(slots: np.ndarray, bounds: np.ndarray, totals: np.ndarray) -> 
 
 @kernel
 def project_and_sort(
-    counters: np.ndarray, bounds: np.ndarray, means: np.ndarray, quats: np.ndarray, scales: np.ndarray,
-    opacities: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndarray, width: int, height: int, eps2d: float,
-    antialias: bool, near: float, means2d: np.ndarray, records: np.ndarray, radii: np.ndarray, depths: np.ndarray,
-    tiles: np.ndarray, slots: np.ndarray, order: np.ndarray, counts: np.ndarray, totals: np.ndarray, keys: np.ndarray,
+    counters: np.ndarray, bounds: np.ndarray, gaussians: tuple, cameras: tuple, options: tuple, means2d: np.ndarray,
+    records: np.ndarray, radii: np.ndarray, depths: np.ndarray, tiles: np.ndarray, slots: np.ndarray,
+    order: np.ndarray, counts: np.ndarray, totals: np.ndarray, keys: np.ndarray,
 ) -> None:  # fmt: skip
     """Project Gaussians (`project`), number their tiles, and sort those that are seen.
 
@@ -50,9 +49,8 @@ def project_and_sort(
         if piece >= len(bounds):
             break
         project(
-            bounds[piece, 0], bounds[piece, 1], means, quats, scales, opacities, world_to_camera, intrinsics, width,
-            height, eps2d, antialias, near, means2d, records, radii.reshape(-1), depths.reshape(-1), tiles,
-            slots.reshape(-1), totals[piece],
+            bounds[piece, 0], bounds[piece, 1], gaussians, cameras, options, means2d, records, radii.reshape(-1),
+            depths.reshape(-1), tiles, slots.reshape(-1), totals[piece],
         )  # fmt: skip
     end_phase(counters, 0)
     while True:
@@ -69,8 +67,7 @@ def project_and_sort(
 def bin_and_blend(
     counters: np.ndarray, tickets: np.ndarray, counts: np.ndarray, depths: np.ndarray, order: np.ndarray,
     tiles: np.ndarray, slots: np.ndarray, tiles_x: int, tiles_y: int, block_left: np.ndarray, block_top: np.ndarray,
-    pair_tile: np.ndarray, pair_bits: np.ndarray, histograms: np.ndarray, starts: np.ndarray,
-    entry_gaussian: np.ndarray, entry_slot: np.ndarray, entry_bits: np.ndarray, constants: np.ndarray,
+    pair_tile: np.ndarray, pair_bits: np.ndarray, histograms: np.ndarray, lists: tuple, constants: np.ndarray,
     records: np.ndarray, features: np.ndarray, background: np.ndarray, image: np.ndarray, alpha: np.ndarray,
     through: np.ndarray,
 ) -> None:  # fmt: skip
@@ -84,6 +81,7 @@ def bin_and_blend(
         records: [V, N, 8]; all other arguments as in `mark_pairs`, `scatter_pairs` and `blend`.
     """
     parts, units, count = len(histograms), len(histograms) * len(counts), records.shape[1]
+    starts, entry_gaussian, entry_slot, entry_bits = lists
     enter_phase(counters, 0)
     while True:
         unit = phase_ticket(counters, 0)
@@ -113,15 +111,14 @@ def bin_and_blend(
         )  # fmt: skip
     end_phase(counters, 2)
     blend(
-        tickets, constants, tiles_x, tiles_y, starts, entry_gaussian, entry_slot, entry_bits, pair_bits,
-        records.reshape(-1), features, background, image, alpha, through,
+        tickets, constants, tiles_x, tiles_y, lists, pair_bits, records.reshape(-1), features, background, image,
+        alpha, through,
     )  # fmt: skip
 
 
 @kernel
 def blend_back(
-    counters: np.ndarray, tickets: np.ndarray, bounds: np.ndarray, tiles_x: int, tiles_y: int,
-    starts: np.ndarray, entry_gaussian: np.ndarray, entry_slot: np.ndarray, entry_bits: np.ndarray,
+    counters: np.ndarray, tickets: np.ndarray, bounds: np.ndarray, tiles_x: int, tiles_y: int, lists: tuple,
     pair_bits: np.ndarray, records: np.ndarray, features: np.ndarray, background: np.ndarray, image: np.ndarray,
     alpha: np.ndarray, g_image: np.ndarray, g_alpha: np.ndarray, geometry: bool, crowd: int, sums: np.ndarray,
     slots: np.ndarray, width: int, v_means2d: np.ndarray, v_records: np.ndarray, v_features: np.ndarray,
@@ -138,8 +135,8 @@ def blend_back(
     """
     enter_phase(counters, 0)
     blend_backward(
-        tickets, tiles_x, tiles_y, starts, entry_gaussian, entry_slot, entry_bits, records.reshape(-1),
-        features, background, image, alpha, g_image, g_alpha, geometry, crowd, sums,
+        tickets, tiles_x, tiles_y, lists, records.reshape(-1), features, background, image, alpha, g_image, g_alpha,
+        geometry, crowd, sums,
     )  # fmt: skip
     end_phase(counters, 0)
     while True:
@@ -155,26 +152,20 @@ def blend_back(
 
 @kernel
 def project_back(
-    tickets: np.ndarray, bounds: np.ndarray, gaussians: tuple, world_to_camera: np.ndarray, intrinsics: np.ndarray,
-    width: int, height: int, eps2d: float, antialias: bool, with_cameras: bool, radii: np.ndarray,
-    g_means2d: np.ndarray, g_records: np.ndarray, made: tuple, v_cameras: np.ndarray,
+    tickets: np.ndarray, bounds: np.ndarray, gaussians: tuple, cameras: tuple, options: tuple, with_cameras: bool,
+    radii: np.ndarray, g_means2d: np.ndarray, g_records: np.ndarray, v_gaussians: tuple, v_cameras: np.ndarray,
 ) -> None:  # fmt: skip
     """The gradient of `project_and_sort`.
 
     Args:
         bounds: first and one past the last Gaussian of each piece, [P, 2].
-        gaussians: means, quats, scales and opacities, flat.
-        made: their gradients, set, flat.
         v_cameras: zero, [P, V 16 8]; all other arguments as in `project_backward`.
     """
-    means, quats, scales, opacities = gaussians
-    v_means, v_quats, v_scales, v_opacities = made
     while True:
         piece = take_ticket(tickets)
         if piece >= len(bounds):
             return
         project_backward(
-            bounds[piece, 0], bounds[piece, 1], means, quats, scales, opacities, world_to_camera, intrinsics, width,
-            height, eps2d, antialias, with_cameras, radii, g_means2d, g_records, v_means, v_quats, v_scales,
-            v_opacities, v_cameras[piece],
+            bounds[piece, 0], bounds[piece, 1], gaussians, cameras, options, with_cameras, radii, g_means2d, g_records,
+            v_gaussians, v_cameras[piece],
         )  # fmt: skip

@@ -38,16 +38,9 @@ def _pixels(tile: tl.tensor, width: tl.tensor, height: tl.tensor, across: tl.ten
 
 @triton.jit
 def _alphas(
-    entries: tl.tensor,
-    first: tl.tensor,
-    end: tl.tensor,
-    centres: tl.tensor,
-    rests: tl.tensor,
-    records: tl.tensor,
-    x: tl.tensor,
-    y: tl.tensor,
-    GROUP: tl.constexpr,
-) -> tuple:
+    entries: tl.tensor, first: tl.tensor, end: tl.tensor, centres: tl.tensor, rests: tl.tensor, records: tl.tensor,
+    x: tl.tensor, y: tl.tensor, GROUP: tl.constexpr,
+) -> tuple:  # fmt: skip
     """The group's Gaussians and which are any, [G]; t, u, log2 of the uncapped alpha, and alpha, [G, P]."""
     place = first + tl.arange(0, GROUP)
     real = place < end
@@ -75,24 +68,11 @@ def _weights(alpha: tl.tensor, left: tl.tensor) -> tuple:
 
 @triton.jit(do_not_specialize=SIZES)
 def blend(
-    starts: tl.tensor,
-    entries: tl.tensor,
-    centres: tl.tensor,
-    rests: tl.tensor,
-    records: tl.tensor,
-    features: tl.tensor,
-    background: tl.tensor,
-    image: tl.tensor,
-    alpha_image: tl.tensor,
-    width: tl.tensor,
-    height: tl.tensor,
-    across: tl.tensor,
-    down: tl.tensor,
-    count: tl.tensor,
-    CHANNELS: tl.constexpr,
-    PART: tl.constexpr,
+    starts: tl.tensor, entries: tl.tensor, centres: tl.tensor, rests: tl.tensor, records: tl.tensor,
+    features: tl.tensor, background: tl.tensor, image: tl.tensor, alpha_image: tl.tensor, width: tl.tensor,
+    height: tl.tensor, across: tl.tensor, down: tl.tensor, count: tl.tensor, CHANNELS: tl.constexpr, PART: tl.constexpr,
     GROUP: tl.constexpr,
-) -> None:
+) -> None:  # fmt: skip
     """Fill image [V, C, h, w] and alpha [V, 1, h, w]; program (tile, part of the channels)."""
     tile = tl.program_id(0)
     view, x, y, inside = _pixels(tile, width, height, across, down)
@@ -122,26 +102,11 @@ def blend(
 
 @triton.jit(do_not_specialize=SIZES)
 def blend_backward(
-    starts: tl.tensor,
-    entries: tl.tensor,
-    slots: tl.tensor,
-    centres: tl.tensor,
-    rests: tl.tensor,
-    records: tl.tensor,
-    features: tl.tensor,
-    image: tl.tensor,
-    alpha_image: tl.tensor,
-    g_image: tl.tensor,
-    g_alpha: tl.tensor,
-    sums: tl.tensor,
-    width: tl.tensor,
-    height: tl.tensor,
-    across: tl.tensor,
-    down: tl.tensor,
-    count: tl.tensor,
-    CHANNELS: tl.constexpr,
-    GROUP: tl.constexpr,
-) -> None:
+    starts: tl.tensor, entries: tl.tensor, slots: tl.tensor, centres: tl.tensor, rests: tl.tensor, records: tl.tensor,
+    features: tl.tensor, image: tl.tensor, alpha_image: tl.tensor, g_image: tl.tensor, g_alpha: tl.tensor,
+    sums: tl.tensor, width: tl.tensor, height: tl.tensor, across: tl.tensor, down: tl.tensor, count: tl.tensor,
+    CHANNELS: tl.constexpr, GROUP: tl.constexpr,
+) -> None:  # fmt: skip
     """Fill the slots' rows of the sums [E, 6 + C]; program (tile).
 
     Walks front to back as the blend does: what lies behind a Gaussian is the pixel's total minus the prefix.

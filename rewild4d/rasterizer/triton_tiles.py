@@ -22,17 +22,9 @@ SIZES = ["total", "rows", "steps", "across", "views", "count", "number"]
 
 @triton.jit(do_not_specialize=SIZES)
 def list_entries(
-    ends: tl.tensor,
-    tiles: tl.tensor,
-    wides: tl.tensor,
-    first_keys: tl.tensor,
-    keys: tl.tensor,
-    owners: tl.tensor,
-    total: tl.tensor,
-    rows: tl.tensor,
-    steps: tl.tensor,
-    across: tl.tensor,
-) -> None:
+    ends: tl.tensor, tiles: tl.tensor, wides: tl.tensor, first_keys: tl.tensor, keys: tl.tensor, owners: tl.tensor,
+    total: tl.tensor, rows: tl.tensor, steps: tl.tensor, across: tl.tensor,
+) -> None:  # fmt: skip
     """Fill keys and owners [E] with each row's rectangle of tiles, row after row; program (block).
 
     A row is a view and a Gaussian, view * N + Gaussian. ``ends`` [rows] is the running sum of ``tiles``; each entry
@@ -76,18 +68,9 @@ def start_tiles(
 
 @triton.jit(do_not_specialize=SIZES)
 def gather(
-    ends: tl.tensor,
-    tiles: tl.tensor,
-    sums: tl.tensor,
-    records: tl.tensor,
-    v_means2d: tl.tensor,
-    v_records: tl.tensor,
-    v_features: tl.tensor,
-    views: tl.tensor,
-    count: tl.tensor,
-    CHANNELS: tl.constexpr,
-    PART: tl.constexpr,
-) -> None:
+    ends: tl.tensor, tiles: tl.tensor, sums: tl.tensor, records: tl.tensor, v_means2d: tl.tensor, v_records: tl.tensor,
+    v_features: tl.tensor, views: tl.tensor, count: tl.tensor, CHANNELS: tl.constexpr, PART: tl.constexpr,
+) -> None:  # fmt: skip
     """Add a Gaussian's rows of the sums [E, 6 + C]; program (block, part of the channels).
 
     Fills v_means2d [V, N, 2] and v_records [V, N, 4] (see triton_project.py) and v_features [N, C], over all views.

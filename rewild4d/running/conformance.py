@@ -19,19 +19,12 @@ from rewild4d.errors import UserError
 from rewild4d.files import digest
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.motion import pose_at, pose_gaussians, quats_from_normals, sample_surface
-from rewild4d.priors.template import MIRROR, PARENTS, quadruped
+from rewild4d.priors.template import PARENTS, posed_prior, quadruped
 from rewild4d.progress import Progress
 from rewild4d.registry import load_method
 from rewild4d.running.runner import save_reconstruction
-from rewild4d.transforms import (
-    camera_in_object,
-    look_at,
-    mirror_camera,
-    mirror_transforms,
-    similarity,
-    transform_splats,
-)
-from rewild4d.types import Camera, Case, Clip, Frame, Prior, Splats, Truth
+from rewild4d.transforms import camera_in_object, look_at, similarity, transform_splats
+from rewild4d.types import Camera, Case, Clip, Frame, Splats, Truth
 
 
 def check_method(name: str, preset: str) -> list[Finding]:
@@ -111,7 +104,7 @@ def _difference(one: Reconstruction, other: Reconstruction, case: Case, what: st
 
 def tiny_case(frames: int = 4, width: int = 96, height: int = 64, views: int = 6) -> Case:
     """A walking template seen from a ring of cameras in a turned, scaled world: the truth is known exactly."""
-    template, mirror = quadruped(), torch.tensor(MIRROR)
+    template = quadruped()
     times = torch.arange(frames, dtype=torch.float64) / 10
     angles = torch.zeros(frames, len(PARENTS), 3)
     for leg, phase in zip((10, 13, 16, 19), (0.0, 0.5, 0.0, 0.5), strict=True):
@@ -120,13 +113,10 @@ def tiny_case(frames: int = 4, width: int = 96, height: int = 64, views: int = 6
     turn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3)))[0]
     world = similarity(0.3, turn * torch.linalg.det(turn), torch.tensor((0.4, -0.2, 0.7), dtype=torch.float64))
     ring = [_ring_camera(world, 2 * math.pi * view / views, width, height) for view in range(views)]
-    cameras = tuple(camera_in_object(ring[i % views], world) for i in range(frames))
-    prior = Prior(
-        name="exact", provenance="the template that the images were drawn from", vertices=template.vertices,
-        faces=template.faces, weights=template.weights, bones=template.bones, parents=torch.tensor(PARENTS),
-        mirror=mirror, times=times, object_to_world=world.expand(frames, 4, 4).clone(), cameras=cameras,
-        transforms=transforms, cameras_flip=tuple(map(mirror_camera, cameras)),
-        transforms_flip=mirror_transforms(transforms, mirror), quality={}, digest=digest(transforms, world),
+    cameras = [camera_in_object(ring[i % views], world) for i in range(frames)]
+    prior = posed_prior(
+        template, transforms, world.expand(frames, 4, 4).clone(), cameras, times, name="exact",
+        provenance="the template that the images were drawn from", digest=digest(transforms, world),
     )  # fmt: skip
     sample = sample_surface(prior, 4000, torch.Generator().manual_seed(0))
     colors = 0.5 + 0.4 * torch.sin(3 * sample.points)

@@ -1,7 +1,6 @@
 """The Gaussian competitors: the contract of all four at tiny size, resuming after a kill, and what they share."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 import torch
+from dying import Killed, kill_late
 
 from rewild4d.baselines.d3dgs import D3dgs, D3dgsConfig, D3dgsStar, D3dgsStarConfig, random_gaussians
 from rewild4d.baselines.d3dgs_network import DeformationNetwork, NetworkShape, octave_code
@@ -27,6 +27,8 @@ from rewild4d.running.conformance import check_method, tiny_case
 from rewild4d.transforms import camera_in_object
 from rewild4d.types import Case
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 CPU = torch.device("cpu")
 SHORT: dict[str, Any] = {
     "image_size": 64,
@@ -44,15 +46,6 @@ TINY = {
     "gart": msgspec.convert(SHORT | GRID, GartConfig),
     "gart-star": msgspec.convert(SHORT | GRID | {"refine": {"steps": 3}}, GartStarConfig),
 }
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Tiny tensors on a busy machine: threads only wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -77,13 +70,6 @@ def test_the_contract_is_kept(name: str, monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.parametrize("name", TINY)
 def test_a_killed_fit_resumes_to_the_same_bits(name: str, case: Case, tmp_path: Path) -> None:
-    class Killed(Exception):
-        pass
-
-    def kill_late(step: int, total: int, values: object) -> None:
-        if step == total:
-            raise Killed
-
     whole = fitted(name, case)
     with pytest.raises(Killed):
         fitted(name, case, log=kill_late, workdir=tmp_path)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from external_program import UPPER, bodies, coarse_grid, fit, psnr, settings
+from external_program import UPPER, bodies, fit, psnr, settings
 from torch import Tensor
 
 from rewild4d.baselines import external_alignment
@@ -13,19 +13,10 @@ from rewild4d.baselines.external_folder import crop_box
 from rewild4d.cameras.rendering import render
 from rewild4d.errors import UserError
 from rewild4d.priors.motion import pose_at
-from rewild4d.running.conformance import tiny_case
 from rewild4d.transforms import similarity, skin_points
 from rewild4d.types import Case
 
-
-@pytest.fixture(scope="module")
-def case() -> Case:
-    return tiny_case(frames=3)
-
-
-@pytest.fixture(autouse=True)
-def fewer_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    coarse_grid(monkeypatch)
+pytestmark = pytest.mark.usefixtures("coarse_grid")
 
 
 @pytest.mark.parametrize("what", ["plain", "ascii", "order", "sh1", "sh2", "sh3"])

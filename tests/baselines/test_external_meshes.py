@@ -10,9 +10,9 @@ import numpy as np
 import pygltflib
 import pytest
 import torch
-from external_program import coarse_grid, fit, posed
+from external_program import fit, posed
 from external_stub import png
-from test_rig import Builder
+from rig_files import Builder
 
 from rewild4d.baselines.external import ExternalConfig
 from rewild4d.baselines.external_folder import find_outputs
@@ -20,18 +20,9 @@ from rewild4d.baselines.external_gltf import read_animation
 from rewild4d.baselines.external_profiles import PROFILES
 from rewild4d.errors import UserError
 from rewild4d.io.meshes import Mesh, discs, read_mesh
-from rewild4d.running.conformance import tiny_case
 from rewild4d.types import Case
 
-
-@pytest.fixture(scope="module")
-def case() -> Case:
-    return tiny_case(frames=3)
-
-
-@pytest.fixture(autouse=True)
-def fewer_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    coarse_grid(monkeypatch)
+pytestmark = pytest.mark.usefixtures("coarse_grid")
 
 
 def glb(path: Path, morph: bool, moving: bool, clips: int = 1) -> None:

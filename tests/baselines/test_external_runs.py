@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import torch
 from artemis_animals import write_animal
-from external_program import CPU, UPPER, OneCase, bodies, coarse_grid, fit, settings
+from external_program import CPU, UPPER, bodies, fit, settings
+from one_case import OneCase
 
 from rewild4d import cli
 from rewild4d.baselines.external import External, ExternalConfig
@@ -26,15 +27,7 @@ from rewild4d.running import runner
 from rewild4d.running.conformance import tiny_case
 from rewild4d.types import Case
 
-
-@pytest.fixture(scope="module")
-def case() -> Case:
-    return tiny_case(frames=3)
-
-
-@pytest.fixture(autouse=True)
-def fewer_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    coarse_grid(monkeypatch)
+pytestmark = pytest.mark.usefixtures("coarse_grid")
 
 
 FAILURES = {

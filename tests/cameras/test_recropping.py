@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_prior_files import a_prior
+from prior_files import a_prior
 
 from rewild4d.cameras.recropping import crop_between, recropped, seen_by
 from rewild4d.ours.motion import camera_between, frame_position

@@ -7,9 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 import torch
-from test_prior_runs import panned, plan, tiny  # noqa: F401
-from test_wild import cache  # noqa: F401
-from test_wild_evaluation import PROTOCOL
+from films import PROTOCOL, panned, plan
 
 from rewild4d.baselines.gart_config import GartConfig, GartStarConfig
 from rewild4d.baselines.gart_reconstruction import SEEN, GartStarReconstruction
@@ -25,6 +23,8 @@ from rewild4d.running import runner
 from rewild4d.running.conformance import tiny_case
 from rewild4d.transforms import transform_splats
 from rewild4d.types import Case, Frame, Splats, Truth
+
+pytestmark = pytest.mark.usefixtures("cache", "tiny_footage")
 
 CPU = torch.device("cpu")
 TINY: dict[str, Any] = {

@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -10,8 +9,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 import torch
-from extractors import LinearNetwork, LinearVideoNetwork, SquaredError
-from pictures import clips, flat, noise, refused, with_alpha, write
+from pictures import GREY, Call, clips, flat, noise, refused, with_alpha, write
 
 from rewild4d import cli
 from rewild4d.commands import score as command
@@ -19,29 +17,6 @@ from rewild4d.evaluation.networks import FAMILIES, Networks, load_networks
 from rewild4d.metrics.image import PSNR_CAP
 
 FETCH = "weights missing, run: rewild4d-bench weights fetch"
-Call = Callable[..., dict]  # type: ignore[type-arg]
-
-
-@pytest.fixture
-def networks(monkeypatch: pytest.MonkeyPatch) -> Networks:
-    """Small networks in place of the real ones, which need their weights."""
-    made = Networks({"lpips_alex": SquaredError(), "lpips_vgg": SquaredError()}, LinearNetwork(), LinearVideoNetwork())
-    monkeypatch.setattr(command, "load_networks", lambda families, device: made)
-    return made
-
-
-@pytest.fixture
-def score(networks: Networks, capsys: pytest.CaptureFixture[str]) -> Call:
-    """Call `score --json` and give what it prints."""
-
-    def call(*words: object) -> dict:  # type: ignore[type-arg]
-        with pytest.raises(SystemExit) as stop:
-            cli.main(["score", *map(str, words), "--json"])
-        out, err = capsys.readouterr()
-        assert stop.value.code == 0, err
-        return json.loads(out)
-
-    return call
 
 
 def test_a_known_error(score: Call, tmp_path: Path) -> None:
@@ -65,7 +40,6 @@ def test_a_known_error(score: Call, tmp_path: Path) -> None:
     assert found["machine"]["torch"] == torch.__version__
 
 
-GREY = noise(0)[..., :1]
 PALETTE = np.where(noise(1)[..., :1] < 128, 40, 200).astype(np.uint8)
 
 

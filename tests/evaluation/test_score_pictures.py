@@ -1,24 +1,20 @@
 """Pictures and films as cameras and programs write them, read by `score` as a viewer shows them."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import moving
 import numpy as np
 import pytest
-from pictures import flat, noise, write
+from pictures import GREY, Call, flat, noise, write
 from PIL import Image, ImageOps
-from test_score import GREY, networks, score  # noqa: F401
 
 from rewild4d.datasets.images import ORIENTATION
 from rewild4d.metrics.image import PSNR_CAP
 
-Call = Callable[..., dict]  # type: ignore[type-arg]
-
 
 @pytest.mark.parametrize("turn", range(1, 9))
-def test_pictures_are_upright(score: Call, tmp_path: Path, turn: int) -> None:  # noqa: F811
+def test_pictures_are_upright(score: Call, tmp_path: Path, turn: int) -> None:
     """A photograph that was stored turned, with a tag that says how, is the picture that a viewer shows."""
     soft = cv2.resize(noise(5, (5, 6)), (48, 40), interpolation=cv2.INTER_CUBIC)
     tags = Image.Exif()
@@ -31,7 +27,7 @@ def test_pictures_are_upright(score: Call, tmp_path: Path, turn: int) -> None:  
     assert found["scores"]["psnr"]["value"] > 40
 
 
-def test_one_grey_that_means_transparent(score: Call, tmp_path: Path) -> None:  # noqa: F811
+def test_one_grey_that_means_transparent(score: Call, tmp_path: Path) -> None:
     """Such a file and one with an alpha channel show the same picture on any background."""
     grey = np.where(GREY[..., 0] < 128, 7, 200).astype(np.uint8)
     (tmp_path / "p").mkdir()
@@ -42,7 +38,7 @@ def test_one_grey_that_means_transparent(score: Call, tmp_path: Path) -> None:  
     assert found["scores"]["psnr"]["value"] == PSNR_CAP
 
 
-def test_fill_bytes_before_a_marker_are_legal(score: Call, tmp_path: Path) -> None:  # noqa: F811
+def test_fill_bytes_before_a_marker_are_legal(score: Call, tmp_path: Path) -> None:
     """ITU T.81, B.1.1.2."""
     write(tmp_path / "t" / "a.jpg", flat(120, 90, 60))
     whole = (tmp_path / "t" / "a.jpg").read_bytes()
@@ -52,7 +48,7 @@ def test_fill_bytes_before_a_marker_are_legal(score: Call, tmp_path: Path) -> No
     assert found["scores"]["psnr"]["value"] == PSNR_CAP
 
 
-def test_a_video_of_changing_rate_has_each_frame_once(score: Call, tmp_path: Path) -> None:  # noqa: F811
+def test_a_video_of_changing_rate_has_each_frame_once(score: Call, tmp_path: Path) -> None:
     for i in range(8):
         write(tmp_path / "t" / "v" / f"{i:05d}.png", flat(20 + 25 * i, 20 + 25 * i, 20 + 25 * i, size=(32, 32)))
     (tmp_path / "p").mkdir()

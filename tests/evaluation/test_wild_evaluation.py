@@ -7,23 +7,20 @@ from pathlib import Path
 import moving
 import pytest
 import torch
-from test_wild import SELECTION, cache  # noqa: F401
+from films import PROTOCOL, SELECTION, Plate
 
 from rewild4d.baselines.empty import EmptyReconstruction
 from rewild4d.datasets.video.online import Online
 from rewild4d.errors import UserError
 from rewild4d.evaluation import novel_views
 from rewild4d.evaluation.measuring import evaluate
-from rewild4d.evaluation.protocol import NovelViews, Protocol, find_protocol
+from rewild4d.evaluation.protocol import NovelViews, find_protocol
 from rewild4d.types import Camera, Clip, Splats, Truth
 from rewild4d.visualize.run_pictures import save_pictures
 
+pytestmark = pytest.mark.usefixtures("cache")
+
 CPU = torch.device("cpu")
-SCORES = ("psnr", "psnr_fg", "iou")
-PROTOCOL = Protocol(
-    name="test-v1", dataset="online", title="", description="", background=1.0, scores=SCORES, floors=(),
-    selection=SELECTION,
-)  # fmt: skip
 
 
 @pytest.fixture
@@ -31,28 +28,6 @@ def case(tmp_path: Path) -> tuple[Clip, Truth]:
     moving.frames(tmp_path / "clip" / "frames", 24, step=0.5)
     moving.masks(tmp_path / "clip" / "masks", 24, step=0.5)
     return Online(tmp_path / "clip", fps=10).load("clip", SELECTION)
-
-
-class Plate:
-    """The pixels of one frame as Gaussians on a plane that faces a camera, at twice the size of the image asked for."""
-
-    def __init__(self, clip: Clip, knows: bool = True) -> None:
-        self.frame, self.knows = clip.frames[0], knows
-        self.asked: list[float] = []
-
-    def at(self, time: float) -> Splats:
-        rows, columns = torch.nonzero(self.frame.mask[0] > 0.5, as_tuple=True)
-        middle = torch.stack(((columns + 0.5) / 32 - 1, (rows + 0.5) / 32 - 1, torch.full(rows.shape, 2.0)), dim=1)
-        count = len(rows)
-        return Splats(middle, torch.tensor((1.0, 0, 0, 0)).expand(count, 4), torch.full((count, 3), 0.012),
-                      torch.full((count,), 0.95), self.frame.rgb[:, rows, columns].T[:, None].contiguous())  # fmt: skip
-
-    def camera(self, time: float) -> Camera | None:
-        self.asked.append(time)
-        intrinsics = torch.tensor(((128.0, 0, 64), (0, 128, 64), (0, 0, 1)), dtype=torch.float64)
-        return Camera(torch.eye(4, dtype=torch.float64), intrinsics, 128, 128) if self.knows else None
-
-    def save(self, folder: Path) -> None: ...
 
 
 def test_held_out_frames_are_seen_with_the_reconstructions_camera(case: tuple[Clip, Truth]) -> None:

@@ -6,28 +6,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
 from torch import Tensor
 
-from rewild4d.baselines import external_alignment
 from rewild4d.baselines.external import External, ExternalConfig, ExternalReconstruction
 from rewild4d.cameras.rendering import render
-from rewild4d.contracts import Selection
 from rewild4d.io.meshes import Mesh, discs
 from rewild4d.priors.motion import pose_at
 from rewild4d.transforms import skin_points
-from rewild4d.types import Case, Clip, Truth
+from rewild4d.types import Case
 
 CPU = torch.device("cpu")
 UPPER = "upper bound: rotated, scaled and shifted to the best input-view PSNR"
 STUB = Path(__file__).parent / "external_stub.py"
-
-
-def coarse_grid(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A coarser grid: enough for a case this small."""
-    for name, value in (("AZIMUTHS", 12), ("ELEVATIONS", (20.0,)), ("SCALES", (1.0,)), ("REFINED", 2)):
-        monkeypatch.setattr(external_alignment, name, value)
 
 
 def posed(case: Case, index: int) -> Tensor:
@@ -78,21 +69,3 @@ def psnr(found: ExternalReconstruction, case: Case, held_out: bool = False) -> f
         color, alpha = render(found.at(frame.time), frame.camera)
         values.append(-10 * math.log10(float((color + 1 - alpha - frame.over(1.0)).square().mean())))
     return sum(values) / len(values)
-
-
-class OneCase:
-    """A reader of the tiny case."""
-
-    licence = "CC0 1.0"
-
-    def __init__(self, case: Case) -> None:
-        self.case = case
-
-    def cases(self, selection: Selection) -> list[str]:
-        return [self.case.clip.name]
-
-    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
-        return self.case.clip, self.case.truth
-
-    def check(self) -> list[Any]:
-        return []

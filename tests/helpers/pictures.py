@@ -1,20 +1,22 @@
 """Small images and clips on disk, and a command that refuses them."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from calling import call
 
-from rewild4d import cli
+Call = Callable[..., dict]  # type: ignore[type-arg]
+"""`score` with these words, and what it prints."""
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     """The one sentence that a refused command leaves on standard error (behind its progress)."""
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["score", *map(str, words)])
+    code = call("score", *words)
     out, err = capsys.readouterr()
-    assert (stop.value.code, out) == (2, "")
+    assert (code, out) == (2, "")
     assert "Traceback" not in err
     said = err[err.index("rewild4d-bench: ") :].strip()
     assert len(said.splitlines()) == 1
@@ -28,6 +30,9 @@ def flat(*color: int, size: tuple[int, int] = (40, 48), dtype: type = np.uint8) 
 
 def noise(seed: int, size: tuple[int, int] = (40, 48)) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)
+
+
+GREY = noise(0)[..., :1]
 
 
 def write(path: Path, image: np.ndarray) -> Path:

@@ -20,6 +20,20 @@ def leaves(dtype: torch.dtype, **values: Tensor) -> dict[str, Tensor]:
     return {name: value.to(dtype).detach().clone().requires_grad_() for name, value in values.items()}
 
 
+def same_on_any_threads(make: Callable[[], list[Tensor]], counts: tuple[int, ...] = (1, 2, 4)) -> list[Tensor]:
+    """The same bits for each number of threads; gives them."""
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in counts:
+            torch.set_num_threads(threads)
+            found.append(make())
+    finally:
+        torch.set_num_threads(before)
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+    return found[0]
+
+
 def check_twins(make: Make, tolerance: float = 2e-5) -> None:
     """The same function in double (plain torch) and single precision (fused): relative errors of values and gradients.
 

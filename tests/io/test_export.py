@@ -184,10 +184,8 @@ def test_what_cannot_be_written_says_why(case: Case, prior_only: PriorOnlyRecons
 
 
 def test_the_command(
-    tmp_path: Path, case: Case, prior_only: PriorOnlyReconstruction, capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    monkeypatch.setenv("REWILD4D_CACHE", str(tmp_path / "cache"))
+    tmp_path: Path, case: Case, prior_only: PriorOnlyReconstruction, capsys: pytest.CaptureFixture[str], cache: Path
+) -> None:
     moving.frames(tmp_path / "clip" / "frames")
     moving.masks(tmp_path / "clip" / "masks")
     settings = {"settings": json.dumps({"fps": "10.0", "end": "0.85"})}

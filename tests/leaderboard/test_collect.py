@@ -9,9 +9,9 @@ import imageio.v2 as imageio
 import msgspec
 import numpy as np
 import pytest
+from calling import call
 from records_for_tests import PROTOCOL, psnr, record
 
-from rewild4d import cli
 from rewild4d.errors import UserError
 from rewild4d.leaderboard import collect as module
 from rewild4d.leaderboard.collect import MARKER, collect, per_moment, rounded, title_of
@@ -27,12 +27,6 @@ ITEMS = [f"view {view} at {time:.4f} s" for time in (0.0, 0.5) for view in (1, 2
 
 def kept_records(folder: Path) -> list[RunRecord]:
     return [record for _, record in find_records(folder / "kept")]
-
-
-def call(*words: str) -> int:
-    with pytest.raises(SystemExit) as stop:
-        cli.main(list(words))
-    return int(stop.value.code or 0)
 
 
 def keep(folder: Path, seed: int, drawn: bool = True, **changes: Any) -> RunRecord:

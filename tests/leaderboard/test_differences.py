@@ -7,9 +7,9 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from calling import output, refusal
 from records_for_tests import record
 
-from rewild4d import cli
 from rewild4d.evaluation.protocol import load_protocols
 from rewild4d.leaderboard.records import write_record
 from rewild4d.leaderboard.specs import load_specs
@@ -61,20 +61,13 @@ def runs(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def call(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    with pytest.raises(SystemExit) as stop:
-        cli.main(list(words))
-    assert stop.value.code == 0
-    return capsys.readouterr().out
-
-
 def difference(text: str) -> str:
     """The second of the two tables."""
     return text[text.index("difference to Ours") :]
 
 
 def test_every_sign_is_the_row_less_the_reference(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = difference(call(capsys, "table", "sweep-random", "--runs", str(runs), "--against", "ours"))
+    text = difference(output(capsys, "table", "sweep-random", "--runs", str(runs), "--against", "ours"))
     line = next(line for line in text.splitlines() if line.startswith("| D-3DGS* |"))
     # Rigs differ by whole dB, methods by the same on each of them: every interval is a point.
     assert [cell.strip() for cell in line.split("|")[2:-1]] == [
@@ -87,9 +80,9 @@ def test_every_sign_is_the_row_less_the_reference(runs: Path, capsys: pytest.Cap
 
 def test_a_lead_is_marked_in_every_format(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("table", "sweep-random", "--runs", str(runs), "--against", "ours", "--format")
-    assert difference(call(capsys, *words, "latex")).count(r"\textbf{") == 1
-    assert difference(call(capsys, *words, "html")).count("<b>−0.010 [−0.010, −0.010]</b>") == 1
-    lines = call(capsys, *words, "csv").split("\n\n")[1]
+    assert difference(output(capsys, *words, "latex")).count(r"\textbf{") == 1
+    assert difference(output(capsys, *words, "html")).count("<b>−0.010 [−0.010, −0.010]</b>") == 1
+    lines = output(capsys, *words, "csv").split("\n\n")[1]
     rows = list(csv.DictReader(io.StringIO(lines)))
     found = {
         (row["condition"], row["score"]): (float(row["value"]), row["rank"])
@@ -102,7 +95,7 @@ def test_a_lead_is_marked_in_every_format(runs: Path, capsys: pytest.CaptureFixt
 
 
 def test_an_advantage_is_told_apart_and_marks_nothing(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = difference(call(capsys, "table", "sweep-random", "--runs", str(runs), "--against", "ours"))
+    text = difference(output(capsys, "table", "sweep-random", "--runs", str(runs), "--against", "ours"))
     rows = [line.split("|")[1].strip() for line in text.splitlines() if line.startswith("| ")][2:]
     assert rows == ["D-3DGS", "D-3DGS*", "GART (20 bones)", "GART* (20 bones) [2]"]
     line = next(line for line in text.splitlines() if line.startswith("| GART*"))
@@ -112,7 +105,7 @@ def test_an_advantage_is_told_apart_and_marks_nothing(runs: Path, capsys: pytest
 
 def test_one_condition_alone(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("table", "artemis", "--protocol", "artemis-random-256", "--runs", str(runs), "--against", "ours")
-    text = difference(call(capsys, *words))
+    text = difference(output(capsys, *words))
     line = next(line for line in text.splitlines() if line.startswith("| D-3DGS* |"))
     cells = [cell.strip() for cell in line.split("|")[2:-1]]
     titles = load_specs()["artemis"].scores
@@ -134,7 +127,7 @@ def test_an_interval_that_holds_0_is_no_lead(tmp_path: Path, capsys: pytest.Capt
     value = made.scores["psnr"].value or 0.0
     lowered = msgspec.structs.replace(made, scores={"psnr": Score(value - 4.0, "dB", "higher", 1)})
     write_record(lowered, worse)
-    shown = difference(call(capsys, "table", "sweep-random", "--runs", str(tmp_path), "--against", "ours"))
+    shown = difference(output(capsys, "table", "sweep-random", "--runs", str(tmp_path), "--against", "ours"))
     line = next(line for line in shown.splitlines() if line.startswith("| D-3DGS* |"))
     first = line.split("|")[2].strip()
     # Of draws of four rigs 31.6 % are without the bad one and 5.1 % have it three times or more, 0.4 % four times.
@@ -143,18 +136,12 @@ def test_an_interval_that_holds_0_is_no_lead(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_a_preset_or_a_case_that_is_not_there_is_said(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def refused(*words: str) -> str:
-        with pytest.raises(SystemExit) as stop:
-            cli.main(list(words))
-        assert stop.value.code == 2
-        return capsys.readouterr().err
-
     bogus = "unknown preset 'bogus'. Available: beyond, paper, quick, standard."
-    assert bogus in refused("table", "sweep-random", "--runs", str(runs), "--preset", "bogus")
+    assert bogus in refusal(capsys, "table", "sweep-random", "--runs", str(runs), "--preset", "bogus")
     page = str(runs / "page")
-    assert bogus in refused("leaderboard", "build", "--runs", str(runs), "--out", page, "--preset", "bogus")
+    assert bogus in refusal(capsys, "leaderboard", "build", "--runs", str(runs), "--out", page, "--preset", "bogus")
     cases = f"unknown case 'horse/Wal'. Did you mean 'horse/Walk'? Available: {', '.join(sorted(RIGS))}."
     for name in ((), ("sweep-random",)):
-        assert cases in refused("table", *name, "--runs", str(runs), "--case", "horse/Wal")
-    shown = call(capsys, "table", "--runs", str(runs), "--case", "*o*/*a*")
+        assert cases in refusal(capsys, "table", *name, "--runs", str(runs), "--case", "horse/Wal")
+    shown = output(capsys, "table", "--runs", str(runs), "--case", "*o*/*a*")
     assert "| horse/Walk |" in shown and "| fox/Run |" not in shown and "| wolf/Gallop |" in shown

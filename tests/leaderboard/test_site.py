@@ -8,9 +8,9 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from calling import call
 from records_for_tests import PROTOCOL, psnr, record
 
-from rewild4d import cli
 from rewild4d.errors import UserError
 from rewild4d.leaderboard.curves import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, curve, moments
 from rewild4d.leaderboard.records import RunRecord, find_records, write_record
@@ -126,17 +126,12 @@ def test_a_run_id_is_no_path(runs: Path, tmp_path: Path, name: str) -> None:
 
 
 def test_the_command(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def call(*words: str) -> int:
-        with pytest.raises(SystemExit) as stop:
-            cli.main(["leaderboard", *words])
-        return int(stop.value.code or 0)
-
-    assert call("build", "--runs", str(runs), "--out", str(tmp_path / "page")) == 0
+    assert call("leaderboard", "build", "--runs", str(runs), "--out", str(tmp_path / "page")) == 0
     assert capsys.readouterr().out.strip() == str(tmp_path / "page" / "index.html")
-    assert call("biuld") == 2
+    assert call("leaderboard", "biuld") == 2
     assert "unknown leaderboard command 'biuld'. Did you mean 'build'?" in capsys.readouterr().err
     (tmp_path / "none").mkdir()
-    assert call("build", "--runs", str(tmp_path / "none"), "--out", str(tmp_path / "p2")) == 2
+    assert call("leaderboard", "build", "--runs", str(tmp_path / "none"), "--out", str(tmp_path / "p2")) == 2
     assert "expected run records, found none" in capsys.readouterr().err
     assert not (tmp_path / "p2").exists()
 

@@ -3,19 +3,13 @@
 from pathlib import Path
 
 import pytest
+from calling import output
 from records_for_tests import PROTOCOL, record
 
 from rewild4d import cli
 from rewild4d.errors import UserError
 from rewild4d.leaderboard.records import write_record
 from rewild4d.running import planning
-
-
-def call(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    with pytest.raises(SystemExit) as stop:
-        cli.main(list(words))
-    assert stop.value.code == 0
-    return capsys.readouterr().out
 
 
 def test_a_protocol_is_known_by_its_name_its_family_or_its_records() -> None:
@@ -36,10 +30,10 @@ def test_everything_of_one_protocol(tmp_path: Path, capsys: pytest.CaptureFixtur
         write_record(made, tmp_path / str(index))
     words = ("table", "--runs", str(tmp_path), "--protocol")
     for index, name in enumerate(("artemis-sweep-256", "artemis-sweep-256-v1", "somebodys-v1")):
-        shown = call(capsys, *words, name)
+        shown = output(capsys, *words, name)
         assert [number for number in range(3) if f"**T{number}**" in shown] == [index]
     (tmp_path / "empty").mkdir()
-    nothing = call(capsys, "table", "--runs", str(tmp_path / "empty"), "--protocol", "davis-512")
+    nothing = output(capsys, "table", "--runs", str(tmp_path / "empty"), "--protocol", "davis-512")
     assert nothing == "no records\n", "known, but nothing is in this folder"
     there = f"artemis-sweep-256-v1, {newest}, somebodys-v1"
     for name, told in (

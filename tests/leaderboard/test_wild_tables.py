@@ -9,9 +9,9 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from calling import call
 from records_for_tests import record
 
-from rewild4d import cli
 from rewild4d.commands import run_table
 from rewild4d.commands.choice import cases_of, chosen
 from rewild4d.datasets.video.davis import known_sequences
@@ -23,13 +23,10 @@ from rewild4d.priors.config import FOOTAGE, QUICK, STANDARD, PriorConfig
 from rewild4d.running import planning
 from rewild4d.running.planning import Choice
 
+pytestmark = pytest.mark.usefixtures("cache")
+
 NAMES = ("input-view", "novel-view")
 COMMITTED = Path(__file__).resolve().parents[2] / "results" / "2026-11-23-davis-standard"
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("REWILD4D_CACHE", str(tmp_path / "cache"))
 
 
 def davis(root: Path, *sequences: str) -> Path:
@@ -44,12 +41,6 @@ def davis(root: Path, *sequences: str) -> Path:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 cv2.imwrite(str(path), picture)
     return root
-
-
-def call(*words: str) -> int:
-    with pytest.raises(SystemExit) as stop:
-        cli.main(list(words))
-    return int(stop.value.code or 0)
 
 
 def run_of(protocol: str, case: str, prior: PriorConfig, preset: str = "standard", **changes: Any) -> RunRecord:

@@ -2,30 +2,18 @@
 
 import io
 import json
-import os
 import pickle
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from conftest import SHARED
+from tiny_weights import Calls
 
 from rewild4d.errors import UserError
 from rewild4d.metrics import carriers, weights
 
 KERNEL = np.ones((2, 3, 4, 5), np.float32)
-
-
-class Calls:
-    """Unpickled by a careless reader, it makes a file."""
-
-    def __init__(self, marker: Path) -> None:
-        self.marker = marker
-
-    def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
-        return os.system, (f"touch {self.marker}",)
 
 
 @pytest.mark.parametrize("tree", [{"a": 1}, [KERNEL], {"a": KERNEL.astype(object)}, "text"])
@@ -113,8 +101,8 @@ def test_the_real_table_is_whole() -> None:
         assert file.form in carriers.READERS and file.layout in carriers.LAYOUTS
 
 
-def test_the_pinned_hashes_are_the_published_ones() -> None:
-    path = SHARED / "design" / "weights_known_hashes.json"
+def test_the_pinned_hashes_are_the_published_ones(shared: Path) -> None:
+    path = shared / "design" / "weights_known_hashes.json"
     if not path.is_file():
         pytest.skip(f"the table of published hashes is not here ({path})")
     published = {name.rpartition("/")[2]: entry for name, entry in json.loads(path.read_text()).items()}

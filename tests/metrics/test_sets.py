@@ -29,15 +29,11 @@ from rewild4d.metrics.video import video_features
 from rewild4d.running.conformance import tiny_case
 from rewild4d.types import Case
 
+pytestmark = pytest.mark.usefixtures("cache")
+
 SCORES = ("kid_v", "fvd_f", "kvd_f")
 SETS = {**PROTOCOL, "scores": ["psnr", *SCORES], "floors": ["empty"]}
 WHITE = Conditions("grey 1", "full frame", 24.0)
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("REWILD4D_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
 
 
 def features(rows: int, seed: int, network: str = "linear", frames: int | None = None, width: int = 6) -> Features:

@@ -2,14 +2,12 @@
 
 import errno
 import hashlib
-import os
 import pickle
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import safetensors.torch
-from tiny_weights import TENSORS, TREE, Tiny, assert_loaded, make_tiny, pin, quiet, status
+from tiny_weights import TENSORS, TREE, Calls, Tiny, assert_loaded, make_tiny, pin, quiet, status
 
 from rewild4d.errors import UserError
 from rewild4d.metrics.weight_files import import_weights
@@ -96,16 +94,6 @@ def test_a_truncated_file_is_refused(tiny: Tiny) -> None:
     tiny.path.write_bytes(tiny.kept[:-5])
     with pytest.raises(UserError, match=f"with {len(tiny.kept)} bytes .* got {len(tiny.kept) - 5} bytes"):
         load_weights("tiny")
-
-
-class Calls:
-    """Unpickled by a careless reader, it makes a file."""
-
-    def __init__(self, marker: Path) -> None:
-        self.marker = marker
-
-    def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
-        return os.system, (f"touch {self.marker}",)
 
 
 def test_a_pickle_that_calls_a_function_is_refused(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:

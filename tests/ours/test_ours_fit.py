@@ -8,113 +8,33 @@ from pathlib import Path
 import msgspec
 import pytest
 import torch
+from dying import Killed, kill_late
+from toys import FRAMES, HEIGHT, TINY, WIDTH
 
 from rewild4d.errors import UserError
 from rewild4d.harmonics import seen_colors
 from rewild4d.kernels.threads import set_kernel_threads
-from rewild4d.ours.config import Canonical, Config, Deform, Density, Geometry, PriorUse, Skinning, WarmUp
+from rewild4d.ours.config import Canonical, Config, PriorUse, WarmUp
 from rewild4d.ours.fit import Training, train
 from rewild4d.ours.method import Ours
 from rewild4d.ours.model import build_model
 from rewild4d.ours.reconstruction import OursReconstruction
 from rewild4d.ours.schedule import for_clip
 from rewild4d.ours.symmetry import SIGNS, Key, Supervision
-from rewild4d.priors.kinematics import pose
-from rewild4d.priors.motion import quats_from_normals, sample_surface
-from rewild4d.priors.template import MIRROR, PARENTS, quadruped
 from rewild4d.rasterizer import rasterize
-from rewild4d.transforms import (
-    axis_angle_to_matrix,
-    look_at,
-    mirror_camera,
-    mirror_transforms,
-    similarity,
-    skin_points,
-)
-from rewild4d.types import Camera, Clip, Frame, Prior
+from rewild4d.transforms import axis_angle_to_matrix, similarity
+from rewild4d.types import Clip, Prior
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 CPU = torch.device("cpu")
-WIDTH, HEIGHT, FRAMES = 64, 48, 5
-TINY = Config(
-    image_size=64,
-    iterations=16,
-    checkpoint_every=5,
-    canonical=Canonical(samples=200, sh_degree=1),
-    skinning=Skinning(resolution=10, sweeps=5),
-    deform=Deform(width=16, sampled=60),
-    warmup=WarmUp(iterations=6, regress=4, samples=150, size=48, views=2),
-    geometry=Geometry(smooth_size=24, temporal=0.1, rigid=0.1),
-    density=Density(every=0.2, cap=260),
-)
-
-
-def camera(index: int) -> Camera:
-    """One of twelve on a ring around the origin."""
-    angle = 2 * math.pi * index / 12
-    eye = torch.tensor((12 * math.sin(angle), 3.0, 12 * math.cos(angle)), dtype=torch.float64)
-    up = torch.tensor((0.0, 1.0, 0.0), dtype=torch.float64)
-    focal = 2.2 * HEIGHT
-    intrinsics = torch.tensor(((focal, 0, WIDTH / 2), (0, focal, HEIGHT / 2), (0, 0, 1)), dtype=torch.float64)
-    return Camera(look_at(eye, torch.zeros(3, dtype=torch.float64), up), intrinsics, WIDTH, HEIGHT)
-
-
-def swing(amplitude: float) -> torch.Tensor:
-    """Transforms of legs that swing by an amplitude in radians, [T, J, 4, 4]."""
-    angles = torch.zeros(FRAMES, 20, 3)
-    for frame in range(FRAMES):
-        step = amplitude * math.sin(2 * math.pi * (frame + 1) / FRAMES)
-        for bone, sign in ((10, 1), (19, -1), (13, -1), (16, 1)):
-            angles[frame, bone, 0] = sign * step
-    return pose(angles, quadruped().bones[:, 0], PARENTS)
 
 
 @pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Tiny tensors on a busy machine: threads only wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+def kernel_threads() -> Iterator[None]:
+    """A test that sets them sets them for itself."""
     yield
     set_kernel_threads(None)
-    torch.set_num_threads(before)
-
-
-@pytest.fixture(scope="module")
-def toy() -> tuple[Clip, Prior]:
-    """A clip of the animal, and a prior of the right shape that does not move."""
-    template, mirror = quadruped(), torch.tensor(MIRROR)
-    cameras = tuple(camera(index) for index in range(FRAMES))
-    still = swing(0.0)
-    prior = Prior(
-        name="toy",
-        provenance="toy",
-        vertices=template.vertices,
-        faces=template.faces,
-        weights=template.weights,
-        bones=template.bones,
-        parents=torch.tensor(PARENTS),
-        mirror=mirror,
-        times=torch.arange(FRAMES, dtype=torch.float64) / 10,
-        object_to_world=torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1),
-        cameras=cameras,
-        transforms=still,
-        cameras_flip=tuple(mirror_camera(each) for each in cameras),
-        transforms_flip=mirror_transforms(still, mirror),
-        quality={},
-        digest="toy",
-    )
-    surface = sample_surface(prior, 800, torch.Generator().manual_seed(1))
-    front = surface.points[:, 2:] > 0
-    colors = torch.where(front, torch.tensor((0.8, 0.3, 0.1)), torch.tensor((0.1, 0.4, 0.7)))
-    frames = []
-    for index, transforms in enumerate(swing(0.7)):
-        view = cameras[index]
-        means = skin_points(surface.points, surface.weights, transforms)
-        image, alpha, _ = rasterize(
-            means, quats_from_normals(surface.normals), torch.full((800, 3), surface.radius), torch.full((800,), 0.95),
-            colors, view.world_to_camera[None], view.intrinsics[None], WIDTH, HEIGHT,
-        )  # fmt: skip
-        frames.append(Frame(index / 10, view, image[0].clamp(0, 1), alpha[0].clamp(0, 1), index))
-    return Clip("toy/swing", "toy", tuple(frames), 10.0, "CC0", "toy"), prior
 
 
 def quiet(step: int, total: int, values: object) -> None:
@@ -202,14 +122,6 @@ def test_a_change_of_scale_by_the_deformation_costs_its_square(toy: tuple[Clip, 
 
 def test_a_killed_fit_resumes_to_the_same_bits_on_more_threads(toy: tuple[Clip, Prior], tmp_path: Path) -> None:
     whole = train(*toy, TINY, 0, CPU, quiet, None)
-
-    class Killed(Exception):
-        pass
-
-    def kill_late(step: int, total: int, values: object) -> None:
-        if step == total:
-            raise Killed
-
     # The last log comes after the last checkpoint but one: everything since then is lost and done again.
     with pytest.raises(Killed):
         train(*toy, TINY, 0, CPU, kill_late, tmp_path)

@@ -7,7 +7,7 @@ import msgspec
 import pytest
 import torch
 from torch import Tensor
-from twins import check_twins, leaves, normal, unit
+from twins import check_twins, leaves, normal, same_on_any_threads, unit
 
 from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.config import Config, Deform, Geometry
@@ -75,21 +75,17 @@ def test_sizes_that_the_kernels_do_not_take_go_to_the_twin(width: int, heads: in
 
 
 def test_poses_are_the_same_bits_for_any_number_of_threads_and_without_a_gradient() -> None:
-    before, found, own = torch.get_num_threads(), [], network(SMALL)
-    code = normal(30, 6, seed=1).float()
-    try:
-        for threads in (1, 2, 4):
-            torch.set_num_threads(threads)
-            own.zero_grad()
-            pose = own(code)
-            torch.stack([part.square().sum() for part in pose]).sum().backward()
-            found.append([*pose, *(parameter.grad for parameter in own.parameters())])
-    finally:
-        torch.set_num_threads(before)
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+    own, code = network(SMALL), normal(30, 6, seed=1).float()
+
+    def make() -> list[Tensor]:
+        own.zero_grad()
+        pose = own(code)
+        torch.stack([part.square().sum() for part in pose]).sum().backward()
+        return [*pose, *(parameter.grad for parameter in own.parameters())]
+
+    found = same_on_any_threads(make)
     with torch.no_grad():
-        assert all(torch.equal(a, b) for a, b in zip(own(code), found[0][:3], strict=True))
+        assert all(torch.equal(a, b) for a, b in zip(own(code), found[:3], strict=True))
 
 
 def test_one_pose_does_not_depend_on_the_others_of_its_batch() -> None:

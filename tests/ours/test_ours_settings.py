@@ -1,8 +1,8 @@
 """The settings that a preset gives: by the length of the clip, and by whether its cameras are known."""
 
 import msgspec
-import test_ours_fit
 import torch
+from toys import TINY
 
 from rewild4d.config import load_preset
 from rewild4d.ours.config import Config
@@ -10,7 +10,7 @@ from rewild4d.ours.method import Ours
 from rewild4d.ours.schedule import for_clip_of_ours
 from rewild4d.types import Clip, Prior
 
-CPU, TINY, toy = torch.device("cpu"), test_ours_fit.TINY, test_ours_fit.toy
+CPU = torch.device("cpu")
 
 
 def test_settings_follow_the_length_of_the_clip() -> None:

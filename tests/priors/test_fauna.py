@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from calling import call, refusal
 
-from rewild4d.cli import main
 from rewild4d.errors import UserError
 from rewild4d.priors.fauna import read_fauna
 from rewild4d.priors.fauna_bones import estimate_bones, joint_transforms, skinning_weights
@@ -83,18 +83,15 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def refused(folder: Path, out: Path, flags: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     """The one sentence that `prior import` leaves, and nothing else."""
-    with pytest.raises(SystemExit) as stop:
-        main(["prior", "import", "--files", str(folder), "--out", str(out / "p.npz"), *flags])
-    said = capsys.readouterr().err
-    assert stop.value.code == 2 and said.count("\n") == 1 and not out.exists()
+    said = refusal(capsys, "prior", "import", "--files", folder, "--out", out / "p.npz", *flags)
+    assert said.count("\n") == 1 and not out.exists()
     return said
 
 
 def test_what_the_command_writes_is_read_back(whole: Path, tmp_path: Path) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(["prior", "import", "--files", str(whole), "--out", str(tmp_path / "p.npz")])
+    code = call("prior", "import", "--files", whole, "--out", tmp_path / "p.npz")
     made = read_fauna(whole, flip=None, boxes=None, size=256, fps=24.0)
-    assert stop.value.code == 0 and load_prior(tmp_path / "p.npz").digest == made.digest
+    assert code == 0 and load_prior(tmp_path / "p.npz").digest == made.digest
 
 
 MESH, POSE, BOX = "*0_mesh.obj", "*0_pose.txt", "0_box.txt"

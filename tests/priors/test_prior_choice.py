@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_prior_io import prior, two_frames  # noqa: F401
+from prior_files import two_frames
 
 from rewild4d.errors import UserError
 from rewild4d.priors.choose import ELSEWHERE, OTHER_BONES, PriorChoice, make_prior
@@ -16,12 +16,12 @@ from rewild4d.types import Clip, Keypoints, Prior, Truth
 NOTHING = Truth((), None, "")
 
 
-def chosen(prior: Prior, clip: Clip, folder: Path) -> Prior:  # noqa: F811
+def chosen(prior: Prior, clip: Clip, folder: Path) -> Prior:
     save_prior(seal(prior), folder / "p.npz")
     return make_prior(PriorChoice(str(folder / "p.npz"), STANDARD), clip, NOTHING, folder / "no", lambda *_: None)
 
 
-def test_a_file_that_a_run_left_is_taken_as_it_is(prior: Prior, tmp_path: Path) -> None:  # noqa: F811
+def test_a_file_that_a_run_left_is_taken_as_it_is(prior: Prior, tmp_path: Path) -> None:
     found = chosen(prior, two_frames(), tmp_path)
     assert found.notes == (ELSEWHERE,)
     for key in ("transforms", "transforms_flip", "object_to_world", "times"):
@@ -31,19 +31,19 @@ def test_a_file_that_a_run_left_is_taken_as_it_is(prior: Prior, tmp_path: Path) 
         assert torch.equal(mine.intrinsics, theirs.intrinsics)
 
 
-def test_its_figures_are_measured_again(prior: Prior, tmp_path: Path) -> None:  # noqa: F811
+def test_its_figures_are_measured_again(prior: Prior, tmp_path: Path) -> None:
     found = chosen(replace(prior, quality={"mask_iou": 0.99, "cost": 0.25}), two_frames(), tmp_path)
     assert found.quality["mask_iou"] == prior.quality["mask_iou"] != 0.99
     assert found.quality["cost"] == 0.25 and "hops" not in found.quality
 
 
-def test_a_file_for_frames_of_half_the_size_serves(prior: Prior, tmp_path: Path) -> None:  # noqa: F811
+def test_a_file_for_frames_of_half_the_size_serves(prior: Prior, tmp_path: Path) -> None:
     half = tuple(camera.resized(32, 20) for camera in prior.cameras)
     found = chosen(replace(prior, cameras=half), two_frames(), tmp_path)
     assert torch.equal(found.cameras[0].intrinsics, prior.cameras[0].intrinsics) and found.cameras[0].width == 64
 
 
-def test_cameras_that_contradict_the_clips_are_one_sentence(prior: Prior, tmp_path: Path) -> None:  # noqa: F811
+def test_cameras_that_contradict_the_clips_are_one_sentence(prior: Prior, tmp_path: Path) -> None:
     unknown = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)  # as `prior fit` writes it: the object is the world
     sentence = r"p.npz: expected a prior whose cameras agree with those of made/up, but at 0.000 s they put the temp"
     with pytest.raises(UserError, match=sentence):
@@ -51,7 +51,7 @@ def test_cameras_that_contradict_the_clips_are_one_sentence(prior: Prior, tmp_pa
 
 
 @pytest.mark.parametrize(("shift", "agrees"), [(0.6, True), (0.7, False)])
-def test_a_hundredth_of_the_longer_side_is_the_limit(prior, tmp_path, shift, agrees) -> None:  # type: ignore[no-untyped-def]  # noqa: F811
+def test_a_hundredth_of_the_longer_side_is_the_limit(prior, tmp_path, shift, agrees) -> None:  # type: ignore[no-untyped-def]
     """Of 64 pixels it is 0.64."""
     moved = tuple(camera.shifted(shift, 0.0, 64, 40) for camera in prior.cameras)
     if agrees:
@@ -62,7 +62,7 @@ def test_a_hundredth_of_the_longer_side_is_the_limit(prior, tmp_path, shift, agr
         chosen(replace(prior, cameras=moved), two_frames(), tmp_path)
 
 
-def test_a_file_for_another_clip_and_masks_that_are_empty(prior: Prior, tmp_path: Path) -> None:  # noqa: F811
+def test_a_file_for_another_clip_and_masks_that_are_empty(prior: Prior, tmp_path: Path) -> None:
     clip = two_frames()
     with pytest.raises(UserError, match="p.npz: made/up: expected a prior that knows its 2 frames from 0.000 to 0.042"):
         chosen(replace(prior, times=prior.times + 7.0), clip, tmp_path)
@@ -78,7 +78,7 @@ def test_noise_that_is_none(level: str) -> None:
 
 
 @pytest.mark.parametrize("bones", [5, 20, 30])
-def test_keypoints_say_nothing_of_another_skeleton(prior: Prior, tmp_path: Path, bones: int) -> None:  # noqa: F811
+def test_keypoints_say_nothing_of_another_skeleton(prior: Prior, tmp_path: Path, bones: int) -> None:
     """A mapping names bones of the template; a skeleton of as many bones in pairs of its own is another one too."""
     shape = {
         "weights": torch.eye(bones)[torch.zeros(len(prior.vertices), dtype=torch.long)],

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from prior_files import a_prior, ring
 
 from rewild4d.cli import main
 from rewild4d.commands import prior as command
@@ -18,9 +19,6 @@ from rewild4d.errors import UserError
 from rewild4d.priors.config import FOOTAGE
 from rewild4d.priors.io import load_prior, save_prior
 from rewild4d.priors.steady import REACH, clusters, steady, without_hops
-from rewild4d.priors.template import quadruped
-from rewild4d.transforms import look_at
-from rewild4d.types import Camera, Prior
 
 
 def test_clusters_are_those_of_the_definition() -> None:
@@ -37,23 +35,6 @@ def test_clusters_are_those_of_the_definition() -> None:
             if near[i, j] and dense[i] and dense[j]:
                 assert labels[i] == labels[j]
     assert len({int(x) for x in labels[dense]}) >= 3 and labels[-1] == -1
-
-
-def ring(angles: list[float]) -> tuple[Camera, ...]:
-    up, origin = torch.tensor((0.0, 1.0, 0.0)).double(), torch.zeros(3).double()
-    eyes = [torch.tensor((14 * math.sin(a), 2.0, 14 * math.cos(a))).double() for a in angles]
-    intrinsics = torch.tensor(((100.0, 0, 32), (0, 100, 32), (0, 0, 1))).double()
-    return tuple(Camera(look_at(eye, origin, up), intrinsics, 64, 64) for eye in eyes)
-
-
-def a_prior(angles: list[float], flipped: list[float]) -> Prior:
-    template, count = quadruped(), len(angles)
-    still = torch.eye(4).repeat(count, 20, 1, 1)
-    return Prior(
-        "made", "", template.vertices, template.faces, template.weights, template.bones, torch.full((20,), -1),
-        torch.arange(20), torch.arange(count).double() / 24, torch.eye(4).double().repeat(count, 1, 1), ring(angles),
-        still, ring(flipped), still, {}, "",
-    )  # fmt: skip
 
 
 def test_a_camera_that_hops_is_left_out_and_a_hop_of_the_mirrored_one_is_mended() -> None:

@@ -1,7 +1,6 @@
 """The fit finds a known animal again, in a world that is turned, scaled and shifted at random."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 
 import msgspec
@@ -22,17 +21,10 @@ from rewild4d.priors.template import PARENTS, quadruped, quads
 from rewild4d.transforms import axis_angle_to_matrix, look_at, similarity, skin_points
 from rewild4d.types import Camera, Clip, Frame
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 QUICK = PRESETS["quick"]
 WORLD_SCALE = 0.37
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """On tensors this small threads only wait for each other, and on a busy machine for long."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def world() -> tuple[Tensor, Tensor]:

@@ -1,7 +1,6 @@
 """A known animal before a camera nobody knows is found again, and what people add to the masks is understood."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 
 import msgspec
@@ -24,16 +23,10 @@ from rewild4d.priors.views import DISTANCE, ELEVATION, ELEVATION_SPREAD, WINDOW,
 from rewild4d.transforms import axis_angle_to_matrix, look_at, skin_points
 from rewild4d.types import Camera, Clip, Crop, Frame, Keypoints, Prior
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 AZIMUTH = 115.0
 """Of the first true camera, degrees from the head towards the animal's left; it grows by four a frame."""
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def shortened(steps: tuple[int, ...]) -> PriorConfig:

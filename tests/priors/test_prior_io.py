@@ -8,31 +8,9 @@ import pytest
 import torch
 
 from rewild4d.errors import UserError
-from rewild4d.priors.fit import Animal, make_prior
 from rewild4d.priors.io import load_prior, save_prior
-from rewild4d.priors.proportions import Proportions
-from rewild4d.transforms import look_at, mirror_points, similarity, skin_points
-from rewild4d.types import Camera, Clip, Frame, Prior
-
-
-def two_frames() -> Clip:
-    """Two frames of one camera; the mask is the left half of the image."""
-    up = torch.tensor((0.0, 1.0, 0.0), dtype=torch.float64)
-    view = look_at(torch.tensor((6.0, 1.0, 2.0), dtype=torch.float64), torch.zeros(3, dtype=torch.float64), up)
-    intrinsics = torch.tensor(((60.0, 0.0, 30.0), (0.0, 60.0, 20.0), (0.0, 0.0, 1.0)), dtype=torch.float64)
-    mask = torch.zeros(1, 40, 64)
-    mask[:, :, :32] = 1.0
-    frames = tuple(Frame(t / 24, Camera(view, intrinsics, 64, 40), mask.expand(3, -1, -1), mask) for t in range(2))
-    return Clip("made/up", "none", frames, 24.0, "CC0", "")
-
-
-@pytest.fixture
-def prior() -> Prior:
-    """A bent template in `two_frames`."""
-    angles = 0.3 * torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(0))
-    matrix = similarity(0.5, torch.eye(3, dtype=torch.float64), 0.1 * torch.ones(3, dtype=torch.float64))
-    animal = Animal(Proportions.average(), matrix.expand(2, 4, 4).contiguous(), angles, {"cost": 0.25})
-    return make_prior(animal, two_frames(), "template", "Made by a test.")
+from rewild4d.transforms import mirror_points, skin_points
+from rewild4d.types import Prior
 
 
 def test_what_was_saved_is_loaded_with_the_same_digest(prior: Prior, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from animals import yaw
 from artemis_animals import FRAMES, block, turned, write_animal
-from test_prior_files import a_prior
+from prior_files import a_prior
 from torch import Tensor
 
 from rewild4d.datasets.artemis.files import list_motions

@@ -1,19 +1,15 @@
 """How a prior reaches a run on real footage: travel, keypoints, files of whole frames, the filter, and what is told."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import moving
-import msgspec
 import numpy as np
 import pytest
 import torch
-from test_prior_files import a_prior
-from test_wild import SELECTION, cache  # noqa: F401
-from test_wild_evaluation import PROTOCOL
+from films import PAN, SELECTION, TINY, panned, plan
+from prior_files import a_prior
 
 from rewild4d.cli import main
 from rewild4d.commands.shared import choose_prior
@@ -22,49 +18,20 @@ from rewild4d.datasets.video.davis import Davis
 from rewild4d.datasets.video.online import Online
 from rewild4d.datasets.video.whole_frames import whole_clip
 from rewild4d.errors import UserError
-from rewild4d.priors import choose
 from rewild4d.priors.choose import PriorChoice, make_prior
-from rewild4d.priors.config import FOOTAGE, STANDARD
+from rewild4d.priors.config import STANDARD
 from rewild4d.priors.footage import fit_footage
 from rewild4d.priors.io import load_prior, save_prior
 from rewild4d.priors.judge import agreement, doubts
 from rewild4d.priors.placing import known_frames, placed
-from rewild4d.registry import load_method
 from rewild4d.running import provenance, runner
 from rewild4d.types import Clip, Crop, Frame, Prior, Truth
 
-TINY = msgspec.structs.replace(
-    FOOTAGE, yaw_starts=4,
-    stages=tuple(msgspec.structs.replace(stage, steps=1, frames=3, size=24) for stage in FOOTAGE.stages),
-)  # fmt: skip
-PAN = 4
-"""Pixels a frame by which the camera follows the animal, which stays at its place in the image."""
-
-
-@pytest.fixture(autouse=True)
-def tiny(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(choose, "FOOTAGE", TINY)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("cache", "tiny_footage")
 
 
 def silent(*_: object) -> None:
     return None
-
-
-def panned(folder: Path, count: int = 12) -> Path:
-    """folder/frames and folder/masks: an animal that walks to the right before a camera that pans along."""
-    scene = np.random.default_rng(0).integers(0, 255, (64, 96 + PAN * count, 3), dtype=np.uint8)
-    scene = cv2.normalize(cv2.GaussianBlur(scene, (0, 0), 4.0), None, 0, 255, cv2.NORM_MINMAX)
-    where = {"left": 48.0, "step": 0.0}
-    for i in range(count):
-        inside = moving.mask(i, **where)[..., None] > 0
-        view = scene[:, PAN * i : PAN * i + 96]
-        moving.save(folder / "frames" / f"{i:05d}.png", np.where(inside, np.uint8(150), view))
-        moving.save(folder / "masks" / f"{i:05d}.png", moving.mask(i, **where))
-    return folder
 
 
 def test_travel_leads_from_shown_frame_to_shown_frame_in_pixels_of_the_crop(tmp_path: Path) -> None:
@@ -274,16 +241,6 @@ def test_what_speaks_against_a_prior_is_said() -> None:
         "head and tail are uncertain: the clip and its mirror image agree in 40% of the frames",
     )
     assert "costs only 0.0020 more" in doubts({"facing_margin": 0.002})[0]
-
-
-def plan(reader: Online, case: str, out: Path, prior: str = "template") -> runner.Plan:
-    entry = runner.Entry(
-        "prior-only", "quick", msgspec.structs.replace(load_method("prior-only").Config(), gaussians=300), (0,)
-    )
-    return runner.Plan(
-        dataset="online", reader=reader, root=out, cases=(case,), protocol=PROTOCOL, entries=(entry,),
-        prior=choose_prior(prior, "quick", reader), device=torch.device("cpu"), out=out,
-    )  # fmt: skip
 
 
 def test_a_run_warns_of_a_template_that_does_not_fit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

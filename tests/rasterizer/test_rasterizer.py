@@ -8,6 +8,7 @@ import pytest
 import torch
 from splats import NAMES, gradients, hard_scene, loss_weights, render, scene
 from torch import Tensor
+from twins import same_on_any_threads
 
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import mirror_camera, mirror_points, mirror_quats
@@ -117,29 +118,18 @@ def single_run() -> list[Tensor]:
 
 
 def test_the_same_bits_for_any_number_of_threads() -> None:
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 4):
-            torch.set_num_threads(threads)
-            results.append(single_run())
-    finally:
-        torch.set_num_threads(before)
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+    same_on_any_threads(single_run)
 
 
 def test_more_threads_than_eights_of_gaussians() -> None:
     """Pieces of fewer than eight would be read and written from before the arrays' first element."""
-    before, results = torch.get_num_threads(), []
     inputs = {name: tensor.float() for name, tensor in scene(60, 3, 10, 24, 20, 5).items()}
-    try:
-        for threads in (1, 16):
-            torch.set_num_threads(threads)
-            image, found = gradients(inputs, 24, 20)
-            results.append([image, *found.values()])
-    finally:
-        torch.set_num_threads(before)
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+    def make() -> list[Tensor]:
+        image, found = gradients(inputs, 24, 20)
+        return [image, *found.values()]
+
+    same_on_any_threads(make, (1, 16))
 
 
 def test_threads_and_a_forked_child_give_the_same_bits() -> None:

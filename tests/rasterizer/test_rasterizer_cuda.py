@@ -20,6 +20,7 @@ from torch import Tensor
 
 from rewild4d.errors import UserError
 from rewild4d.rasterizer import backends, pick_rasterizer, reference, set_default
+from rewild4d.rasterizer.conventions import RasterInput
 
 WIDTH, HEIGHT = 20, 18
 """Nine tiles, five of them cut by the frame."""
@@ -198,7 +199,7 @@ class StubGsplat(ModuleType):
                       rasterize_mode: str, packed: bool, sh_degree: None) -> tuple[Tensor, Tensor, dict]:  # fmt: skip
         assert not packed and sh_degree is None and rasterize_mode in ("classic", "antialiased")
         antialias = rasterize_mode == "antialiased"
-        image, alpha, info = reference.rasterize(*arrays, backgrounds, eps2d, antialias, near_plane)
+        image, alpha, info = reference.rasterize(RasterInput(*arrays, backgrounds, eps2d, antialias, near_plane))
         boxes = info.radii.ceil().int()[..., None] * torch.tensor([1, 0], dtype=torch.int32)
         return image.movedim(1, -1), alpha.movedim(1, -1), {"means2d": info.means2d, "radii": boxes}
 
@@ -221,7 +222,7 @@ def test_gsplat_gets_and_gives_what_the_reference_does(name: str, adapter: Calla
     for function in (reference.rasterize, adapter):
         leaves = {key: tensor.clone().requires_grad_(key != "intrinsics") for key, tensor in inputs.items()}
         arrays = (leaves[key] for key in NAMES[:-1])
-        image, alpha, info = function(*arrays, width, height, leaves.get("background"), **options)
+        image, alpha, info = function(RasterInput(*arrays, width, height, leaves.get("background"), **options))
         (image.square().sum() + alpha.sum()).backward()
         results.append([image, alpha, info.radii.ceil(), info.means2d.grad, leaves["means"].grad])
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
@@ -230,7 +231,7 @@ def test_gsplat_gets_and_gives_what_the_reference_does(name: str, adapter: Calla
 def test_gsplat_refuses_to_differentiate_the_intrinsics(adapter: Callable[..., Any]) -> None:
     inputs = {name: tensor.requires_grad_() for name, tensor in scene(4, 3, 1, 8, 8, 0).items()}
     with pytest.raises(ValueError, match="gsplat.* no gradient for them"):
-        adapter(*(inputs[name] for name in NAMES[:-1]), 8, 8, None, 0.3, False, 0.01)
+        adapter(RasterInput(*(inputs[name] for name in NAMES[:-1]), 8, 8, None, 0.3, False, 0.01))
 
 
 def test_gsplat_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,13 +7,14 @@ from typing import Any
 
 import msgspec
 import pytest
+from calling import output
+from one_case import OneCase
 from records_for_tests import PROTOCOL, psnr, record
 
 from rewild4d import cli
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig
 from rewild4d.commands import run_table, table
 from rewild4d.config import load_preset
-from rewild4d.contracts import Selection
 from rewild4d.errors import UserError
 from rewild4d.leaderboard.records import FILE, RunRecord, write_record
 from rewild4d.leaderboard.specs import Condition, Line, Spec, load_reported, load_specs
@@ -25,7 +26,6 @@ from rewild4d.registry import load_method
 from rewild4d.running import planning
 from rewild4d.running.conformance import tiny_case
 from rewild4d.running.provenance import FROM_TRUTH
-from rewild4d.types import Case, Clip, Truth
 
 
 def spec(rows: Sequence[Line], **changes: Any) -> Spec:
@@ -178,24 +178,6 @@ def test_a_protocol_can_be_chosen_only_for_a_single_condition() -> None:
     assert one.conditions[0].protocol.startswith("artemis-random-128-v")
 
 
-class OneCase:
-    """A reader of the tiny case."""
-
-    licence = "CC0 1.0"
-
-    def __init__(self, case: Case) -> None:
-        self.case = case
-
-    def cases(self, selection: Selection) -> list[str]:
-        return [self.case.clip.name]
-
-    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
-        return self.case.clip, self.case.truth
-
-    def check(self) -> list[Any]:
-        return []
-
-
 @pytest.fixture
 def demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Spec:
     """A table of two cheap rows on one tiny case, in the place of those that ship."""
@@ -214,25 +196,18 @@ def demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Spec:
     return found
 
 
-def command(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    with pytest.raises(SystemExit) as stop:
-        cli.main(list(words))
-    assert stop.value.code == 0
-    return capsys.readouterr().out
-
-
 def test_a_table_is_run_printed_and_only_completed(
     demo: Spec, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = str(tmp_path / "runs")
     wanted = ("run", "--table", "demo", "--out", out, "--jobs", "1")
-    planned = command(capsys, *wanted, "--plan").splitlines()
+    planned = output(capsys, *wanted, "--plan").splitlines()
     assert [line.split()[:2] for line in planned] == [
         ["missing", label] for label in ("empty", "Coarse", "Coarse", "Fine", "Fine")
     ], "empty once, two rows with two seeds each"
-    shown = command(capsys, *wanted)
+    shown = output(capsys, *wanted)
     assert len(list(Path(out).rglob(FILE))) == 5
-    assert shown == command(capsys, "table", "demo", "--runs", out), "the folder's records give the same table"
+    assert shown == output(capsys, "table", "demo", "--runs", out), "the folder's records give the same table"
     assert all(f"| {label} |" in shown for label in ("Coarse", "Fine", "empty"))
 
     fitted: list[tuple[PriorOnlyConfig, int]] = []
@@ -243,20 +218,20 @@ def test_a_table_is_run_printed_and_only_completed(
         return fit(self, *given, **named)
 
     monkeypatch.setattr(PriorOnly, "fit", spy)
-    assert command(capsys, *wanted) == shown
+    assert output(capsys, *wanted) == shown
     assert fitted == []
     gone = next(folder.parent for folder in Path(out).rglob(FILE) if "prior-only-default-seed1" in str(folder))
     lost = msgspec.json.decode((gone / FILE).read_bytes(), type=RunRecord)
     for path in sorted(gone.rglob("*"), reverse=True):
         path.unlink() if path.is_file() else path.rmdir()
-    assert sorted(line.split()[0] for line in command(capsys, *wanted, "--plan").splitlines()) == ["done"] * 4 + [
+    assert sorted(line.split()[0] for line in output(capsys, *wanted, "--plan").splitlines()) == ["done"] * 4 + [
         "missing"
     ]
-    assert command(capsys, *wanted) == shown
+    assert output(capsys, *wanted) == shown
     assert fitted == [(PriorOnlyConfig(gaussians=lost.config["gaussians"]), 1)]
     (gone / FILE).unlink()
     times = {path: path.stat().st_mtime_ns for path in Path(out).rglob(FILE)}
-    assert command(capsys, *wanted) == shown
+    assert output(capsys, *wanted) == shown
     assert len(fitted) == 1, "what was fitted is scored again, not fitted again"
     assert {path: path.stat().st_mtime_ns for path in Path(out).rglob(FILE) if path.parent != gone} == times
     assert (gone / FILE).is_file()
@@ -268,11 +243,11 @@ def test_a_named_table_tells_its_gaps(demo: Spec, tmp_path: Path, capsys: pytest
     prior = {"choice": demo.conditions[0].prior, "config": msgspec.to_builtins(QUICK)}
     made = record(method="prior-only", config=config, prior=prior, protocol={**PROTOCOL, "name": name})
     write_record(replace_scores(made), tmp_path / "runs" / "one")
-    shown = command(capsys, "table", "demo", "--runs", str(tmp_path / "runs"))
+    shown = output(capsys, "table", "demo", "--runs", str(tmp_path / "runs"))
     assert "| Coarse | 21.50 | n/a [1] |" in shown
     assert "[1] not computed: artemis-sweep-128-v" in shown
     assert "Without records: Fine; `rewild4d-bench run --table demo --preset quick` makes what is missing." in shown
-    one = command(capsys, "table", "demo", "--runs", str(tmp_path / "runs"), "--against", "fine", "--format", "csv")
+    one = output(capsys, "table", "demo", "--runs", str(tmp_path / "runs"), "--against", "fine", "--format", "csv")
     assert one.count("no record yet") == 2 + 2, "the row's own cells, and those of the row that is compared with it"
 
 

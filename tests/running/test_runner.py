@@ -11,15 +11,16 @@ from typing import Any
 import msgspec
 import pytest
 import torch
+from one_case import OneCase
+from records_for_tests import still
 
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig
 from rewild4d.commands.evaluate import Options as EvaluateOptions
 from rewild4d.commands.evaluate import score_again
-from rewild4d.contracts import Selection
 from rewild4d.errors import UserError
 from rewild4d.evaluation.coverage import coverage, visible
 from rewild4d.evaluation.protocol import NovelViews, find_protocol
-from rewild4d.leaderboard.records import FILE, RunRecord, Timing
+from rewild4d.leaderboard.records import FILE
 from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import STANDARD
 from rewild4d.priors.io import save_prior
@@ -28,7 +29,7 @@ from rewild4d.registry import load_method
 from rewild4d.running import runner
 from rewild4d.running.conformance import check_method, tiny_case
 from rewild4d.running.workers import Threads, share_cores, start_worker
-from rewild4d.types import Camera, Case, Clip, Truth
+from rewild4d.types import Camera, Case, Truth
 
 SETTINGS = PriorOnlyConfig(gaussians=2000)
 
@@ -36,24 +37,6 @@ SETTINGS = PriorOnlyConfig(gaussians=2000)
 @pytest.fixture(scope="module")
 def case() -> Case:
     return tiny_case()
-
-
-class OneCase:
-    """A reader of the tiny case."""
-
-    licence = "CC0 1.0"
-
-    def __init__(self, case: Case) -> None:
-        self.case = case
-
-    def cases(self, selection: Selection) -> list[str]:
-        return [self.case.clip.name]
-
-    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
-        return self.case.clip, self.case.truth
-
-    def check(self) -> list[Any]:
-        return []
 
 
 @pytest.fixture
@@ -71,11 +54,6 @@ def plan(case: Case, tmp_path: Path) -> runner.Plan:
         device=torch.device("cpu"),
         out=tmp_path / "runs",
     )  # fmt: skip
-
-
-def still(record: RunRecord) -> RunRecord:
-    """A record without what may differ between two equal runs."""
-    return msgspec.structs.replace(record, timing=Timing("", 0, 0, 0))
 
 
 def test_a_run_scores_the_exact_prior_well(plan: runner.Plan) -> None:

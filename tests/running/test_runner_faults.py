@@ -10,7 +10,8 @@ import dying
 import msgspec
 import pytest
 import torch
-from external_program import OneCase
+from one_case import OneCase
+from records_for_tests import still
 
 from rewild4d import registry
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig, PriorOnlyReconstruction
@@ -20,7 +21,6 @@ from rewild4d.commands.shared import exit_code, require_writable
 from rewild4d.errors import UserError
 from rewild4d.evaluation.measuring import evaluate
 from rewild4d.evaluation.protocol import find_protocol
-from rewild4d.leaderboard.records import RunRecord, Timing
 from rewild4d.machine import _sources, code_of, code_version
 from rewild4d.metrics import weights
 from rewild4d.priors.choose import PriorChoice
@@ -55,11 +55,6 @@ def plan(case: Case, tmp_path: Path) -> runner.Plan:
 def only_job(plan: runner.Plan) -> runner.Job:
     (job,) = runner.pieces(plan)
     return job
-
-
-def still(record: RunRecord) -> RunRecord:
-    """A record without what may differ between two equal runs."""
-    return msgspec.structs.replace(record, timing=Timing("", 0, 0, 0))
 
 
 def test_a_prior_that_is_gone_fails_only_what_was_not_finished(

@@ -9,8 +9,7 @@ import moving
 import numpy as np
 import pytest
 import torch
-from test_wild import SELECTION, cache  # noqa: F401
-from test_wild_evaluation import Plate
+from films import SELECTION, Plate
 
 from rewild4d.baselines.empty import EmptyReconstruction
 from rewild4d.cameras.orbit import orbit_cameras
@@ -27,6 +26,8 @@ from rewild4d.visualize.original_view import original_frames, save_original_view
 from rewild4d.visualize.pictures import PANEL, over
 from rewild4d.visualize.run_pictures import save_pictures
 from rewild4d.visualize.turntable import Stance, find_stance, four_views, turn
+
+pytestmark = pytest.mark.usefixtures("cache")
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -27,17 +27,9 @@ from rewild4d.datasets.images import read_rgb
 from rewild4d.errors import UserError
 from rewild4d.types import Frame
 
+pytestmark = pytest.mark.usefixtures("cache")
+
 SWEEP = Selection(cameras="sweep", size=WIDTH)
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("REWILD4D_CACHE", str(tmp_path / "cache"))
-
-
-@pytest.fixture
-def animal(tmp_path: Path) -> Path:
-    return write_animal(tmp_path / "cat")
 
 
 def centroid(frame: Frame) -> np.ndarray:

@@ -16,14 +16,10 @@ from rewild4d.errors import UserError
 from rewild4d.transforms import look_at
 from rewild4d.types import Camera
 
+pytestmark = pytest.mark.usefixtures("cache")
+
 VIEWS, FRAMES, WIDTH, HEIGHT = 3, 3, 32, 18
 SWEEP = Selection(cameras="sweep", size=32)
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("REWILD4D_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
 
 
 def writer(folder: Path) -> ArtemisWriter:

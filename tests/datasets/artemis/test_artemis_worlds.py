@@ -18,18 +18,10 @@ from rewild4d.datasets.images import read_alpha
 from rewild4d.errors import UserError
 from rewild4d.evaluation.coverage import coverage
 
+pytestmark = pytest.mark.usefixtures("cache")
+
 SWEEP = Selection(cameras="sweep", size=WIDTH)
 MATTES = "img/walk/*/img_????_alpha.png"
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("REWILD4D_CACHE", str(tmp_path / "cache"))
-
-
-@pytest.fixture
-def animal(tmp_path: Path) -> Path:
-    return write_animal(tmp_path / "cat")
 
 
 def change(animal: Path, pattern: str, edit: Callable[[np.ndarray], np.ndarray]) -> None:

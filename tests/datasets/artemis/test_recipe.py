@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pygltflib
 import pytest
-from test_rig import build
+from rig_files import build
 
 from rewild4d.contracts import Selection
 from rewild4d.datasets.artemis.reader import Artemis

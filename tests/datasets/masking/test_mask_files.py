@@ -6,13 +6,15 @@ import cv2
 import moving
 import numpy as np
 import pytest
+from films import SELECTION
 from PIL import Image
-from test_wild import SELECTION, cache  # noqa: F401
 
 from rewild4d.datasets.masking.masks import list_images, open_masks, read_values
 from rewild4d.datasets.video.davis import Davis
 from rewild4d.datasets.video.online import Online
 from rewild4d.errors import UserError
+
+pytestmark = pytest.mark.usefixtures("cache")
 
 INSIDE = moving.mask(0)
 

@@ -8,7 +8,7 @@ import moving
 import numpy as np
 import pytest
 import torch
-from test_wild import SELECTION, cache, iou  # noqa: F401
+from films import SELECTION, iou
 
 from rewild4d import cli
 from rewild4d.datasets.masking.grabcut import rough_masks
@@ -17,6 +17,8 @@ from rewild4d.datasets.masking.makers import Unmasked, parse_boxes, run_program,
 from rewild4d.datasets.video.aptv2 import AptV2
 from rewild4d.datasets.video.online import Online
 from rewild4d.errors import UserError
+
+pytestmark = pytest.mark.usefixtures("cache")
 
 CPU = torch.device("cpu")
 COPY = """

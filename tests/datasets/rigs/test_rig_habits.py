@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_rig import Builder, build
+from rig_files import Builder, build
 
 from rewild4d.datasets.rigs.reader import clips, load_rig
 from rewild4d.errors import UserError
 
 
 def rewritten(folder: Path, change: Callable[[Builder, dict[str, Any]], object]) -> Path:
-    """The hand-made rig of test_rig with a change to what its file says."""
+    """The hand-made rig with a change to what its file says."""
     data = build(folder / "a.glb").read_bytes()
     length = struct.unpack_from("<I", data, 12)[0]
     tree = json.loads(data[20 : 20 + length])

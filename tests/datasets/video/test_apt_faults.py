@@ -5,10 +5,12 @@ from pathlib import Path
 
 import moving
 import pytest
-from test_wild import SELECTION, cache  # noqa: F401
+from films import SELECTION
 
 from rewild4d.datasets.video.aptv2 import AptV2
 from rewild4d.errors import UserError
+
+pytestmark = pytest.mark.usefixtures("cache")
 
 FAULTS: list[tuple[dict[str, object], str, str]] = [
     ({"image_id": 5000}, "name an image that is not listed", "image_id 5000"),

@@ -5,10 +5,12 @@ from pathlib import Path
 import moving
 import numpy as np
 import pytest
-from test_wild import SELECTION, cache  # noqa: F401
+from films import SELECTION
 
 from rewild4d.datasets.video.davis import Davis
 from rewild4d.errors import UserError
+
+pytestmark = pytest.mark.usefixtures("cache")
 
 
 def two_objects(folder: Path, ids: tuple[int, int] = (1, 2), mode: str | None = "P") -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 import moving
 import numpy as np
 import pytest
+from films import SELECTION, iou, restored
 from PIL import Image
-from test_wild import SELECTION, cache, iou, restored  # noqa: F401
 
 from rewild4d import cli
 from rewild4d.datasets.video import video_file
@@ -16,6 +16,8 @@ from rewild4d.datasets.video.mask_check import check_videos
 from rewild4d.datasets.video.online import Online
 from rewild4d.datasets.video.video_file import ascending, video_facts
 from rewild4d.errors import UserError
+
+pytestmark = pytest.mark.usefixtures("cache")
 
 H264 = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-qp", "12")
 

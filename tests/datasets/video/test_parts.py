@@ -5,7 +5,7 @@ from pathlib import Path
 import moving
 import numpy as np
 import pytest
-from test_wild import SELECTION, cache, iou, restored  # noqa: F401
+from films import SELECTION, iou, restored
 
 from rewild4d import cli
 from rewild4d.datasets.video.davis import Davis
@@ -13,6 +13,8 @@ from rewild4d.datasets.video.mask_check import check_videos
 from rewild4d.datasets.video.online import Online
 from rewild4d.datasets.video.parts import NOTE, main_parts, standing_apart
 from rewild4d.errors import UserError
+
+pytestmark = pytest.mark.usefixtures("cache")
 
 
 def blobs(*boxes: tuple[int, int]) -> np.ndarray:

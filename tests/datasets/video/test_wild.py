@@ -7,8 +7,8 @@ import moving
 import numpy as np
 import pytest
 import torch
+from films import SELECTION, iou, restored
 
-from rewild4d.contracts import Selection
 from rewild4d.datasets.keypoints.keypoints import read_badja
 from rewild4d.datasets.masking.masks import FRAMED, mask_facts, match_masks, open_masks
 from rewild4d.datasets.video.aptv2 import AptV2
@@ -20,26 +20,7 @@ from rewild4d.errors import UserError
 from rewild4d.evaluation.protocol import find_protocol
 from rewild4d.types import Camera, Crop
 
-SELECTION = Selection(cameras="unknown", size=64, framing="crop", split=5)
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("REWILD4D_CACHE", str(tmp_path / "cache"))
-
-
-def restored(frame, size: tuple[int, int]) -> np.ndarray:  # type: ignore[no-untyped-def]
-    """The frame's mask back in the original frame, nearest pixel, bool [h, w]."""
-    rows, columns = np.mgrid[: size[1], : size[0]]
-    points = torch.from_numpy(np.stack((columns + 0.5, rows + 0.5), axis=-1)).float()
-    at = frame.crop.from_original(points, frame.mask.shape[1]).floor().long()
-    inside = ((at >= 0) & (at < frame.mask.shape[1])).all(-1)
-    at = at.clamp(0, frame.mask.shape[1] - 1)
-    return ((frame.mask[0][at[..., 1], at[..., 0]] > 0.5) & inside).numpy()
-
-
-def iou(a: np.ndarray, b: np.ndarray) -> float:
-    return (a & b).sum() / (a | b).sum()
+pytestmark = pytest.mark.usefixtures("cache")
 
 
 def test_the_split_is_four_to_one_and_never_at_the_ends() -> None:

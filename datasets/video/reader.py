@@ -1,0 +1,60 @@
+"""What the readers of real videos share."""
+
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rewild4d.contracts import Finding, Selection
+from rewild4d.datasets.video.mask_check import VideoReader, check_videos
+from rewild4d.datasets.video.wild import Video, original_images, split_video
+from rewild4d.types import Clip, Truth
+
+
+class VideoDataset(VideoReader):
+    """Videos with masks, each one a case. Keeps contracts.DatasetReader.
+
+    Attributes:
+        options: names of what may be set beside the root; each is an attribute too.
+    """
+
+    options: tuple[str, ...]
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The options that differ from their defaults, for the record."""
+        given = {name: getattr(self, name) for name in self.options}
+        return {
+            name: str(value.resolve() if isinstance(value, Path) else value)
+            for name, value in given.items()
+            if value is not None and value != "auto"
+        }
+
+    @abstractmethod
+    def video(self, case: str) -> Video:
+        """Return the frames and masks of a case, and its keypoints where it has some.
+
+        Raises:
+            UserError: no such case, no masks for it, or files that cannot be used.
+        """
+
+    def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
+        """Decode one case.
+
+        Raises:
+            UserError: as `video`.
+        """
+        return split_video(self.video(case), selection)
+
+    def originals(self, case: str, selection: Selection) -> Iterator[np.ndarray]:
+        """Return the whole frames that the images of a clip were cut from, uint8 [h, w, 3]; for pictures alone.
+
+        Raises:
+            UserError: as `video`.
+        """
+        return original_images(self.video(case), selection)
+
+    def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
+        """Verify some cases, each file decoded; contact sheets go to ``sheets``."""
+        return check_videos(self, cases, sheets)
