@@ -1,6 +1,7 @@
 """What each fused kernel saves: the whole training step with all kernels, without one of them, and in plain torch."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Protocol
 
 from rewild4d.benchmarks.results import Row, timed_row
@@ -42,11 +43,11 @@ def _steps(make: Make, preset: str, count: int, size: int, repeats: int) -> dict
     before = {name: kernel.calls for name, kernel in KERNELS.items()}
     stepper.turn()
     used = [name for name, kernel in KERNELS.items() if kernel.calls > before[name]]
-    choices = {ALL: (), **{f"without {name}": (name,) for name in used}, NONE: tuple(used)}
+    choices: dict[str, tuple[str, ...]] = {ALL: (), **{f"without {name}": (name,) for name in used}, NONE: tuple(used)}
 
     def turn(names: tuple[str, ...]) -> None:
         with without_kernels(*names):
             stepper.turn()
 
-    samples = measure({name: lambda off=off: turn(off) for name, off in choices.items()}, repeats, f"kernels, {preset}")
+    samples = measure({name: partial(turn, off) for name, off in choices.items()}, repeats, f"kernels, {preset}")
     return {name: per(sample, stepper.period) for name, sample in samples.items()}
