@@ -16,7 +16,7 @@ from rewild4d.datasets import surface_nets
 from rewild4d.datasets.artemis import writer as artemis_writer
 from rewild4d.datasets.builtin import anatomy, bodies, coats, gait, implicit
 from rewild4d.datasets.builtin.gait import Gait, Wave
-from rewild4d.datasets.rigs import animal, shading, studio, voxels
+from rewild4d.datasets.rigs import animal, closest_points, shading, studio, voxels
 from rewild4d.datasets.rigs.animal import AnimatedAnimal, Surface
 from rewild4d.datasets.rigs.studio import Progress, render_artemis
 from rewild4d.errors import UserError, unknown_name
@@ -187,8 +187,9 @@ def build(name: str) -> list[AnimatedAnimal]:
 
 def recipe_digest() -> str:
     """SHA-256 over everything that decides what the built-in data looks like: the sources, the size and the count."""
-    modules = (anatomy, animal, artemis_writer, bodies, coats, gait, implicit, shading, studio, surface_nets, voxels)
-    sources = [Path(module.__file__ or "").read_bytes() for module in modules]
+    made_by = (anatomy, bodies, coats, gait, implicit, surface_nets)
+    rendered_by = (animal, artemis_writer, closest_points, shading, studio, voxels)
+    sources = [Path(module.__file__ or "").read_bytes() for module in (*made_by, *rendered_by)]
     return digest(Path(__file__).read_bytes(), *sources)
 
 

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import open3d as o3d
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from rewild4d.datasets.rigs.animal import Surface
@@ -27,6 +28,14 @@ DILATION = 5
 """Pixels of the window that carries colour past the silhouette, so that resizing straight colour makes no dark rim."""
 
 
+def raycaster(vertices: Sequence[NDArray[np.float64]], surfaces: Sequence[Surface]) -> EmbreeScene:
+    """Scene of the surfaces with the given vertices (each [n, 3]); geometry id = index of the surface."""
+    scene = EmbreeScene(robust=True)
+    for points, surface in zip(vertices, surfaces, strict=True):
+        TriangleMesh(scene, points.astype(np.float32), surface.faces.astype(np.int32))
+    return scene
+
+
 class Picture:
     """The animal at one moment, ready to be seen by many cameras.
 
@@ -41,7 +50,7 @@ class Picture:
 
     def __init__(
         self,
-        scene: o3d.t.geometry.RaycastingScene,
+        scene: EmbreeScene,
         surfaces: Sequence[Surface],
         extent: NDArray[np.float64],
         origin: NDArray[np.float64],
@@ -93,17 +102,16 @@ class Picture:
 
     def _cast(self, rays: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Which rays hit the animal, [m], and the shaded colour that they see, [m, 3]."""
-        answer = {key: value.numpy() for key, value in self.scene.cast_rays(rays).items()}
-        where = np.flatnonzero(np.isfinite(answer["t_hit"]))
-        geometry = answer["geometry_ids"][where]
-        primitive = answer["primitive_ids"][where].astype(np.int64)
-        share = barycentric(answer["primitive_uvs"][where])
+        answer = self.scene.run(rays[:, :3], rays[:, 3:], query="INTERSECT", output=True)
+        where = np.flatnonzero(answer["primID"] >= 0)
+        geometry, primitive = answer["geomID"][where], answer["primID"][where]
+        share = barycentric(np.stack((answer["u"][where], answer["v"][where]), axis=1))
         color = np.empty((len(where), 3), np.float32)
         for number, surface in enumerate(self.surfaces):
             mine = np.flatnonzero(geometry == number)
             if len(mine):
                 color[mine] = _albedo(surface, surface.faces[primitive[mine]], share[mine])
-        return where, color * self._shade(answer["primitive_normals"][where], rays[where, 3:])[:, None]
+        return where, color * self._shade(answer["Ng"][where], rays[where, 3:])[:, None]
 
     def _shade(self, normals: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.float32]:
         """Factor in [0.7, 1] from the flat normals, turned towards the viewer, [n]."""

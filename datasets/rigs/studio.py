@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from rewild4d.datasets.artemis.writer import ArtemisWriter
 from rewild4d.datasets.rigs.animal import AnimatedAnimal
 from rewild4d.datasets.rigs.reader import content, load_rig
-from rewild4d.datasets.rigs.shading import SUN_ALONG, SUN_UP, Picture
-from rewild4d.datasets.rigs.voxels import raycaster, voxelise
+from rewild4d.datasets.rigs.shading import SUN_ALONG, SUN_UP, Picture, raycaster
+from rewild4d.datasets.rigs.voxels import voxelise
 from rewild4d.errors import UserError
 from rewild4d.transforms import look_at
 from rewild4d.types import Camera

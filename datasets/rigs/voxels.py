@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 
 from rewild4d.datasets.rigs.animal import Surface
+from rewild4d.datasets.rigs.closest_points import closest_points
 
 CELLS = 96
 """Lattice cells along the longest axis: fine enough for ears and tails, a few hundred thousand cells at most."""
@@ -37,16 +37,6 @@ class Volume:
     radius: NDArray[np.float64]
 
 
-def raycaster(vertices: Sequence[NDArray[np.float64]], surfaces: Sequence[Surface]) -> o3d.t.geometry.RaycastingScene:
-    """Scene of the surfaces with the given vertices (each [n, 3]); geometry id = index of the surface."""
-    scene = o3d.t.geometry.RaycastingScene()
-    for points, surface in zip(vertices, surfaces, strict=True):
-        scene.add_triangles(
-            np.ascontiguousarray(points, dtype=np.float32), np.ascontiguousarray(surface.faces, dtype=np.uint32)
-        )
-    return scene
-
-
 def voxelise(surfaces: Sequence[Surface], cells: int = CELLS) -> Volume:
     """Voxels inside the rest surfaces or within half a cell of them, weighted like the nearest surface point.
 
@@ -60,30 +50,30 @@ def voxelise(surfaces: Sequence[Surface], cells: int = CELLS) -> Volume:
     centre = (low + high) / 2
     axes = [(np.arange(n) - (n - 1) / 2) * pitch for n in counts]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    scene = raycaster([surface.vertices - centre for surface in surfaces], surfaces)
-    distance = scene.compute_distance(lattice.reshape(-1, 3).astype(np.float32)).numpy().reshape(counts)
-    inside = binary_fill_holes(distance <= 0.5 * pitch * (1 + 1e-3))
-    local = lattice[inside]
-    indices, weights = _nearest_weights(scene, surfaces, local)
+    triangles = np.concatenate([(surface.vertices - centre)[surface.faces] for surface in surfaces])
+    near = closest_points(triangles, lattice.reshape(-1, 3), 0.5 * pitch * (1 + 1e-3)).faces >= 0
+    local = lattice[binary_fill_holes(near.reshape(counts))]
+    indices, weights = _nearest_weights(triangles, surfaces, local)
     return Volume(local + centre, indices, weights, np.full(3, 128 * pitch))
 
 
 def _nearest_weights(
-    scene: o3d.t.geometry.RaycastingScene, surfaces: Sequence[Surface], points: NDArray[np.float64]
+    triangles: NDArray[np.float64], surfaces: Sequence[Surface], points: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Top weights of the nearest surface point of each point, [V, K] and [V, K]."""
     bones = 1 + max(int(surface.bone_indices.max()) for surface in surfaces)
     keep = min(INFLUENCES, bones)
-    closest = {key: value.numpy() for key, value in scene.compute_closest_points(points.astype(np.float32)).items()}
+    faces, uv, _ = closest_points(triangles, points)
+    ends = np.cumsum([len(surface.faces) for surface in surfaces])
     indices, weights = np.empty((len(points), keep), np.int64), np.empty((len(points), keep))
     for start in range(0, len(points), CHUNK):
         rows = slice(start, start + CHUNK)
         dense = np.zeros((len(points[rows]), bones))
-        geometry = closest["geometry_ids"][rows]
+        owner = np.searchsorted(ends, faces[rows], side="right")
         for number, surface in enumerate(surfaces):
-            hit = np.flatnonzero(geometry == number)
-            corners = surface.faces[closest["primitive_ids"][rows][hit].astype(np.int64)]
-            share = barycentric(closest["primitive_uvs"][rows][hit])
+            hit = np.flatnonzero(owner == number)
+            corners = surface.faces[faces[rows][hit] - ends[number] + len(surface.faces)]
+            share = barycentric(uv[rows][hit])
             for corner in range(3):
                 vertex = corners[:, corner]
                 amount = share[:, corner, None] * surface.bone_weights[vertex]

@@ -5,9 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 import pytest
 import torch
+import trimesh
 from torch import Tensor
 
 from rewild4d.errors import UserError
@@ -122,28 +122,53 @@ def test_what_cannot_be_written_leaves_nothing(change: str, value: float, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-def test_points_of_open3d_files(tmp_path: Path) -> None:
+def check_points(path: Path) -> None:
+    assert read_points(path).tolist() == POINTS
+    assert read_surface(path, 50, 0).tolist() == POINTS
+    assert len(read_mesh(path)[1]) == 0
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_points_of_trimesh_files(encoding: str, tmp_path: Path) -> None:
+    cloud = trimesh.PointCloud(np.array(POINTS), colors=np.full((2, 4), 255, np.uint8))
+    cloud.export(tmp_path / "t.ply", encoding=encoding)
+    check_points(tmp_path / "t.ply")
+
+
+@pytest.mark.parametrize("ascii_file", [True, False])
+def test_points_of_open3d_files(ascii_file: bool, tmp_path: Path) -> None:
+    o3d = pytest.importorskip("open3d")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(POINTS))
     cloud.colors = o3d.utility.Vector3dVector(np.ones((2, 3)))
-    for ascii_file in (True, False):
-        o3d.io.write_point_cloud(str(tmp_path / "o.ply"), cloud, write_ascii=ascii_file)
-        assert read_points(tmp_path / "o.ply").tolist() == POINTS
-        assert read_surface(tmp_path / "o.ply", 50, 0).tolist() == POINTS
-        assert len(read_mesh(tmp_path / "o.ply")[1]) == 0
+    o3d.io.write_point_cloud(str(tmp_path / "o.ply"), cloud, write_ascii=ascii_file)
+    check_points(tmp_path / "o.ply")
+
+
+def check_box(path: Path, truth_vertices: np.ndarray, truth_faces: np.ndarray) -> None:
+    """A box of 1 by 2 by 3 whose highest corners have z = 3."""
+    vertices, faces = read_mesh(path)
+    np.testing.assert_allclose(vertices, truth_vertices)
+    np.testing.assert_array_equal(faces, truth_faces)
+    points = read_surface(path, 22_000, 0)
+    assert points.shape == (22_000, 3) and points.dtype == torch.float64
+    on_top = float((points[:, 2] > 3 - 1e-9).double().mean())
+    assert on_top == pytest.approx(1 * 2 / (2 * (1 * 2 + 1 * 3 + 2 * 3)), abs=0.01)
+    assert torch.equal(points, read_surface(path, 22_000, 0))
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_meshes_of_trimesh_files(encoding: str, tmp_path: Path) -> None:
+    box = trimesh.creation.box(bounds=((0, 0, 0), (1, 2, 3)))
+    box.export(tmp_path / "t.ply", encoding=encoding)
+    check_box(tmp_path / "t.ply", box.vertices, box.faces)
 
 
 @pytest.mark.parametrize("ascii_file", [True, False])
 def test_meshes_of_open3d_files(ascii_file: bool, tmp_path: Path) -> None:
+    o3d = pytest.importorskip("open3d")
     box = o3d.geometry.TriangleMesh.create_box(1.0, 2.0, 3.0)
     o3d.io.write_triangle_mesh(str(tmp_path / "o.ply"), box, write_ascii=ascii_file)
-    vertices, faces = read_mesh(tmp_path / "o.ply")
-    np.testing.assert_allclose(vertices, np.asarray(box.vertices))
-    np.testing.assert_array_equal(faces, np.asarray(box.triangles))
-    points = read_surface(tmp_path / "o.ply", 22_000, 0)
-    assert points.shape == (22_000, 3) and points.dtype == torch.float64
-    on_top = float((points[:, 2] > 3 - 1e-9).double().mean())
-    assert on_top == pytest.approx(1 * 2 / (2 * (1 * 2 + 1 * 3 + 2 * 3)), abs=0.01)
-    assert torch.equal(points, read_surface(tmp_path / "o.ply", 22_000, 0))
+    check_box(tmp_path / "o.ply", np.asarray(box.vertices), np.asarray(box.triangles))
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

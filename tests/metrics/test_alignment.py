@@ -1,14 +1,15 @@
-"""Similarities: the closed form against scipy and open3d, the iterated one on animals that are turned, cut or dirty."""
+"""Similarities: the closed form against other packages, the iterated one on animals that are turned, cut or dirty."""
 
 import math
 import time
 
 import numpy as np
-import open3d as o3d
 import pytest
 import torch
+import trimesh
 from animals import UP, animal, floaters, yaw
 from scipy.spatial.transform import Rotation
+from skimage.transform import estimate_transform
 from torch import Tensor
 
 from rewild4d.metrics.alignment import (
@@ -58,9 +59,20 @@ def test_apply_and_matrix_are_the_same_map() -> None:
     assert known().apply(points.float()).dtype == torch.float32
 
 
-def test_umeyama_equals_open3d_on_noisy_matches() -> None:
+def noisy_matches() -> tuple[Tensor, Tensor]:
     source = cloud(50)
-    target = known().apply(source) + 0.3 * cloud(50, 1)
+    return source, known().apply(source) + 0.3 * cloud(50, 1)
+
+
+def test_umeyama_equals_scikit_image_on_noisy_matches() -> None:
+    source, target = noisy_matches()
+    oracle = estimate_transform("similarity", source.numpy(), target.numpy())
+    np.testing.assert_allclose(umeyama(source, target).matrix.numpy(), oracle.params, atol=1e-9)
+
+
+def test_umeyama_equals_open3d_on_noisy_matches() -> None:
+    o3d = pytest.importorskip("open3d")
+    source, target = noisy_matches()
     estimator = o3d.pipelines.registration.TransformationEstimationPointToPoint(with_scaling=True)
     rows = o3d.utility.Vector2iVector(np.repeat(np.arange(50), 2).reshape(-1, 2))
     clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.numpy())) for points in (source, target)]
@@ -152,13 +164,28 @@ def test_starts_are_distinct_rotations() -> None:
         yaw_starts(torch.zeros(3))
 
 
-def test_points_without_noise_end_at_the_truth_as_open3d_does() -> None:
+def clean_match() -> tuple[Tensor, Tensor, Similarity]:
+    """Points, their places, and the similarity from one to the other; the points are not listed in one order."""
     target = animal(800, 0)
     truth = Similarity(1.1, yaw(12), torch.tensor((0.1, 0.05, -0.1), dtype=torch.float64))
     source = inverse(truth).apply(target)[torch.randperm(800, generator=torch.Generator().manual_seed(1))]
+    return source, target, truth
+
+
+def test_points_without_noise_end_at_the_truth_as_trimesh_does() -> None:
+    source, target, truth = clean_match()
     found = align(source, target, up=UP)
     torch.testing.assert_close(found.transform.matrix, truth.matrix, atol=1e-6, rtol=0)
     assert found.converged and not found.clamped and found.chamfer < 1e-6
+    matrix = found.transform.matrix.numpy()
+    oracle, _, _ = trimesh.registration.icp(source.numpy(), target.numpy(), initial=matrix, reflection=False)
+    np.testing.assert_allclose(matrix, oracle, atol=1e-6)
+
+
+def test_points_without_noise_end_at_the_truth_as_open3d_does() -> None:
+    o3d = pytest.importorskip("open3d")
+    source, target, _ = clean_match()
+    found = align(source, target, up=UP)
     clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.numpy())) for points in (source, target)]
     oracle = o3d.pipelines.registration.registration_icp(
         *clouds,

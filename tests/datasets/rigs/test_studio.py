@@ -7,11 +7,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from rewild4d.datasets.rigs.animal import AnimatedAnimal, Surface
+from rewild4d.datasets.rigs.closest_points import closest_points
 from rewild4d.datasets.rigs.shading import sample_texture
 from rewild4d.datasets.rigs.studio import camera_ring, make_artemis, render_artemis
-from rewild4d.datasets.rigs.voxels import voxelise
+from rewild4d.datasets.rigs.voxels import barycentric, voxelise
 from rewild4d.errors import UserError
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
@@ -147,6 +149,24 @@ def test_overlapping_and_open_parts_are_filled() -> None:
     inside = ((volume.voxels > 0.1) & (volume.voxels < (1.9, 0.9, 0.9))).all(1).sum()
     pitch = volume.radius[0] / 128
     assert inside * pitch**3 == pytest.approx(1.8 * 0.8 * 0.8, rel=0.05)
+
+
+def test_closest_points_equal_trimesh_on_triangles_of_any_size() -> None:
+    rng = np.random.default_rng(0)
+    sizes = 10 ** rng.uniform(-2, 0.5, (70, 1, 1))
+    triangles = rng.uniform(-1, 1, (70, 1, 3)) + sizes * rng.uniform(-1, 1, (70, 3, 3))
+    triangles[3, 2] = triangles[3, 1] = triangles[3, 0]  # a point
+    triangles[4, 2] = (triangles[4, 0] + triangles[4, 1]) / 2  # a line
+    points = rng.uniform(-2, 2, (500, 3))
+    pairs = trimesh.triangles.closest_point(np.tile(triangles, (500, 1, 1)), np.repeat(points, 70, axis=0))
+    truth = np.linalg.norm(pairs.reshape(500, 70, 3) - points[:, None], axis=2).min(1)
+    found = closest_points(triangles, points)
+    place = np.einsum("nk,nkd->nd", barycentric(found.uv), triangles[found.faces])
+    np.testing.assert_allclose(found.distances, truth, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(place - points, axis=1), truth, atol=1e-5)
+    near = closest_points(triangles, points, 0.3)
+    np.testing.assert_array_equal(near.faces, np.where(found.distances < 0.3, found.faces, -1))
+    np.testing.assert_array_equal(near.distances, np.minimum(found.distances, np.float32(0.3)))
 
 
 def test_texture_lookup() -> None:
