@@ -24,28 +24,20 @@ import math
 from pathlib import Path
 from typing import ClassVar
 
-import msgspec
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from rewild4d.baselines.d3dgs_network import DeformationNetwork, NetworkShape
+from rewild4d.baselines.d3dgs_config import INFO, STAR_INFO, D3dgsConfig, D3dgsStarConfig, NetworkShape
+from rewild4d.baselines.d3dgs_network import DeformationNetwork
 from rewild4d.baselines.saved import Root, gaussians_from_state, load_state, save_state, splats_of
-from rewild4d.baselines.splatting import (
-    ImageLoss,
-    Resets,
-    Shape,
-    SplatConfig,
-    SplatTraining,
-    run_steps,
-    surface_gaussians,
-)
+from rewild4d.baselines.splatting import Shape, SplatTraining, run_steps, surface_gaussians
 from rewild4d.baselines.volume import random_points, scene_frame
 from rewild4d.contracts import Log, MethodInfo
 from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.checkpoint import fit_digest
-from rewild4d.ours.config import Canonical, Degree, Density, Opacity, Positive, Rate, Share, Weight
+from rewild4d.ours.config import Canonical
 from rewild4d.ours.schedule import exponential, fade, for_clip
 from rewild4d.ours.symmetry import Key, Supervision, Target, match_times
 from rewild4d.rasterizer import RasterInfo
@@ -53,87 +45,6 @@ from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Prior, Splats
 
 REACH = OBJECT_DIAGONAL / 2
 """The network's unit of length, so that an animal fills about [-1, 1] as in the original's scenes."""
-PAPER = "Yang et al., Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene Reconstruction, CVPR 2024"
-
-
-class Motion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """When and how the deformation learns."""
-
-    warm_up: Weight = 0.075
-    """Fraction with the Gaussians standing still (3k of 40k)."""
-    noise: Weight = 0.1
-    """Standard deviation of the time's jitter in frames, falling linearly to zero."""
-    noise_until: Weight = 0.5
-    """Fraction at which the jitter ends (20k of 40k)."""
-    rate: Rate = (8e-4, 1.6e-6)
-    """Learning rate of the network, falling exponentially."""
-
-
-class D3dgsCanonical(Canonical, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The canonical Gaussians."""
-
-    opacity: Opacity = 0.1
-    """At the start (3DGS)."""
-    sh_degree: Degree = 3
-    """Spherical harmonics of colour, 0 to 3."""
-
-
-class D3dgsDensity(Density, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Densification with a cap."""
-
-    start: Weight = 0.0125
-    """Fraction of the first round (500 of 40k)."""
-    end: Weight = 0.375
-    """Fraction of the last (15k of 40k)."""
-    every: Positive = 0.0025
-    """Fraction between rounds (100 of 40k)."""
-    prune_opacity: Share = 0.005
-    """Gaussians below this opacity are removed (3DGS); a reset must leave more."""
-
-
-class D3dgsResets(Resets, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Opacity resets: every Gaussian has to earn its opacity again, so that floaters are pruned."""
-
-    every: Weight = 0.075
-    """Fraction between resets (3k of 40k); 0 for none."""
-    until: Weight = 0.375
-    """Fraction after which there are none (15k of 40k)."""
-
-
-class D3dgsConfig(SplatConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """`d3dgs`; the defaults are the original's schedule on 20k steps."""
-
-    canonical: D3dgsCanonical = D3dgsCanonical()
-    density: D3dgsDensity = D3dgsDensity()
-    resets: D3dgsResets = D3dgsResets()
-    network: NetworkShape = NetworkShape()
-    motion: Motion = Motion()
-
-
-class StarCanonical(D3dgsCanonical, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The canonical Gaussians, on the prior's surface."""
-
-    opacity: Opacity = 0.9
-    """At the start, as `ours`."""
-
-
-class StarLoss(ImageLoss, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Losses of one rendered view."""
-
-    silhouette: Weight = 0.1
-    """BCE + Dice of the matte, as `ours`."""
-
-
-class D3dgsStarConfig(D3dgsConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """`d3dgs-star`; the defaults are `d3dgs`'s with the silhouette loss of `ours` and its start."""
-
-    mirrored: Share = 0.5
-    """Share of the steps that see a mirror image, at negative times (the paper's is open; `ours`: half). An eighth, as
-    presets of `ours` have it, gains nothing sure: tiger, held out, mean of three seeds 19.8 for 19.3 (quick), 20.5 for
-    20.3 (standard, seeds differ by .8); giraffe 25.9 (standard, one seed) for 26.2
-    (three, network in single precision)."""
-    canonical: StarCanonical = StarCanonical()
-    loss: StarLoss = StarLoss()
 
 
 class D3dgsModel(nn.Module):
@@ -220,9 +131,7 @@ class D3dgs:
     """The method from the clip alone (contracts.Method)."""
 
     name: ClassVar[str] = "d3dgs"
-    info: ClassVar[MethodInfo] = MethodInfo(
-        title="D-3DGS", paper=PAPER, licence="MIT (written anew from the paper)", uses_prior=False
-    )
+    info: ClassVar[MethodInfo] = INFO
     Config: ClassVar[type[D3dgsConfig]] = D3dgsConfig
 
     def fit(
@@ -270,11 +179,7 @@ class D3dgsStar(D3dgs):
     """The method with the prior's start, silhouettes and flipped frames (contracts.Method)."""
 
     name: ClassVar[str] = "d3dgs-star"
-    info: ClassVar[MethodInfo] = MethodInfo(
-        title="D-3DGS*",
-        paper=f"{PAPER}; the star as in the paper of `ours`",
-        licence="MIT (written anew from the paper)",
-    )
+    info: ClassVar[MethodInfo] = STAR_INFO
     Config: ClassVar[type[D3dgsConfig]] = D3dgsStarConfig
 
     def _start(

@@ -1,12 +1,11 @@
 """The deformation network of D-3DGS: place and time of a canonical Gaussian to its change of place, turn and size."""
 
-import msgspec
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
+from rewild4d.baselines.d3dgs_config import NetworkShape
 from rewild4d.kernels.halves import available
-from rewild4d.ours.config import Count, Whole
 from rewild4d.ours.pose import seed_linears
 
 OUTPUTS = 10
@@ -17,29 +16,6 @@ def octave_code(values: Tensor, octaves: int) -> Tensor:
     """[x, sin 2^k x, cos 2^k x], k < octaves, no factor pi; [..., d] -> [..., d (1 + 2 octaves)]."""
     angles = (values[..., None, :] * 2.0 ** torch.arange(octaves).to(values)[:, None]).flatten(-2)
     return torch.cat((values, angles.sin(), angles.cos()), dim=-1)
-
-
-class NetworkShape(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Sizes of the network; the defaults are the original's."""
-
-    depth: Count = 8
-    """Layers before the heads."""
-    width: Count = 256
-    """Of each: 10,000 Gaussians cost about 32 GFLOP a step at 256, 8 at 128, so short presets are narrower."""
-    skip: Whole = 4
-    """The input joins once more after this layer (counted from 0)."""
-    place_octaves: Whole = 10
-    """Of the position code."""
-    time_octaves: Whole = 6
-    """Of the time code."""
-    time_width: Count = 256
-    """Hidden width of the time's own network."""
-    time_features: Count = 30
-    """What it makes of the time."""
-    half: bool = True
-    """On a CPU that multiplies bfloat16 pairs the layers work in bfloat16, as the deformation of `ours` does: forward
-    and backward about 20 ms for 50 (timed by hand; 6,000 Gaussians, width 128, one thread); the built-in tiger held
-    out, standard, mean of three seeds that differ by .8: 20.3 dB for 20.0 (single precision, on another machine)."""
 
 
 class DeformationNetwork(nn.Module):

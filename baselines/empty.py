@@ -3,15 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import torch
 
-from rewild4d.contracts import Log, MethodInfo
+from rewild4d.baselines.floors_config import EMPTY_INFO, EmptyConfig
+from rewild4d.contracts import Log
 from rewild4d.types import Camera, Clip, Prior, Splats
-
-
-class EmptyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Nothing to choose."""
 
 
 class EmptyReconstruction:
@@ -30,7 +26,7 @@ class EmptyReconstruction:
 class Empty:
     """Renders the background: on white, a small animal costs it little, which is why it is always printed."""
 
-    info = MethodInfo(title="empty", paper="", licence="MIT", is_floor=True, uses_prior=False)
+    info = EMPTY_INFO
     Config = EmptyConfig
 
     def fit(

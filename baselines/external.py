@@ -14,13 +14,14 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import msgspec
 import torch
 from torch import Tensor
 
 from rewild4d.baselines.external_alignment import UPS, Placement, place_by_search, place_fauna
+from rewild4d.baselines.external_config import INFO, ExternalConfig
 from rewild4d.baselines.external_folder import (
     crop_box,
     find_outputs,
@@ -35,7 +36,6 @@ from rewild4d.contracts import Log, MethodInfo
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import digest, load_tensors, save_tensors, write_text
 from rewild4d.io.meshes import Discs
-from rewild4d.ours.config import Count, Positive
 from rewild4d.ours.motion import camera_between, frame_position
 from rewild4d.priors.motion import pose_at
 from rewild4d.transforms import skin_points, split_similarity, transform_splats
@@ -44,28 +44,6 @@ from rewild4d.types import Camera, Clip, Frame, Prior, Splats
 STATE = "external.pt"
 DONE = "done.json"
 Shots = list[tuple[Frame, Camera]]
-
-
-class ExternalConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Whose program, and how its files are read."""
-
-    program: str = ""
-    """Its name, for tables; the profile's where it is left out."""
-    profile: str = "frames"
-    """Layout of its files: frames, glb, gvfdiffusion, dreammesh4d or 3d-fauna."""
-    command: str = ""
-    """Words that start it; {clip} and {out} stand for the two folders, {case} and {seed} for what they say. A file that
-    a word names counts as a setting: edit it and it is another run. What such a file reads or imports does not."""
-    folder: str = ""
-    """Where its results are already, instead of a command; {case} stands for <animal>__<motion>."""
-    placed: Literal["profile", "yes", "no"] = "profile"
-    """Whether results stand in the world of the cameras; "no" rotates them to the best input-view PSNR."""
-    up: Literal["profile", "y", "-y", "z", "any"] = "profile"
-    """Axis of its results that points up, where they are rotated; "any" tries all three."""
-    points: Count = 20_000
-    """Gaussians on a mesh."""
-    timeout: Positive = 6 * 3600.0
-    """Seconds that the program may take."""
 
 
 @dataclass(frozen=True)
@@ -109,9 +87,7 @@ class ExternalReconstruction:
 class External:
     """A program of others (contracts.Method)."""
 
-    info: ClassVar[MethodInfo] = MethodInfo(
-        title="anybody's program, by files", paper="that of the program", licence="that of the program"
-    )
+    info: ClassVar[MethodInfo] = INFO
     Config: ClassVar[type[ExternalConfig]] = ExternalConfig
 
     def inputs(self, config: ExternalConfig, case: str) -> str:

@@ -29,7 +29,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from rewild4d.baselines.gart_config import GartConfig, GartStarConfig
+from rewild4d.baselines.gart_config import INFO, STAR_INFO, GartConfig, GartStarConfig
 from rewild4d.baselines.gart_reconstruction import GartReconstruction, GartStarReconstruction
 from rewild4d.baselines.gart_refine import refine_step
 from rewild4d.baselines.gart_skeleton import PoseTable, prior_poses
@@ -47,8 +47,6 @@ from rewild4d.ours.schedule import exponential, for_clip
 from rewild4d.ours.symmetry import Key, Supervision, Target, match_times
 from rewild4d.rasterizer import RasterInfo
 from rewild4d.types import OBJECT_DIAGONAL, Clip, Prior
-
-PAPER = "Lei et al., GART: Gaussian Articulated Template Models, CVPR 2024"
 
 
 class GartModel(nn.Module):
@@ -157,9 +155,7 @@ class Gart:
     """The method on the prior's skeleton (contracts.Method)."""
 
     name: ClassVar[str] = "gart"
-    info: ClassVar[MethodInfo] = MethodInfo(
-        title="GART (20 bones)", paper=PAPER, licence="MIT (written anew from the paper)"
-    )
+    info: ClassVar[MethodInfo] = INFO
     Config: ClassVar[type[GartConfig]] = GartConfig
     Result: ClassVar[type[GartReconstruction]] = GartReconstruction
 
@@ -205,11 +201,6 @@ class GartStar(Gart):
     """The method with the poses of all scored moments fitted once more to the input view (contracts.Method)."""
 
     name: ClassVar[str] = "gart-star"
-    info: ClassVar[MethodInfo] = MethodInfo(
-        title="GART* (20 bones)",
-        paper=PAPER,
-        licence="MIT (written anew from the paper)",
-        mark="poses fitted once more to each input image",
-    )
+    info: ClassVar[MethodInfo] = STAR_INFO
     Config: ClassVar[type[GartConfig]] = GartStarConfig
     Result: ClassVar[type[GartReconstruction]] = GartStarReconstruction

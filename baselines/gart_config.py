@@ -1,11 +1,15 @@
-"""Settings of GART; "fraction" means a share of the original's 10k steps, or of as many as `iterations` says."""
+"""Settings of GART and GART*, and what tables say of the two; a light module, read before the method is loaded.
+
+"fraction" means a share of the original's 10k steps, or of as many as `iterations` says.
+"""
 
 from typing import Annotated
 
 import msgspec
 from msgspec import Meta
 
-from rewild4d.baselines.splatting import GaussianRates, ImageLoss, Resets, SplatConfig
+from rewild4d.baselines.splatting_config import GaussianRates, ImageLoss, Resets, SplatConfig
+from rewild4d.contracts import MethodInfo
 from rewild4d.ours.config import (
     Canonical,
     Count,
@@ -18,6 +22,13 @@ from rewild4d.ours.config import (
     Skinning,
     Weight,
     Whole,
+)
+
+PAPER = "Lei et al., GART: Gaussian Articulated Template Models, CVPR 2024"
+LICENCE = "MIT (written anew from the paper)"
+INFO = MethodInfo(title="GART (20 bones)", paper=PAPER, licence=LICENCE)
+STAR_INFO = MethodInfo(
+    title="GART* (20 bones)", paper=PAPER, licence=LICENCE, mark="poses fitted once more to each input image"
 )
 
 

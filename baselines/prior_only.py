@@ -7,13 +7,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import torch
 from torch import Tensor
 
-from rewild4d.contracts import Log, MethodInfo
+from rewild4d.baselines.floors_config import PRIOR_ONLY_INFO, PriorOnlyConfig
+from rewild4d.contracts import Log
 from rewild4d.files import load_tensors, save_tensors
-from rewild4d.ours.config import Count, Positive
 from rewild4d.priors.io import load_prior, save_prior
 from rewild4d.priors.motion import (
     SurfaceSample,
@@ -26,15 +25,6 @@ from rewild4d.priors.motion import (
 )
 from rewild4d.transforms import transform_splats
 from rewild4d.types import Camera, Clip, Prior, Splats
-
-
-class PriorOnlyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the prior's surface is drawn."""
-
-    gaussians: Count = 12000
-    """Points on the surface: enough that their discs close at 512 pixels."""
-    thickness: Positive = 0.3
-    """Along the normal, as a share of the disc's radius: a thin shell."""
 
 
 class PriorOnlyReconstruction:
@@ -97,7 +87,7 @@ class PriorOnlyReconstruction:
 class PriorOnly:
     """The floor that a reconstruction has to leave behind."""
 
-    info = MethodInfo(title="prior only", paper="after the 3D-Fauna row (Li et al. 2024)", licence="MIT", is_floor=True)
+    info = PRIOR_ONLY_INFO
     Config = PriorOnlyConfig
 
     def fit(

@@ -10,6 +10,8 @@ read once, hashed, and only then parsed, at every load; torch.hub looks at eight
 Nothing downloads by itself. A network that lies nowhere is `WeightsMissing`, with the command that fetches it.
 """
 
+from __future__ import annotations
+
 import contextlib
 import hashlib
 import os
@@ -21,15 +23,17 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
-import safetensors.torch
-import torch
-from torch import Tensor
 
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import atomic, cache_folder
-from rewild4d.metrics.carriers import Tensors, convert
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rewild4d.metrics.carriers import Tensors
 
 FETCH = "rewild4d-bench weights fetch"
 
@@ -121,6 +125,8 @@ def home() -> Path:
 
 def places() -> list[Path]:
     """Folders that are searched, in order: $REWILD4D_WEIGHTS, the toolkit's cache, torch.hub's checkpoints."""
+    import torch.hub
+
     folders = (home(), cache_folder() / "weights", Path(torch.hub.get_dir()) / "checkpoints")
     return list(dict.fromkeys(folders))
 
@@ -166,6 +172,8 @@ def is_here(name: str) -> bool:
 
 
 def _parse(data: bytes, known: Network) -> LoadedWeights:
+    import safetensors.torch
+
     return LoadedWeights(safetensors.torch.load(data), known.sha256)
 
 
@@ -219,6 +227,10 @@ def make(name: str, copies: dict[str, Copy]) -> bytes:
     Raises:
         UserError: a file's bytes are not the published ones, or their tensors not the network's.
     """
+    import safetensors.torch
+
+    from rewild4d.metrics.carriers import convert
+
     tensors: Tensors = {}
     for file, copy in copies.items():
         known = table().files[file]

@@ -12,7 +12,6 @@ from importlib import resources
 from typing import Any, TypeVar
 
 import msgspec
-import tyro
 
 from rewild4d.errors import UserError, unknown_name
 
@@ -66,7 +65,13 @@ def _preset_file(method: str) -> dict[str, Any]:
 
 
 def parse_flags(
-    options_type: type[T], arguments: list[str], *, prog: str, description: str, also: Iterable[str] = ()
+    options_type: type[T],
+    arguments: list[str],
+    *,
+    prog: str,
+    description: str,
+    config: msgspec.Struct | None = None,
+    also: Iterable[str] = (),
 ) -> T:
     """Parse a command's flags; a misspelt one is a sentence with the nearest name, not a page.
 
@@ -75,12 +80,21 @@ def parse_flags(
         arguments: what came after the command's name.
         prog: how the command is called, for help.
         description: shown on top of the help.
+        config: settings of a method that are flags too (--loss.ssim 0.3); the result has them as ``config``.
         also: flags that the command knows under other circumstances, for the nearest name.
 
     Raises:
         UserError: a flag that does not exist, a value of the wrong type, or a number that is not finite.
         SystemExit: --help.
     """
+    known = {*_flags(options_type), *(_flags(type(config)) if config is not None else ())}
+    for flag in (word.split("=")[0] for word in arguments if word.startswith("--") and word != "--"):
+        if flag.replace("_", "-") not in known and flag != "--help" and not flag.startswith("--tyro-"):
+            raise unknown_name("option", flag, known.union(also))
+    import tyro  # it takes a while, as does reading every setting's help: a misspelt flag is told before
+
+    if config is not None:
+        options_type = _with_settings(options_type, config)
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
@@ -92,7 +106,7 @@ def parse_flags(
             raise
         raise UserError(f"{_first_words(said.getvalue()).rstrip('.')}; see {prog} --help.") from None
     if unknown and unknown[0].startswith("-"):
-        raise unknown_name("option", unknown[0].split("=")[0], [*_flags(options_type), *also])
+        raise unknown_name("option", unknown[0].split("=")[0], known.union(also))
     if unknown:
         raise UserError(f"{prog}: expected options only, got '{unknown[0]}'; see {prog} --help.")
     for flag, number in _floats(options):
@@ -137,8 +151,10 @@ def _first_words(box: str) -> str:
     return next((sentence for sentence in sentences if len(sentence.split()) > 2), plain.strip())
 
 
-def with_method_flags(options_type: type, config: msgspec.Struct) -> type:
-    """``options_type`` with one more field, ``config``, whose settings are flags of their own (--loss.ssim 0.3)."""
+def _with_settings(options_type: type, config: msgspec.Struct) -> type:
+    """``options_type`` with one more field, ``config``, whose settings are flags without its name before them."""
+    import tyro
+
     flattened: Any = typing.Annotated[type(config), tyro.conf.arg(name="")]  # type: ignore[valid-type]
     return dataclasses.make_dataclass(
         options_type.__name__,
@@ -152,11 +168,11 @@ def with_method_flags(options_type: type, config: msgspec.Struct) -> type:
 def _flags(node: Any, prefix: str = "") -> Iterator[str]:
     """Every flag that a dataclass or Struct type gives, nested ones with dots."""
     for name, hint in typing.get_type_hints(node).items():
-        if name.startswith("_") or name == "info":
+        if name.startswith("_"):
             continue
         inner = f"{prefix}{name.replace('_', '-')}"
-        if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
-            yield from _flags(hint, "" if name == "config" else f"{inner}.")
+        if isinstance(hint, type) and (issubclass(hint, msgspec.Struct) or dataclasses.is_dataclass(hint)):
+            yield from _flags(hint, f"{inner}.")
         else:
             yield f"--{inner}"
             if hint is bool:

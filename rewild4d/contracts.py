@@ -1,14 +1,18 @@
 """What a method, a reconstruction and a dataset reader promise. Structural: nobody has to inherit."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import msgspec
-import torch
 
-from rewild4d.types import Camera, Clip, Prior, Splats, Truth
+if TYPE_CHECKING:
+    import torch
+
+    from rewild4d.types import Camera, Clip, Prior, Splats, Truth
 
 Log = Callable[[int, int, Mapping[str, float]], None]
 """log(step, total, values): progress of a long computation, called every few steps."""
@@ -128,6 +132,10 @@ class Method(Protocol):
     def load(self, folder: Path, device: torch.device) -> Reconstruction:
         """Read back what `Reconstruction.save` wrote: the same pixels."""
         ...
+
+
+Parts = Literal["auto", "all", "main"]
+"""Which connected parts of a mask are the animal; auto: the main one where others stand apart from it, else all."""
 
 
 class Selection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

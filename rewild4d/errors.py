@@ -1,6 +1,5 @@
 """The one exception for bad input: one clear sentence, exit code 2, no traceback."""
 
-import difflib
 from collections.abc import Iterable
 
 MOST_LISTED = 30
@@ -19,6 +18,8 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
         name: what the user gave.
         known: every valid name.
     """
+    import difflib  # only who misspells a name waits for it
+
     names = sorted(set(known))
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     hint = f" Did you mean '{close[0]}'?" if close else ""

@@ -1,5 +1,7 @@
 """Files and folders: whole or not at all, one writer at a time, known by their content, in the order people count."""
 
+from __future__ import annotations
+
 import contextlib
 import hashlib
 import os
@@ -12,13 +14,15 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import platformdirs
-import torch
 
 from rewild4d.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+    import torch
 
 try:
     import fcntl
@@ -131,6 +135,8 @@ def write_text(path: Path, text: str) -> None:
 
 def save_tensors(state: Any, path: Path) -> None:
     """Write what `torch.load` reads, atomically; see `atomic` for errors."""
+    import torch
+
     with atomic(path) as temporary, temporary.open("wb") as file:
         try:
             torch.save(state, file)
@@ -144,12 +150,13 @@ def digest(*parts: bytes | str | np.ndarray | torch.Tensor) -> str:
     """SHA-256 over text, bytes and arrays (with their shape and type), as hex."""
     sha = hashlib.sha256()
     for part in parts:
-        if isinstance(part, torch.Tensor):
-            part = part.detach().cpu().numpy()
-        if isinstance(part, np.ndarray):
-            sha.update(f"{part.dtype}{part.shape}".encode())
-            part = np.ascontiguousarray(part).tobytes()
-        sha.update(part.encode() if isinstance(part, str) else part)
+        if isinstance(part, str):
+            part = part.encode()
+        elif not isinstance(part, bytes):
+            array = part.detach().cpu().numpy() if hasattr(part, "detach") else part
+            sha.update(f"{array.dtype}{array.shape}".encode())
+            part = array.tobytes()
+        sha.update(part)
         sha.update(b"\0")
     return sha.hexdigest()
 
@@ -195,6 +202,8 @@ def load_tensors(path: Path, kind: str = "saved reconstruction") -> Any:
     Raises:
         UserError: it is missing, damaged, or holds more than tensors and numbers.
     """
+    import torch
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of torch, about pickles of its first years

@@ -3,11 +3,18 @@
 A package scan would miss the mapped folders of an editable install; a table cannot.
 """
 
+from __future__ import annotations
+
 import importlib
 from importlib import metadata
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rewild4d.errors import UserError, unknown_name
+
+if TYPE_CHECKING:
+    import msgspec
+
+    from rewild4d.contracts import MethodInfo
 
 METHODS = {
     "ours": "rewild4d.ours.method:Ours",
@@ -19,12 +26,30 @@ METHODS = {
     "empty": "rewild4d.baselines.empty:Empty",
     "external": "rewild4d.baselines.external:External",
 }
+SETTINGS = {
+    "ours": ("rewild4d.ours", "INFO", "Config"),
+    "d3dgs": ("rewild4d.baselines.d3dgs_config", "INFO", "D3dgsConfig"),
+    "d3dgs-star": ("rewild4d.baselines.d3dgs_config", "STAR_INFO", "D3dgsStarConfig"),
+    "gart": ("rewild4d.baselines.gart_config", "INFO", "GartConfig"),
+    "gart-star": ("rewild4d.baselines.gart_config", "STAR_INFO", "GartStarConfig"),
+    "prior-only": ("rewild4d.baselines.floors_config", "PRIOR_ONLY_INFO", "PriorOnlyConfig"),
+    "empty": ("rewild4d.baselines.floors_config", "EMPTY_INFO", "EmptyConfig"),
+    "external": ("rewild4d.baselines.external_config", "INFO", "ExternalConfig"),
+}
+"""Modules without torch that hold `info` and `Config` of our methods: all that lists and flags need of a method."""
 DATASETS = {
     "artemis": "rewild4d.datasets.artemis.reader:Artemis",
     "davis": "rewild4d.datasets.video.davis:Davis",
     "aptv2": "rewild4d.datasets.video.aptv2:AptV2",
     "online": "rewild4d.datasets.video.online:Online",
 }
+TITLES = {
+    "artemis": "Artemis / DFA folders: one animal, or a folder of animals",
+    "davis": "DAVIS 2016 and 2017: real videos with true masks",
+    "aptv2": "APTv2 and APT-36K: short real clips with keypoints",
+    "online": "A person's own video, with masks",
+}
+"""What our data sets are: the first line of each reader's docstring, readable without importing it."""
 BUILTIN = {"artemis": "rewild4d.datasets.builtin.synthetic:ensure"}
 """Data sets that make themselves on first use: a function that returns their folder."""
 
@@ -43,6 +68,49 @@ def load_method(name: str) -> Any:
     return _load("methods", name)()
 
 
+def method_info(name: str) -> MethodInfo:
+    """Return the `info` of a method, without importing the method if it is ours.
+
+    Raises:
+        UserError: as `load_method`.
+    """
+    module, info, _ = SETTINGS.get(name, ("", "", ""))
+    return _resolve(f"{module}:{info}") if module else load_method(name).info
+
+
+def load_config(name: str) -> type[msgspec.Struct]:
+    """Return the `Config` of a method, without importing the method if it is ours.
+
+    Raises:
+        UserError: as `load_method`.
+    """
+    module, _, config = SETTINGS.get(name, ("", "", ""))
+    return _resolve(f"{module}:{config}") if module else load_method(name).Config
+
+
+def dataset_title(name: str) -> str:
+    """Return what a data set is in one line, without importing its reader if it is ours.
+
+    Raises:
+        UserError: as `load_dataset`.
+    """
+    if name in TITLES:
+        return TITLES[name]
+    first, *_ = (load_dataset(name).__doc__ or "no description").strip().splitlines()
+    return first.rstrip(".")
+
+
+def require_name(kind: str, name: str) -> None:
+    """Fail on a name that no method or data set has, before anything is imported.
+
+    Raises:
+        UserError: no such name; with the nearest one.
+    """
+    table = _table(kind)
+    if name not in table:
+        raise unknown_name(kind.removesuffix("s"), name, table)
+
+
 def load_dataset(name: str) -> Any:
     """The reader class of the data set called ``name``: reader(root) -> contracts.DatasetReader.
 
@@ -59,15 +127,12 @@ def load_builtin(name: str) -> Any:
 
 
 def _load(kind: str, name: str) -> Any:
-    table = _table(kind)
-    if name not in table:
-        raise unknown_name(kind.removesuffix("s"), name, table)
+    require_name(kind, name)
+    target = _table(kind)[name]
     try:
-        return _resolve(table[name])
+        return _resolve(target)
     except (ImportError, AttributeError) as error:
-        raise UserError(
-            f"{kind.removesuffix('s')} '{name}': expected an object at {table[name]}, but {error}."
-        ) from error
+        raise UserError(f"{kind.removesuffix('s')} '{name}': expected an object at {target}, but {error}.") from error
 
 
 def _table(kind: str) -> dict[str, str]:

@@ -68,7 +68,7 @@ def test_tables_can_be_printed_where_the_code_page_has_no_arrows() -> None:
 
 @pytest.mark.parametrize("chosen", [{"NUMBA_CPU_NAME": "generic"}, {"NUMBA_ENABLE_AVX": "0"}])
 def test_kernels_use_no_feature_that_numba_was_told_to_leave_out(chosen: dict[str, str]) -> None:
-    code = "from rewild4d.kernels import halves, matrix; print(halves.AVAILABLE, matrix.ROWS)"
+    code = "from rewild4d.kernels import halves, matrix; print(halves.available(), matrix.ROWS)"
     environment = os.environ | chosen
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False", "4"]

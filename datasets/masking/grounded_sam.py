@@ -15,11 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rewild4d.datasets.masking import DETECTOR, SEGMENTER
 from rewild4d.datasets.masking.makers import MaskMaker, Unmasked
 from rewild4d.errors import UserError
 
-DETECTOR = "IDEA-Research/grounding-dino-tiny"
-SEGMENTER = "facebook/sam2.1-hiera-small"
 MEAN, SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 SHORTEST, LONGEST = 800, 1333
 """Grounding DINO sees frames with their shorter side at the first, unless the longer one then exceeds the second."""

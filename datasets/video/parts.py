@@ -6,19 +6,18 @@ An animal behind a pole is in parts too, so by itself nothing is left out but wh
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Literal, get_args
+from typing import get_args
 
 import cv2
 import msgspec
 import numpy as np
 
+from rewild4d.contracts import Parts
 from rewild4d.datasets.masking.masks import NOISE
 from rewild4d.datasets.video.wild import Masks, Video
 from rewild4d.errors import unknown_name
 from rewild4d.files import atomic, cache_folder, digest
 
-Parts = Literal["auto", "all", "main"]
-"""Which connected parts of a mask are the animal; auto: the main one where others stand apart from it, else all."""
 NOTE = "of masks in several parts only the one that goes on from the frame before is taken"
 APART = 0.2
 """Distance from the largest part, times the animal's length, beyond which another is not its other side of a pole."""

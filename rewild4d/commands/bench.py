@@ -1,24 +1,22 @@
 """`bench`: time the rasterizer or a training step on this machine, print a table and leave the data."""
 
+from __future__ import annotations
+
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import torch
-
-from rewild4d.benchmarks.peers import CUDA_PEERS, PEERS, installed
-from rewild4d.benchmarks.raster_bench import bench_rasterizer
-from rewild4d.benchmarks.results import Result, Row, default_path, this_machine, to_json, write_result
-from rewild4d.benchmarks.step_bench import bench_step
-from rewild4d.benchmarks.tables import markdown
-from rewild4d.benchmarks.timing import threads
 from rewild4d.commands.shared import require_writable_file
 from rewild4d.config import load_preset, parse_flags
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.machine import pick_device
 from rewild4d.ours.config import Config
-from rewild4d.rasterizer import pick_rasterizer
+
+if TYPE_CHECKING:
+    import torch
+
+    from rewild4d.benchmarks.results import Row
 
 RASTERIZER = """Time the rasterizer, forward and with backward, against peers from PyPI that run on the same device and
 against the least time that the arithmetic itself would take here. Contenders take turns within one run."""
@@ -98,6 +96,10 @@ def _rasterizer(arguments: list[str]) -> int:
         RasterizerOptions, arguments[1:], prog="rewild4d-bench bench rasterizer", description=RASTERIZER
     )
     _check(options, options.gaussians)
+    from rewild4d.benchmarks.peers import CUDA_PEERS, PEERS, installed
+    from rewild4d.benchmarks.raster_bench import bench_rasterizer
+    from rewild4d.machine import pick_device
+
     settings: dict[str, int | str | list[int]] = {
         "gaussians": list(options.gaussians), "sizes": list(options.sizes), "repeats": options.repeats,
     }  # fmt: skip
@@ -113,6 +115,9 @@ def _step(arguments: list[str]) -> int:
     options = parse_flags(StepOptions, arguments[1:], prog="rewild4d-bench bench step", description=STEP)
     _check(options, (options.gaussians,))
     load_preset("ours", Config, options.preset)  # an unknown preset is said before anything is measured
+    from rewild4d.benchmarks.step_bench import bench_step
+    from rewild4d.machine import pick_device
+
     settings: dict[str, int | str | list[int]] = {
         "gaussians": options.gaussians, "sizes": list(options.sizes), "repeats": options.repeats,
         "preset": options.preset,
@@ -145,6 +150,11 @@ def _report(
     measure: Callable[[], list[Row]],
 ) -> int:
     """Measure, write the data, print the table."""
+    from rewild4d.benchmarks.results import Result, default_path, this_machine, to_json, write_result
+    from rewild4d.benchmarks.tables import markdown
+    from rewild4d.benchmarks.timing import threads
+    from rewild4d.rasterizer import pick_rasterizer
+
     if device.type == "cuda" and pick_rasterizer("auto", device) != "triton":
         raise UserError(f"--device {device}: expected Triton, which is what is timed on a GPU; pip install triton.")
     path = options.out or default_path(arguments[0], device)

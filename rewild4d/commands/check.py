@@ -6,12 +6,8 @@ from typing import Any
 
 from rewild4d.commands.shared import open_dataset
 from rewild4d.config import parse_flags
-from rewild4d.contracts import Finding
-from rewild4d.datasets.video.mask_check import SPLIT
-from rewild4d.datasets.video.parts import Parts
+from rewild4d.contracts import Finding, Parts
 from rewild4d.errors import UserError
-from rewild4d.running.conformance import check_method
-from rewild4d.running.runner import choose_cases
 
 DESCRIPTION = """Verify a data set's folder (every fault named, not only the first), or that a method keeps its
 contract: same seed same result, save and load same pixels, resume, a clear error on an empty mask."""
@@ -58,11 +54,16 @@ def main(arguments: list[str]) -> int:
     if options.dataset is not None:
         findings = _check_data(options.dataset, options)
     else:
+        from rewild4d.running.conformance import check_method
+
         findings = check_method(str(options.method), options.preset)
     return report(findings)
 
 
 def _check_data(dataset: str, options: Options) -> list[Finding]:
+    from rewild4d.datasets.video.mask_check import SPLIT
+    from rewild4d.running.runner import choose_cases
+
     reader: Any = open_dataset(dataset, options.data, options)[1]
     if not hasattr(reader, "video"):
         if options.case:

@@ -6,17 +6,12 @@ from pathlib import Path
 
 import tyro
 
-from rewild4d.cameras.recropping import all_moments, seen_by
-from rewild4d.commands.shared import reader_of, require_writable
+from rewild4d.commands.shared import require_writable
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError
 from rewild4d.evaluation.protocol import find_protocol
-from rewild4d.io.export import KINDS, export, parse_kinds, why_not
-from rewild4d.leaderboard.records import FILE, read_record
-from rewild4d.machine import pick_device
-from rewild4d.rasterizer import pick_rasterizer, set_default
+from rewild4d.io import KINDS
 from rewild4d.registry import load_method
-from rewild4d.running import provenance
 
 DESCRIPTION = """Write a run's reconstruction as files for other programs: Gaussians of every frame (ply), an animated
 skinned mesh (glb), cameras (OpenCV axes, JSON) and films (mp4). Of a video that is every frame which shows the animal,
@@ -46,6 +41,14 @@ class Options:
 
 def main(arguments: list[str]) -> int:
     options = parse_flags(Options, arguments, prog="rewild4d-bench export", description=DESCRIPTION)
+    from rewild4d.cameras.recropping import all_moments, seen_by
+    from rewild4d.io.export import export, parse_kinds, why_not
+    from rewild4d.leaderboard.records import FILE, read_record
+    from rewild4d.machine import pick_device
+    from rewild4d.rasterizer import pick_rasterizer, set_default
+    from rewild4d.running import provenance
+    from rewild4d.running.rescoring import reader_of
+
     kinds = parse_kinds(options.what)
     device = pick_device(options.device)
     set_default(pick_rasterizer(options.rasterizer, device))

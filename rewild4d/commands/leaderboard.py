@@ -1,22 +1,21 @@
 """`leaderboard`: records of a folder as data for a repository, and as a static page."""
 
+from __future__ import annotations
+
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from rewild4d.commands.choice import chosen
 from rewild4d.commands.shared import require_writable
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.leaderboard.collect import collect, title_of
-from rewild4d.leaderboard.layout import Table
-from rewild4d.leaderboard.records import RunRecord, find_records
-from rewild4d.leaderboard.site import Part, build_site
 from rewild4d.leaderboard.specs import load_specs
-from rewild4d.leaderboard.tables import difference_table, named_table
-from rewild4d.running import planning
+
+if TYPE_CHECKING:
+    from rewild4d.leaderboard.layout import Table
+    from rewild4d.leaderboard.records import RunRecord
 
 BUILD = """Make a static page from records alone: a sortable table per protocol, the named tables that have records, and
 a page per run with its settings, provenance, curves over time and pictures. Every folder of runs is a part of its own,
@@ -75,6 +74,10 @@ def main(arguments: list[str]) -> int:
 
 def build(arguments: list[str]) -> int:
     options = parse_flags(BuildOptions, arguments, prog="rewild4d-bench leaderboard build", description=BUILD)
+    from rewild4d.leaderboard.collect import title_of
+    from rewild4d.leaderboard.records import find_records
+    from rewild4d.leaderboard.site import Part, build_site
+
     parts = []
     for folder in options.runs:
         found = find_records(folder)
@@ -86,6 +89,9 @@ def build(arguments: list[str]) -> int:
 
 def collect_runs(arguments: list[str]) -> int:
     options = parse_flags(CollectOptions, arguments, prog="rewild4d-bench leaderboard collect", description=COLLECT)
+    from rewild4d.leaderboard.collect import collect
+    from rewild4d.leaderboard.records import find_records
+
     found = [pair for folder in options.runs for pair in find_records(folder)]
     _require_records(options.runs, found)
     out = options.out.absolute()
@@ -105,6 +111,10 @@ def _require_records(folders: tuple[Path, ...], found: Sequence[object]) -> None
 def _named(records: list[RunRecord], preset: str) -> list[tuple[Table, ...]]:
     """The named tables that compare something, each with the differences to `REFERENCE`: two rows that are no floors
     have records under every condition, and not the same ones."""
+    from rewild4d.commands.choice import chosen
+    from rewild4d.leaderboard.tables import difference_table, named_table
+    from rewild4d.running import planning
+
     tables: list[tuple[Table, ...]] = []
     for name, spec in load_specs().items():
         full = chosen(name, spec, planning.Choice(preset=preset))

@@ -5,9 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rewild4d.config import parse_flags
-from rewild4d.datasets.rigs.studio import make_artemis
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.progress import Progress
 
 LONGEST_SIDE = 8192
 """Of an image in pixels."""
@@ -47,6 +45,9 @@ def main(arguments: list[str]) -> int:
     for flag, value in (("--views", options.views), ("--frames", options.frames)):
         if value < 1:
             raise UserError(f"{flag}: expected a number of at least 1, got {value}.")
+    from rewild4d.datasets.rigs.studio import make_artemis
+    from rewild4d.progress import Progress
+
     progress = Progress(f"{options.rig.name}: {options.clip}")
     made = make_artemis(
         options.rig, options.clip, views=options.views, frames=options.frames, width=width, height=height,

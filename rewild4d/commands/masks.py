@@ -1,22 +1,21 @@
 """`masks`: masks of the animal for a video that has none."""
 
+from __future__ import annotations
+
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import TYPE_CHECKING, Any
 
 from rewild4d.commands.shared import open_dataset, require_writable
 from rewild4d.config import parse_flags
-from rewild4d.datasets.masking.grabcut import rough_masks
-from rewild4d.datasets.masking.grounded_sam import DETECTOR, SEGMENTER, grounded_masks
-from rewild4d.datasets.masking.makers import MaskMaker, parse_boxes, run_program, write_masks
-from rewild4d.datasets.masking.masks import list_images
-from rewild4d.datasets.video.mask_check import SPLIT
+from rewild4d.datasets.masking import DETECTOR, SEGMENTER
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.machine import pick_device
-from rewild4d.running.runner import choose_cases
+
+if TYPE_CHECKING:
+    import torch
+
+    from rewild4d.datasets.masking.makers import MaskMaker
 
 DESCRIPTION = """Make masks of the animal. --tool program runs any command that reads a folder of frames and writes a
 folder of masks; --tool grounded-sam2 uses Grounding DINO and SAM 2 (pip install -e '.[masks]'; their weights are on
@@ -65,6 +64,12 @@ class Options:
 
 def main(arguments: list[str]) -> int:
     options = parse_flags(Options, arguments, prog="rewild4d-bench masks", description=DESCRIPTION)
+    from rewild4d.datasets.masking.makers import parse_boxes, write_masks
+    from rewild4d.datasets.masking.masks import list_images
+    from rewild4d.datasets.video.mask_check import SPLIT
+    from rewild4d.machine import pick_device
+    from rewild4d.running.runner import choose_cases
+
     device = pick_device(options.device)
     maker = make_maker(options, device)
     reader: Any = open_dataset(options.dataset, options.data, options)[1]
@@ -92,6 +97,10 @@ def make_maker(options: Options, device: torch.device) -> MaskMaker:
     Raises:
         UserError: an unknown one, or one that lacks a command or a package.
     """
+    from rewild4d.datasets.masking.grabcut import rough_masks
+    from rewild4d.datasets.masking.grounded_sam import grounded_masks
+    from rewild4d.datasets.masking.makers import run_program
+
     if options.tool not in TOOLS:
         raise unknown_name("tool", options.tool, TOOLS)
     if options.tool == "program":

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 from rewild4d.config import parse_flags, preset_names
 from rewild4d.errors import UserError
-from rewild4d.evaluation.protocol import find_protocol, load_protocols
+from rewild4d.evaluation.protocol import default_name, load_protocols
 from rewild4d.leaderboard.specs import load_specs
-from rewild4d.registry import BUILTIN, load_dataset, load_method, names
+from rewild4d.registry import BUILTIN, dataset_title, method_info, names
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,11 @@ def main(arguments: list[str]) -> int:
     print("data sets")
     for name in names("datasets"):
         made = "; built-in animals are made where --data is left out" if name in BUILTIN else ""
-        print(f"  {name:<12} {_said(_dataset, name)}{made}")
+        print(f"  {name:<12} {_said(dataset_title, name)}{made}")
     print("protocols")
-    for name, protocol in load_protocols().items():
-        chosen = protocol.default and find_protocol(protocol.dataset, None).name == name
+    protocols = load_protocols()
+    for name, protocol in protocols.items():
+        chosen = name == default_name(protocol.dataset, protocols)
         print(f"  {name:<24} {protocol.title}" + (" (default)" if chosen else ""))
     print("tables")
     for name, spec in load_specs().items():
@@ -45,10 +46,5 @@ def _said(describe: Callable[[str], str], name: str) -> str:
 
 
 def _method(name: str) -> str:
-    info = load_method(name).info
+    info = method_info(name)
     return info.title + (f" ({info.paper})" if info.paper else "") + f"; licence {info.licence}"
-
-
-def _dataset(name: str) -> str:
-    first, *_ = (load_dataset(name).__doc__ or "no description").strip().splitlines()
-    return first.rstrip(".")

@@ -1,29 +1,21 @@
 """`prior fit` and `prior import`: a posed template for real footage, as an npz and as pictures to judge it by."""
 
+from __future__ import annotations
+
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rewild4d.commands.shared import require_writable_file
 from rewild4d.config import parse_flags
-from rewild4d.contracts import Selection
-from rewild4d.datasets.video.online import Online
-from rewild4d.datasets.video.parts import Parts
-from rewild4d.datasets.video.whole_frames import whole_clip
+from rewild4d.contracts import Parts, Selection
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.priors.choose import Use, split_marks
-from rewild4d.priors.config import FOOTAGE
-from rewild4d.priors.fauna import read_fauna
-from rewild4d.priors.fauna_files import LARGEST
-from rewild4d.priors.footage import Evidence, fit_footage
-from rewild4d.priors.io import save_prior, seal
-from rewild4d.priors.judge import doubts, joint_scores
-from rewild4d.priors.landmarks import Marks, load_mapping, marks
-from rewild4d.priors.overlay import save_overlay
-from rewild4d.priors.placing import resized
-from rewild4d.priors.steady import without_hops
-from rewild4d.progress import Progress
-from rewild4d.types import Clip, Prior
+from rewild4d.priors.config import FOOTAGE, Use
+
+if TYPE_CHECKING:
+    from rewild4d.priors.landmarks import Marks
+    from rewild4d.types import Clip, Prior
 
 USAGE = """usage: rewild4d-bench prior fit --frames DIR --masks DIR --out prior.npz [--keypoints FILE --mapping NAME]
        rewild4d-bench prior import --files DIR --out prior.npz"""
@@ -99,6 +91,10 @@ def main(arguments: list[str]) -> int:
 
 
 def _import(options: ImportOptions) -> None:
+    from rewild4d.priors.fauna import read_fauna
+    from rewild4d.priors.fauna_files import LARGEST
+    from rewild4d.priors.io import save_prior
+
     if not options.fps > 0:
         raise UserError(f"--fps: expected a number above 0, got {options.fps:g}.")
     if not 0 < options.size <= LARGEST:
@@ -111,6 +107,17 @@ def _import(options: ImportOptions) -> None:
 def _fit(options: FitOptions) -> None:
     if (options.keypoints is None) != (options.mapping is None):
         raise UserError("--keypoints and --mapping: expected both or neither.")
+    from rewild4d.datasets.video.online import Online
+    from rewild4d.datasets.video.whole_frames import whole_clip
+    from rewild4d.priors.choose import split_marks
+    from rewild4d.priors.footage import Evidence, fit_footage
+    from rewild4d.priors.io import save_prior, seal
+    from rewild4d.priors.judge import joint_scores
+    from rewild4d.priors.landmarks import load_mapping
+    from rewild4d.priors.overlay import save_overlay
+    from rewild4d.priors.placing import resized
+    from rewild4d.progress import Progress
+
     mapping = load_mapping(options.mapping) if options.mapping else {}
     reader = Online(
         options.frames, masks=options.masks, fps=options.fps, keypoints=options.keypoints, parts=options.parts
@@ -133,6 +140,8 @@ def _fit(options: FitOptions) -> None:
 
 
 def _marks(options: FitOptions, clip: Clip, mapping: dict[str, str]) -> Marks:
+    from rewild4d.priors.landmarks import marks
+
     found = [frame.keypoints for frame in clip.frames]
     result = marks(found, mapping)
     if options.keypoints is not None and not len(result):
@@ -145,6 +154,9 @@ def _marks(options: FitOptions, clip: Clip, mapping: dict[str, str]) -> Marks:
 
 
 def _tell(prior: Prior, written: list[Path]) -> None:
+    from rewild4d.priors.judge import doubts
+    from rewild4d.priors.steady import without_hops
+
     for name in ("mask_iou", "mask_iou_flip", "facing_margin", "facing_agreement", "pck", "facing"):
         if name in prior.quality:
             print(f"{name:16} {prior.quality[name]:.3f}")

@@ -1,13 +1,12 @@
 """`run`: fit a method on a data set and score it on views it never saw."""
 
+from __future__ import annotations
+
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import msgspec
-
-from rewild4d.commands import run_table
 from rewild4d.commands.shared import (
     check_numbers,
     check_seeds,
@@ -17,18 +16,18 @@ from rewild4d.commands.shared import (
     open_dataset,
     require_writable,
 )
-from rewild4d.config import load_preset, parse_flags, with_method_flags
-from rewild4d.datasets.video.parts import Parts
+from rewild4d.config import load_preset, parse_flags
+from rewild4d.contracts import Parts
 from rewild4d.errors import UserError
 from rewild4d.evaluation.protocol import find_protocol
-from rewild4d.leaderboard.records import RunRecord, to_json
-from rewild4d.leaderboard.tables import markdown
-from rewild4d.machine import pick_device
-from rewild4d.priors.choose import Use
-from rewild4d.rasterizer import pick_rasterizer
-from rewild4d.registry import load_dataset, load_method
-from rewild4d.running.runner import Entry, Plan, choose_cases, execute
-from rewild4d.running.workers import usable_cores
+from rewild4d.priors.config import Use
+from rewild4d.registry import load_config, load_method, require_name
+
+if TYPE_CHECKING:
+    import msgspec
+
+    from rewild4d.leaderboard.records import RunRecord
+    from rewild4d.running.runner import Plan
 
 DESCRIPTION = """Fit a method on every case of a data set and score it on the views that it never saw.
 Finished runs are skipped and a killed one resumes. Without --data the built-in animals are made on first use.
@@ -99,15 +98,20 @@ class Options:
 def main(arguments: list[str]) -> int:
     """Run the command; 0 where every run has scores, 1 where one failed, 2 where a case cannot be read."""
     if any(word.split("=")[0] == "--table" for word in arguments):
+        from rewild4d.commands import run_table
+
         return run_table.main(arguments)
     wanted = _peek(arguments, "--method") or Options.method
     preset = _peek(arguments, "--preset") or Options.preset
-    method = load_method(wanted)
-    options_type = with_method_flags(Options, load_preset(wanted, method.Config, preset))
     options: Any = parse_flags(
-        options_type, arguments, prog="rewild4d-bench run", description=DESCRIPTION, also=["--table"]
-    )
+        Options, arguments, prog="rewild4d-bench run", description=DESCRIPTION,
+        config=load_preset(wanted, load_config(wanted), preset), also=["--table"],
+    )  # fmt: skip
     plan = make_plan(options, options.config)
+    from rewild4d.leaderboard.records import to_json
+    from rewild4d.leaderboard.tables import markdown
+    from rewild4d.running.runner import execute
+
     records = execute(plan)
     if options.json:
         print("[" + ",\n".join(to_json(record) for record in records) + "]")
@@ -123,14 +127,19 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
     Raises:
         UserError: an unknown name, a folder that is not there or cannot be written.
     """
-    device = pick_device(options.device)
-    rasterizer = pick_rasterizer(options.rasterizer, device)
-    load_dataset(options.dataset)  # an unknown data set is the first thing to say
+    require_name("datasets", options.dataset)
     protocol = find_protocol(options.dataset, options.protocol)
     check_numbers(options.jobs, options.threads)
     if not options.seeds:
         raise UserError("--seeds: expected at least one number, got none.")
     check_seeds(options.seeds)
+    from rewild4d.machine import pick_device
+    from rewild4d.rasterizer import pick_rasterizer
+    from rewild4d.running.runner import Entry, Plan, choose_cases
+    from rewild4d.running.workers import usable_cores
+
+    device = pick_device(options.device)
+    rasterizer = pick_rasterizer(options.rasterizer, device)
     require_writable(options.out)
     root, reader = open_dataset(options.dataset, options.data, options)
     names = reader.cases(protocol.selection)

@@ -1,13 +1,15 @@
 """`run --table NAME`: plan what a table needs, run what is missing, print it."""
 
+from __future__ import annotations
+
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
-from rewild4d.commands.choice import cases_of, chosen
 from rewild4d.commands.shared import (
     check_numbers,
     check_seeds,
@@ -18,21 +20,16 @@ from rewild4d.commands.shared import (
     require_writable,
 )
 from rewild4d.config import parse_flags
-from rewild4d.contracts import DatasetReader
-from rewild4d.datasets.video.parts import Parts
+from rewild4d.contracts import DatasetReader, Parts
 from rewild4d.errors import UserError
 from rewild4d.evaluation.protocol import Protocol
-from rewild4d.leaderboard.formats import markdown
-from rewild4d.leaderboard.layout import Table
-from rewild4d.leaderboard.records import RunRecord, to_json
 from rewild4d.leaderboard.specs import Spec, find_spec, load_specs
-from rewild4d.leaderboard.tables import named_table
-from rewild4d.machine import pick_device
-from rewild4d.rasterizer import pick_rasterizer
-from rewild4d.registry import load_dataset
-from rewild4d.running import planning
-from rewild4d.running.runner import Entry, Plan, choose_cases, execute, pieces
-from rewild4d.running.workers import usable_cores
+from rewild4d.registry import require_name
+
+if TYPE_CHECKING:
+    from rewild4d.leaderboard.layout import Table
+    from rewild4d.leaderboard.records import RunRecord
+    from rewild4d.running.runner import Entry, Plan
 
 DESCRIPTION = """Fit what a table of leaderboard/tables (see `list`) needs and has no record for yet, on every case, and
 print it. Finished runs are skipped and a killed one resumes."""
@@ -96,6 +93,12 @@ def main(arguments: list[str]) -> int:
         arguments = ["--help"]
     options = parse_flags(Options, arguments, prog="rewild4d-bench run", description=DESCRIPTION)
     found = find_spec(options.table)
+    from rewild4d.commands.choice import chosen
+    from rewild4d.leaderboard.formats import markdown
+    from rewild4d.leaderboard.records import to_json
+    from rewild4d.running import planning
+    from rewild4d.running.runner import execute
+
     spec = chosen(options.table, found, planning.Choice(options.preset, options.protocol))
     plans = make_plans(options, spec)
     if options.plan:
@@ -120,9 +123,15 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
     """
     check_numbers(options.jobs, options.threads)
     check_seeds(options.seeds)
+    require_name("datasets", spec.dataset)
+    from rewild4d.machine import pick_device
+    from rewild4d.rasterizer import pick_rasterizer
+    from rewild4d.running import planning
+    from rewild4d.running.runner import Plan
+    from rewild4d.running.workers import usable_cores
+
     device = pick_device(options.device)
     rasterizer = pick_rasterizer(options.rasterizer, device)
-    load_dataset(spec.dataset)
     protocols = {one.protocol: planning.protocol_of(spec, one.protocol) for one in spec.conditions}
     entries = planning.entries(options.table, spec, tuple(dict.fromkeys(options.seeds or spec.seeds)))
     require_writable(options.out)
@@ -146,6 +155,9 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
 
 def _cases(options: Options, reader: DatasetReader, protocol: Protocol, patterns: Sequence[str]) -> tuple[str, ...]:
     """What the table wants and the data has; where the table wants all, what `run` takes by itself."""
+    from rewild4d.commands.choice import cases_of
+    from rewild4d.running.runner import choose_cases
+
     preferred = getattr(reader, "default_cases", None)
     free = not patterns and not options.case
     names = preferred(protocol.selection) if preferred and free else reader.cases(protocol.selection)
@@ -156,6 +168,9 @@ def _cases(options: Options, reader: DatasetReader, protocol: Protocol, patterns
 
 
 def _table(options: Options, spec: Spec, records: list[RunRecord]) -> Table:
+    from rewild4d.leaderboard.tables import named_table
+    from rewild4d.running import planning
+
     rows, remarks = planning.entrants(options.table, spec, records)
     frame = replace(planning.frame(options.table, spec), remarks=tuple(remarks))
     return named_table(frame, rows, planning.reported(spec))
@@ -163,6 +178,8 @@ def _table(options: Options, spec: Spec, records: list[RunRecord]) -> Table:
 
 def _print_plan(plan: Plan, labels: dict[str, str]) -> None:
     """One line a run: whether it has a good record, its row, its folder."""
+    from rewild4d.running.runner import pieces
+
     for job in pieces(plan):
         label = labels.get(_key(job.entry), job.entry.method)
         print("done   " if job.finished() else "missing", f"{label:<20} {job.folder}")

@@ -1,21 +1,20 @@
 """`score`: the metrics on anybody's results, without our methods."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from rewild4d.commands.shared import require_writable_file
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.evaluation.cloud_scoring import score_clouds
-from rewild4d.evaluation.folders import score_pictures
-from rewild4d.evaluation.networks import FAMILIES, load_networks
-from rewild4d.evaluation.pairing import Inputs
-from rewild4d.evaluation.reports import Report, markdown, to_json
 from rewild4d.files import write_text
-from rewild4d.machine import pick_device
-from rewild4d.metrics.samples import Progress as ShowProgress
-from rewild4d.progress import Progress
+
+if TYPE_CHECKING:
+    from rewild4d.evaluation.reports import Report
+    from rewild4d.metrics.samples import Progress as ShowProgress
+    from rewild4d.progress import Progress
 
 DESCRIPTION = """Score a folder of images or clips, or a .ply file, against the truth. Images are matched by file name,
 clips (subfolders of frames, or videos) by their own; nothing is resized or cropped."""
@@ -60,6 +59,8 @@ def main(arguments: list[str]) -> int:
     options = parse_flags(Options, arguments, prog="rewild4d-bench score", description=DESCRIPTION)
     if options.out is not None:
         require_writable_file(options.out)
+    from rewild4d.evaluation.reports import markdown, to_json
+
     report = score(options)
     if options.out is not None:
         write_text(options.out, to_json(report) + "\n")
@@ -73,6 +74,12 @@ def score(options: Options) -> Report:
     Raises:
         UserError: a value out of range, a name that is unknown, or a path that cannot be used.
     """
+    from rewild4d.evaluation.cloud_scoring import score_clouds
+    from rewild4d.evaluation.folders import score_pictures
+    from rewild4d.evaluation.networks import FAMILIES, load_networks
+    from rewild4d.evaluation.pairing import Inputs
+    from rewild4d.machine import pick_device
+
     device = pick_device(options.device)
     clouds = [path.suffix.lower() == ".ply" for path in (options.pred, options.truth)]
     if any(clouds):
@@ -116,6 +123,8 @@ class _Bar:
         self.shown: Progress | None = None
 
     def begin(self, title: str) -> ShowProgress:
+        from rewild4d.progress import Progress
+
         self.close()
         self.shown = Progress(title)
         return self.shown

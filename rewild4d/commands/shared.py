@@ -1,22 +1,22 @@
 """What several commands ask of folders, numbers and floors."""
 
+from __future__ import annotations
+
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-import msgspec
+from typing import TYPE_CHECKING, Any
 
 from rewild4d.config import load_preset, preset_names
-from rewild4d.contracts import DatasetReader
 from rewild4d.errors import UserError
-from rewild4d.leaderboard.records import RunRecord
-from rewild4d.priors.choose import PriorChoice, Use
-from rewild4d.priors.config import PRESETS, STANDARD
-from rewild4d.priors.landmarks import load_mapping
-from rewild4d.progress import Progress
-from rewild4d.registry import load_builtin, load_dataset, load_method
-from rewild4d.running.runner import Entry, Plan
+from rewild4d.priors.config import PRESETS, STANDARD, Use
+from rewild4d.registry import load_builtin, load_config, load_dataset
+
+if TYPE_CHECKING:
+    from rewild4d.contracts import DatasetReader
+    from rewild4d.leaderboard.records import RunRecord
+    from rewild4d.priors.choose import PriorChoice
+    from rewild4d.running.runner import Entry, Plan
 
 SOURCE_FLAGS = ("masks", "parts", "start", "end", "fps", "keypoints")
 """Flags that a reader takes if its `options` name them."""
@@ -50,6 +50,8 @@ def open_dataset(dataset: str, data: Path | None, options: Any = None) -> tuple[
     if make_builtin is None:
         named = "--video" if dataset == "online" else "--data"
         raise UserError(f"{named}: the data set '{dataset}' has no built-in data; name its file or folder.")
+    from rewild4d.progress import Progress
+
     progress = Progress("built-in animals")
     root = make_builtin(progress)
     progress.close()
@@ -69,6 +71,9 @@ def choose_prior(name: str, preset: str, reader: DatasetReader, options: Any = N
         UserError: a prior file that cannot be used or a noise that is none; a file of keypoints without a mapping, a
             mapping without keypoints, or one that is not known.
     """
+    from rewild4d.priors.choose import PriorChoice
+    from rewild4d.priors.landmarks import load_mapping
+
     file, mapping, use = (getattr(options, flag, None) for flag in ("keypoints", "mapping", "use_keypoints"))
     own = getattr(reader, "keypoint_mapping", None)
     if (file is not None and mapping is None) or (file is None and mapping is not None and own is None):
@@ -82,29 +87,6 @@ def choose_prior(name: str, preset: str, reader: DatasetReader, options: Any = N
     choice = PriorChoice(name, PRESETS.get(preset, STANDARD), chosen, use or default)
     choice.require()
     return choice
-
-
-def reader_of(run: Path, record: RunRecord, data: Path | None) -> DatasetReader:
-    """The reader of the data that a run was fitted to.
-
-    Args:
-        run: folder of the run.
-        record: of the run.
-        data: where the data is now; None: where the record says.
-
-    Raises:
-        UserError: the record does not say where or how it was read, or the data is not there any more.
-    """
-    reader, root = load_dataset(record.dataset), data or record.data.get("root")
-    if not root:
-        raise UserError(f"{run}: expected a record that names the folder of its data; --data names one.")
-    try:
-        settings = msgspec.json.decode(record.data.get("settings", "{}"), type=dict[str, Any])
-    except msgspec.MsgspecError as error:
-        raise UserError(f"{run}: expected the record's data.settings to be a JSON object, but: {error}.") from error
-    if unknown := sorted(set(settings) - {*getattr(reader, "options", ())}):
-        raise UserError(f"{run}: expected settings that data set {record.dataset} has, got {', '.join(unknown)}.")
-    return reader(Path(root), **settings)
 
 
 def require_writable(folder: Path) -> None:
@@ -141,8 +123,9 @@ def check_seeds(seeds: Sequence[int]) -> None:
 
 def floor_entry(name: str) -> Entry:
     """A floor as a row of a plan: its first preset, one seed."""
-    presets = preset_names(name)
-    config_type = load_method(name).Config
+    from rewild4d.running.runner import Entry
+
+    presets, config_type = preset_names(name), load_config(name)
     return Entry(name, "default", load_preset(name, config_type, presets[0]) if presets else config_type(), (0,))
 
 

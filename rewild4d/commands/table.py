@@ -1,22 +1,20 @@
 """`table`: what was found, from records alone."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from rewild4d.commands.choice import chosen
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.leaderboard.formats import FORMATS
-from rewild4d.leaderboard.layout import Table
-from rewild4d.leaderboard.pooled import pooled_table, pooled_tables
-from rewild4d.leaderboard.records import RunRecord, find_records
 from rewild4d.leaderboard.specs import find_spec
-from rewild4d.leaderboard.tables import difference_table, named_table, protocol_tables
-from rewild4d.running import planning
-from rewild4d.running.runner import choose_cases
+
+if TYPE_CHECKING:
+    from rewild4d.leaderboard.layout import Table
+    from rewild4d.leaderboard.records import RunRecord
 
 DESCRIPTION = """Print what was found, from the records in a folder: with a name one of the tables in leaderboard/tables
 (see `list`), rows averaged over the cases, the best bold, the second underlined; without one everything, a table per
@@ -51,6 +49,8 @@ class Options:
 
 def main(arguments: list[str]) -> int:
     options = parse_flags(Options, arguments, prog="rewild4d-bench table", description=DESCRIPTION)
+    from rewild4d.leaderboard.formats import FORMATS
+
     if options.format not in FORMATS:
         raise unknown_name("format", options.format, FORMATS)
     if len(options.name) > 1:
@@ -66,6 +66,10 @@ def main(arguments: list[str]) -> int:
 
 
 def _everything(options: Options) -> list[Table]:
+    from rewild4d.leaderboard.pooled import pooled_tables
+    from rewild4d.leaderboard.tables import protocol_tables
+    from rewild4d.running import planning
+
     found = _found(options)
     if options.protocol:
         there = sorted({record.protocol["name"] for _, record in found})
@@ -77,6 +81,11 @@ def _everything(options: Options) -> list[Table]:
 
 
 def _named(options: Options) -> list[Table]:
+    from rewild4d.commands.choice import chosen
+    from rewild4d.leaderboard.pooled import pooled_table
+    from rewild4d.leaderboard.tables import difference_table, named_table
+    from rewild4d.running import planning
+
     name = options.name[0]
     choice = planning.Choice(options.preset, options.protocol)
     spec = chosen(name, find_spec(name), choice)
@@ -97,6 +106,9 @@ def _named(options: Options) -> list[Table]:
 
 def _found(options: Options) -> list[tuple[Path, RunRecord]]:
     """The records of the chosen cases, each with its folder."""
+    from rewild4d.leaderboard.records import find_records
+    from rewild4d.running.runner import choose_cases
+
     found = find_records(options.runs)
     cases = choose_cases(list(dict.fromkeys(record.case for _, record in found)), options.case)
     return [pair for pair in found if pair[1].case in cases]

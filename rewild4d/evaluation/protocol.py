@@ -1,5 +1,6 @@
 """Evaluation protocols: a TOML file names what is held out and what is measured."""
 
+from collections.abc import Mapping
 from importlib import metadata, resources
 from importlib.resources.abc import Traversable
 from typing import Literal
@@ -111,6 +112,12 @@ def _decode(file: Traversable) -> Protocol:
     return msgspec.toml.decode(file.read_bytes(), type=Protocol)
 
 
+def default_name(dataset: str, protocols: Mapping[str, Protocol]) -> str | None:
+    """Return the name of a data set's default protocol, or None where it has none."""
+    names = [name for name, protocol in protocols.items() if protocol.dataset == dataset and protocol.default]
+    return max(names, key=lambda name: int(name.rpartition("-v")[2]), default=None)
+
+
 def find_protocol(dataset: str, name: str | None) -> Protocol:
     """The protocol of that name, or the data set's default.
 
@@ -119,8 +126,7 @@ def find_protocol(dataset: str, name: str | None) -> Protocol:
     """
     protocols = load_protocols()
     if name is None:
-        names = [p.name for p in protocols.values() if p.dataset == dataset and p.default]
-        name = max(names, key=lambda text: int(text.rpartition("-v")[2]), default=None)
+        name = default_name(dataset, protocols)
         if name is None:
             raise UserError(f"--protocol: the data set '{dataset}' has no default; name one of its protocols.")
     if name not in protocols:

@@ -15,13 +15,12 @@ from rewild4d.cameras.input_view import input_camera
 from rewild4d.contracts import Articulated, Reconstruction
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import write_text
+from rewild4d.io import KINDS
 from rewild4d.io.ply import write_splats
 from rewild4d.io.skinned_glb import SEEN, shown, write_glb
 from rewild4d.types import Camera, Clip, Frame
 from rewild4d.visualize.pictures import film_rate, over, save_mp4
 from rewild4d.visualize.turntable import find_stance, turn
-
-KINDS = ("ply", "glb", "cameras", "mp4")
 
 
 def parse_kinds(text: str) -> tuple[str, ...]:

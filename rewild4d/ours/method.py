@@ -6,6 +6,7 @@ from typing import ClassVar
 import torch
 
 from rewild4d.contracts import Log, MethodInfo
+from rewild4d.ours import INFO
 from rewild4d.ours.config import Config as OursConfig
 from rewild4d.ours.fit import train
 from rewild4d.ours.reconstruction import OursReconstruction, from_fit, load_reconstruction
@@ -17,11 +18,7 @@ from rewild4d.types import Clip, Prior
 class Ours:
     """Part-aware canonical Gaussians with mirrored supervision (contracts.Method)."""
 
-    info: ClassVar[MethodInfo] = MethodInfo(
-        title="ours",
-        paper="Progressive Pose-Guided 4D Animal Reconstruction from Monocular Video; its code is not public",
-        licence="MIT",
-    )
+    info: ClassVar[MethodInfo] = INFO
     Config: ClassVar[type[OursConfig]] = OursConfig
 
     def fit(

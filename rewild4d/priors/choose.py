@@ -3,7 +3,6 @@
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import msgspec
 import torch
@@ -13,7 +12,7 @@ from rewild4d.errors import UserError
 from rewild4d.files import digest
 from rewild4d.machine import code_version
 from rewild4d.priors.coarse import coarse_prior
-from rewild4d.priors.config import FOOTAGE, PriorConfig
+from rewild4d.priors.config import FOOTAGE, PriorConfig, Use
 from rewild4d.priors.fit import fit_template
 from rewild4d.priors.footage import Evidence, fit_footage
 from rewild4d.priors.io import load_prior, save_prior, seal
@@ -30,9 +29,6 @@ PRIOR_SEED = 0
 
 ELSEWHERE = "made elsewhere: it may have seen the frames that are held out here"
 OTHER_BONES = "keypoints are not scored: their mapping names bones of the template's skeleton, and this is another"
-
-Use = Literal["all", "half", "none"]
-"""Frames whose keypoints a fit sees: all; every other one, and the rest is scored; none, and all are scored."""
 
 
 @dataclass(frozen=True)

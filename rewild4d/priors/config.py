@@ -1,6 +1,11 @@
 """Every choice of the template fit."""
 
+from typing import Literal
+
 import msgspec
+
+Use = Literal["all", "half", "none"]
+"""Frames whose keypoints a fit sees: all; every other one, and the rest is scored; none, and all are scored."""
 
 
 class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -7,13 +7,14 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from queue import SimpleQueue
-from threading import Thread
+from threading import Event, Thread
 from typing import Any, NamedTuple, TypeVar
 
 import torch
 
 from rewild4d.kernels.threads import set_kernel_threads
 from rewild4d.rasterizer import set_default
+from rewild4d.running.interrupts import answer_interrupts, block_interrupts
 
 T = TypeVar("T")
 MOST_THREADS = 4
@@ -86,27 +87,41 @@ class Workers:
             lost: called here with the piece whose process ended under it; its result stands for the piece's.
         """
 
+        stopped = Event()
+
         def work(piece: tuple[Any, ...]) -> T:
             pool = self._free.get()
             try:
-                return pool.submit(function, *piece).result()
+                return pool.submit(_piece, function, piece).result()
             except BrokenProcessPool:
                 pool.shutdown()
                 pool = self._pool()
+                if stopped.wait(0.5):  # Ctrl-C reaches all processes of a terminal, and a worker may end first
+                    raise KeyboardInterrupt from None
                 return lost(*piece)
             finally:
                 self._free.put(pool)
 
-        with ThreadPoolExecutor(self._jobs) as threads:
-            return list(threads.map(work, pieces))
+        with ThreadPoolExecutor(self._jobs, initializer=block_interrupts, initargs=(True,)) as threads:
+            try:
+                return list(threads.map(work, pieces))
+            except KeyboardInterrupt:
+                stopped.set()
+                raise
 
     def _pool(self) -> ProcessPoolExecutor:
         """A process that starts with its first piece."""
         return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), start_worker, self._setup)
 
 
+def _piece(function: Callable[..., T], piece: tuple[Any, ...]) -> T:
+    return function(*piece)
+
+
 def start_worker(threads: Threads, rasterizer: str) -> None:
     """Threads of its own, and an end with its parent: an orphan would write into the folder of the next start."""
+    answer_interrupts(_piece.__code__)
+    block_interrupts(False)  # an interpreter that starts prints pages about it
     _settle(threads, rasterizer)
 
     def watch() -> None:

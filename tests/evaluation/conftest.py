@@ -7,7 +7,6 @@ from calling import output
 from extractors import LinearNetwork, LinearVideoNetwork, SquaredError
 from pictures import Call
 
-from rewild4d.commands import score as command
 from rewild4d.evaluation.networks import Networks
 
 
@@ -15,7 +14,7 @@ from rewild4d.evaluation.networks import Networks
 def networks(monkeypatch: pytest.MonkeyPatch) -> Networks:
     """Small networks that `score` loads."""
     made = Networks({"lpips_alex": SquaredError(), "lpips_vgg": SquaredError()}, LinearNetwork(), LinearVideoNetwork())
-    monkeypatch.setattr(command, "load_networks", lambda families, device: made)
+    monkeypatch.setattr("rewild4d.evaluation.networks.load_networks", lambda families, device: made)
     return made
 
 

@@ -14,13 +14,13 @@ from rewild4d.baselines.gart_reconstruction import SEEN, GartStarReconstruction
 from rewild4d.baselines.gart_skeleton import prior_poses
 from rewild4d.cameras.recropping import seen_by
 from rewild4d.cameras.rendering import render
-from rewild4d.commands.evaluate import Options, score_again
 from rewild4d.datasets.video.online import Online
 from rewild4d.evaluation.refining import ready_to_score
 from rewild4d.leaderboard.tables import markdown
 from rewild4d.registry import load_method
 from rewild4d.running import runner
 from rewild4d.running.conformance import tiny_case
+from rewild4d.running.rescoring import score_again
 from rewild4d.transforms import transform_splats
 from rewild4d.types import Case, Frame, Splats, Truth
 
@@ -139,11 +139,11 @@ def test_a_run_says_that_the_row_has_seen_the_test_image(tmp_path: Path, monkeyp
     # What the fit left is of the shown frames alone; scored again it is refined again.
     saved = load_method("gart-star").load(folder / "reconstruction", CPU)
     assert isinstance(saved, GartStarReconstruction) and len(saved.poses.turns) == 10
-    monkeypatch.setattr("rewild4d.commands.evaluate.find_protocol", lambda *_: PROTOCOL)
-    again = score_again(folder, Options(runs=(folder,), data=tmp_path / "clip"))
+    monkeypatch.setattr("rewild4d.running.rescoring.find_protocol", lambda *_: PROTOCOL)
+    again = score_again(folder, tmp_path / "clip")
     assert again.scores == star.scores and again.marks == star.marks
-    monkeypatch.setattr("rewild4d.commands.evaluate.ready_to_score", lambda *given: (given[0], *seen_by(*given[:4])))
-    unrefined = score_again(folder, Options(runs=(folder,), data=tmp_path / "clip"))
+    monkeypatch.setattr("rewild4d.running.rescoring.ready_to_score", lambda *given: (given[0], *seen_by(*given[:4])))
+    unrefined = score_again(folder, tmp_path / "clip")
     assert SEEN not in unrefined.marks
     seen, unseen = again.scores["psnr"].value, unrefined.scores["psnr"].value
     assert seen is not None and unseen is not None and seen > unseen

@@ -12,7 +12,6 @@ import torch
 from pictures import GREY, Call, clips, flat, noise, refused, with_alpha, write
 
 from rewild4d import cli
-from rewild4d.commands import score as command
 from rewild4d.evaluation.networks import FAMILIES, Networks, load_networks
 from rewild4d.metrics.image import PSNR_CAP
 
@@ -208,7 +207,7 @@ def test_missing_weights_leave_the_other_scores(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     none = Networks(missing=dict.fromkeys(("lpips-alex", "lpips-vgg", "kid", "fvd"), FETCH))
-    monkeypatch.setattr(command, "load_networks", lambda families, device: none)
+    monkeypatch.setattr("rewild4d.evaluation.networks.load_networks", lambda families, device: none)
     clips(tmp_path / "p", "ab", 9, 0)
     with pytest.raises(SystemExit) as stop:
         cli.main(["score", "--pred", str(tmp_path / "p"), "--truth", str(tmp_path / "p")])

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from pictures import clips, flat, noise, refused, write
 
-from rewild4d.commands import score as command
 from rewild4d.evaluation.networks import Networks
 
 
@@ -15,7 +14,9 @@ from rewild4d.evaluation.networks import Networks
 def no_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing here gets as far as a network."""
     missing = dict.fromkeys(("lpips-alex", "lpips-vgg", "kid", "fvd"), "none in this test")
-    monkeypatch.setattr(command, "load_networks", lambda families, device: Networks(missing=missing))
+    monkeypatch.setattr(
+        "rewild4d.evaluation.networks.load_networks", lambda families, device: Networks(missing=missing)
+    )
 
 
 def damaged(image: np.ndarray) -> bytes:

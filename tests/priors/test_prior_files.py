@@ -174,7 +174,7 @@ def test_a_place_that_cannot_be_written_is_told_before_the_fit(tmp_path: Path, m
     (tmp_path / "clip").mkdir()
     (tmp_path / "taken").touch()
     write_frames(tmp_path / "clip", 4)
-    monkeypatch.setattr(command, "fit_footage", lambda *_, **__: pytest.fail("it was fitted"))
+    monkeypatch.setattr("rewild4d.priors.footage.fit_footage", lambda *_, **__: pytest.fail("it was fitted"))
     flags = ["--frames", str(tmp_path / "clip" / "frames"), "--masks", str(tmp_path / "clip" / "masks")]
     with pytest.raises(UserError, match=message):
         command.main(["fit", *flags, "--out", str(tmp_path / out)])

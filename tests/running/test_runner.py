@@ -15,8 +15,6 @@ from one_case import OneCase
 from records_for_tests import still
 
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig
-from rewild4d.commands.evaluate import Options as EvaluateOptions
-from rewild4d.commands.evaluate import score_again
 from rewild4d.errors import UserError
 from rewild4d.evaluation.coverage import coverage, visible
 from rewild4d.evaluation.protocol import NovelViews, find_protocol
@@ -28,6 +26,7 @@ from rewild4d.rasterizer.backends import resolve
 from rewild4d.registry import load_method
 from rewild4d.running import runner
 from rewild4d.running.conformance import check_method, tiny_case
+from rewild4d.running.rescoring import score_again
 from rewild4d.running.workers import Threads, share_cores, start_worker
 from rewild4d.types import Camera, Case, Truth
 
@@ -168,16 +167,16 @@ def test_methods_get_the_clip_and_nothing_that_is_held_out(plan: runner.Plan, mo
 def test_evaluate_gives_the_same_scores(plan: runner.Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     record = runner.execute(plan)[1]
     folder = next(plan.out.rglob(f"prior-only-quick-seed0-{record.run_id[:8]}"))
-    monkeypatch.setattr("rewild4d.commands.shared.load_dataset", lambda _: lambda _: plan.reader)
-    assert still(score_again(folder, EvaluateOptions(runs=(folder,)))) == still(record)
+    monkeypatch.setattr("rewild4d.running.rescoring.load_dataset", lambda _: lambda _: plan.reader)
+    assert still(score_again(folder)) == still(record)
     state = folder / "reconstruction" / "surface.pt"
     for data in (state.read_bytes()[: state.stat().st_size // 2], b"text"):
         state.write_bytes(data)
         with pytest.raises(UserError, match="surface.pt: expected a saved reconstruction, but it is cut off or"):
-            score_again(folder, EvaluateOptions(runs=(folder,)))
+            score_again(folder)
     shutil.rmtree(folder / "reconstruction")
     with pytest.raises(UserError, match="reconstruction: expected a saved reconstruction, but there is no such folder"):
-        score_again(folder, EvaluateOptions(runs=(folder,)))
+        score_again(folder)
 
 
 def test_unknown_case_has_a_suggestion() -> None:

@@ -16,7 +16,6 @@ from records_for_tests import still
 from rewild4d import registry
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig, PriorOnlyReconstruction
 from rewild4d.cameras.rendering import render
-from rewild4d.commands.evaluate import Options, score_again
 from rewild4d.commands.shared import exit_code, require_writable
 from rewild4d.errors import UserError
 from rewild4d.evaluation.measuring import evaluate
@@ -30,6 +29,7 @@ from rewild4d.registry import load_method
 from rewild4d.running import runner
 from rewild4d.running.conformance import tiny_case
 from rewild4d.running.provenance import FROM_TRUTH, marks
+from rewild4d.running.rescoring import score_again
 from rewild4d.running.workers import Threads, Workers
 from rewild4d.types import Case
 
@@ -149,17 +149,17 @@ def test_evaluate_makes_a_failed_record_whole(plan: runner.Plan, monkeypatch: py
         patch.setattr(runner, "evaluate", full)
         (failed,) = runner.execute(plan)
     assert failed.status == "failed"
-    monkeypatch.setattr("rewild4d.commands.shared.load_dataset", lambda _: lambda _: plan.reader)
+    monkeypatch.setattr("rewild4d.running.rescoring.load_dataset", lambda _: lambda _: plan.reader)
     # The command scores by the protocol of the package, which asks for more than this plan.
-    monkeypatch.setattr("rewild4d.commands.evaluate.find_protocol", lambda *_: plan.protocol)
+    monkeypatch.setattr("rewild4d.running.rescoring.find_protocol", lambda *_: plan.protocol)
 
     def slow(*given: Any) -> Any:
         time.sleep(0.02)  # the record counts hundredths of a second, and this case takes less
         return evaluate(*given)
 
-    monkeypatch.setattr("rewild4d.commands.evaluate.evaluate", slow)
+    monkeypatch.setattr("rewild4d.running.rescoring.evaluate", slow)
     folder = only_job(plan).folder
-    renewed = score_again(folder, Options(runs=(folder,)))
+    renewed = score_again(folder)
     assert renewed.marks == ["upper bound: it was told"] and renewed.diagnostics["gaussians"] == 500.0
     assert still(renewed) == still(whole)
     assert renewed.timing.fit_seconds == round(runner.fit_seconds(folder), 2)

@@ -1,0 +1,62 @@
+"""Settings that every Gaussian competitor has; a light module, read before the method is loaded."""
+
+import msgspec
+
+from rewild4d.ours.config import Canonical, Count, Density, Opacity, Rate, Size, Weight, Whole
+
+
+class GaussianRates(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Learning rates of the Gaussians' attributes (Adam)."""
+
+    means: Rate = (8e-4, 8e-6)
+    """Positions, falling exponentially: 1.6e-4 and 1.6e-6 at a scene size of 5."""
+    quats: Weight = 1e-3
+    """Orientations."""
+    log_scales: Weight = 5e-3
+    """Scales."""
+    logit_opacities: Weight = 5e-2
+    """Opacities."""
+    colors: Weight = 2.5e-3
+    """Colours."""
+
+
+class ImageLoss(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Losses of one rendered view, sums over pixels divided by the area of the animal's box as in `ours`."""
+
+    l1: Weight = 0.8
+    """Absolute difference of colour."""
+    ssim: Weight = 0.2
+    """One minus SSIM."""
+    silhouette: Weight = 0.0
+    """BCE + Dice of the matte."""
+    random_background: bool = True
+    """One random colour a step behind render and target, white otherwise."""
+
+
+class Resets(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Opacity resets: every Gaussian has to earn its opacity again, so that floaters are pruned."""
+
+    every: Weight = 0.0
+    """Fraction of the iterations between resets; 0 for none."""
+    until: Weight = 1.0
+    """Fraction of the iterations after which there are none."""
+    opacity: Opacity = 0.01
+    """Opacities above this are set to it."""
+
+
+class SplatConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Settings that every Gaussian competitor has; "fraction" means a share of `iterations`."""
+
+    image_size: Size = 512
+    """Longest image side it trains at; larger clips are reduced."""
+    iterations: Whole = 20_000
+    """Steps."""
+    steps_per_frame: Whole = 0
+    """At least so many steps for every frame of the clip; 0 leaves it at `iterations`."""
+    checkpoint_every: Count = 500
+    """Steps between checkpoints, where a work folder is given."""
+    canonical: Canonical = Canonical()
+    rates: GaussianRates = GaussianRates()
+    loss: ImageLoss = ImageLoss()
+    density: Density = Density()
+    resets: Resets = Resets()

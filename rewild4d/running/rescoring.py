@@ -1,0 +1,107 @@
+"""Saved runs read back: their data, and their scores anew by the protocol they were fitted for."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import torch
+
+from rewild4d.contracts import DatasetReader
+from rewild4d.errors import UserError
+from rewild4d.evaluation.coverage import coverage
+from rewild4d.evaluation.measuring import evaluate
+from rewild4d.evaluation.protocol import find_protocol
+from rewild4d.evaluation.refining import ready_to_score
+from rewild4d.leaderboard.records import FILE, RunRecord, Timing, read_record, write_record
+from rewild4d.machine import code_of, machine, peak_memory_mib, pick_device
+from rewild4d.progress import Progress
+from rewild4d.rasterizer import pick_rasterizer
+from rewild4d.registry import load_dataset, load_method
+from rewild4d.running import provenance
+from rewild4d.running.runner import STAMP, fit_seconds
+from rewild4d.running.workers import share_cores, this_process
+from rewild4d.visualize.original_view import original_frames
+from rewild4d.visualize.run_pictures import save_pictures
+
+
+def reader_of(run: Path, record: RunRecord, data: Path | None) -> DatasetReader:
+    """The reader of the data that a run was fitted to.
+
+    Args:
+        run: folder of the run.
+        record: of the run.
+        data: where the data is now; None: where the record says.
+
+    Raises:
+        UserError: the record does not say where or how it was read, or the data is not there any more.
+    """
+    reader, root = load_dataset(record.dataset), data or record.data.get("root")
+    if not root:
+        raise UserError(f"{run}: expected a record that names the folder of its data; --data names one.")
+    try:
+        settings = msgspec.json.decode(record.data.get("settings", "{}"), type=dict[str, Any])
+    except msgspec.MsgspecError as error:
+        raise UserError(f"{run}: expected the record's data.settings to be a JSON object, but: {error}.") from error
+    if unknown := sorted(set(settings) - {*getattr(reader, "options", ())}):
+        raise UserError(f"{run}: expected settings that data set {record.dataset} has, got {', '.join(unknown)}.")
+    return reader(Path(root), **settings)
+
+
+def score_again(folder: Path, data: Path | None = None, device: str = "auto", rasterizer: str = "auto") -> RunRecord:
+    """Load a run's reconstruction, score it and rewrite its record.
+
+    Args:
+        folder: of the run, with a record.json and a reconstruction.
+        data: where the run's data is now; None: where the record says.
+        device: auto, cpu or cuda.
+        rasterizer: one of `rewild4d.rasterizer.BACKENDS`.
+
+    Raises:
+        UserError: no record, no reconstruction, or data that has changed since the fit.
+    """
+    computing = pick_device(device)
+    renderer = pick_rasterizer(rasterizer, computing)
+    with this_process(share_cores(1, 1, computing), renderer):  # as a run scores: torch's threads decide last digits
+        return _scored(folder, data, computing, renderer)
+
+
+def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: str) -> RunRecord:
+    record = read_record(folder / FILE)
+    saved = folder / "reconstruction"
+    if not saved.is_dir():
+        raise UserError(f"{saved}: expected a saved reconstruction, but there is no such folder.")
+    protocol = find_protocol(record.dataset, record.protocol["name"])
+    spent = fit_seconds(folder) if (folder / STAMP).is_file() else record.timing.fit_seconds
+    reader = reader_of(folder, record, data)
+    clip, truth = reader.load(record.case, protocol.selection)
+    for name, now in (("clip", clip.digest), ("truth", truth.digest)):
+        if now != record.data.get(name):
+            place = data or record.data["root"]
+            raise UserError(f"{place}: the {name} of {record.case} is not the one that {folder} was fitted to.")
+    reconstruction = load_method(record.method).load(saved, device)
+    begin = time.perf_counter()
+    shown = provenance.shown_of(clip, record.prior)
+    progress = Progress(f"{record.case}: refine on held-out frames")
+    reconstruction, clip, truth = ready_to_score(reconstruction, clip, truth, shown, progress)
+    progress.close()
+    progress = Progress(f"{record.case}: evaluate")
+    found = evaluate(reconstruction, clip, truth, protocol, progress, device)
+    progress.close()
+    seconds = time.perf_counter() - begin
+    whole = original_frames(reader, clip, protocol.selection)
+    pictures = save_pictures(reconstruction, clip, truth, folder, whole)
+    described = {"digest": protocol.digest, **msgspec.to_builtins(protocol)}
+    renewed = msgspec.structs.replace(
+        record, status="ok", error="", **found.keep(folder), coverage=coverage(clip, truth), pictures=pictures,
+        diagnostics=provenance.diagnostics(reconstruction, shown, protocol.background), protocol=described,
+        marks=provenance.marks(record.method, record.prior.get("choice", ""), reconstruction),
+        code=code_of(record.method), machine=machine(device, rasterizer), timing=_timing(record, spent, seconds),
+    )  # fmt: skip
+    return read_record(write_record(renewed, folder))
+
+
+def _timing(record: RunRecord, spent: float, seconds: float) -> Timing:
+    """When it was fitted, how long that took, which a failed record does not say, and how long scoring took now."""
+    memory = max(record.timing.peak_memory_mib, round(peak_memory_mib(), 1))
+    return Timing(record.timing.started, round(spent, 2), round(seconds, 2), memory)
