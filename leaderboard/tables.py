@@ -12,8 +12,17 @@ from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.remarks import cases_said, seeds_said
 from rewild4d.leaderboard.specs import Reported, ReportedCell
 from rewild4d.leaderboard.statistics import Estimate, estimate, ranks
-from rewild4d.leaderboard.titles import LESS_IS_BETTER, TITLES, digits_of
-from rewild4d.leaderboard.variants import Variant, by_protocol, coverage_text, is_floor, latest, marks, variants
+from rewild4d.leaderboard.titles import TITLES, better_of, digits_of
+from rewild4d.leaderboard.variants import (
+    Variant,
+    by_protocol,
+    coverage_text,
+    is_floor,
+    latest,
+    marks,
+    row_kind,
+    variants,
+)
 from rewild4d.metrics.names import KINDS
 
 POOLED = "KID and FVD in rows of the mean are means over cases; `table --pooled` computes them over all cases at once."
@@ -211,8 +220,7 @@ def columns_of(
         for name in scores:
             score = known.get(name)
             unit = f", {score.unit}" if score and score.unit != "1" else ""
-            better = score.better if score else "lower" if name.startswith(LESS_IS_BETTER) else "higher"
-            columns.append(Column(TITLES.get(name, name) + unit, better, condition, name))
+            columns.append(Column(TITLES.get(name, name) + unit, better_of(name, known), condition, name))
     return tuple(columns)
 
 
@@ -265,10 +273,7 @@ def _timed_row(variant: Variant, cases: list[str], scores: Sequence[str]) -> Row
 
 def kind_of(entrant: Entrant) -> str:
     """Name the kind of its row: "method", "unranked" where it had what the others had not, or "floor"."""
-    records = runs_of([entrant])
-    if marks(records):
-        return "unranked"
-    return "floor" if records and is_floor(records[0]) else "method"
+    return row_kind(runs_of([entrant]))
 
 
 def _apart(rows: list[Row]) -> list[Row]:

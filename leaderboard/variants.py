@@ -91,6 +91,13 @@ def marks(records: Sequence[RunRecord]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(mark for record in records for mark in record.marks))
 
 
+def row_kind(records: Sequence[RunRecord]) -> str:
+    """Name the kind of a row of records: "method", "unranked" where it had what the others had not, or "floor"."""
+    if marks(records):
+        return "unranked"
+    return "floor" if records and is_floor(records[0]) else "method"
+
+
 def coverage_text(records: Sequence[RunRecord]) -> str:
     """Say what the numbers lean on, averaged over the cases."""
     by_case = {record.case: record.coverage for record in records if record.coverage}
