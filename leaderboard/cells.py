@@ -14,28 +14,27 @@ Values = dict[str, dict[int, float]]
 """Case -> seed -> value."""
 
 
-def cell(records: Sequence[RunRecord], cases: Sequence[str], name: str) -> Cell:
-    """Mean and spread of a score over cases, or why there is none: unequal sets are not averaged.
+def cell(records: Sequence[RunRecord], cases: Sequence[str], name: str, absent: str = "") -> Cell:
+    """Compute mean and spread of a score over cases, or say why there is none: unequal sets are not averaged.
 
     Args:
         records: of one row under one condition.
         cases: every one must have a value.
         name: of the score.
+        absent: why the row can have no records, or "".
     """
     wanted = [record for record in records if record.case in cases]
     good = [record for record in wanted if record.status == "ok"]
-    for case in cases:
-        failed = next((record for record in wanted if record.case == case and record.status != "ok"), None)
-        if failed and not any(record.case == case for record in good):
-            return Cell("failed", note=f"{case}, {failed.method}: failed: {failed.error}")
-    missing = [case for case in cases if not any(record.case == case for record in good)]
+    if absent or not wanted:
+        return Cell("n/a", note=absent or "no record yet")
+    missing = [case for case in cases if all(record.case != case for record in good)]
+    if failed := next((record for case in missing for record in wanted if record.case == case), None):
+        return Cell("failed", note=f"{failed.case}, {failed.method}: failed: {failed.error}")
     if missing:
-        whole = len(missing) == len(cases)
-        return Cell("n/a", note="no record yet" if whole else f"not computed: no result for {', '.join(missing)}")
+        return Cell("n/a", note=f"not computed: no result for {', '.join(missing)}")
     values = values_of(good, name)
-    for record in good:
-        if record.case not in values:
-            return Cell("n/a", note=f"not computed: {_reason(record, name)}")
+    if empty := next((record for record in good if record.case not in values), None):
+        return Cell("n/a", note=f"not computed: {_reason(empty, name)}")
     found, digits = estimate(values), digits_of(name, _unit(good, name))
     spread = "" if found.spread is None else f"{found.spread:.{digits}f}"
     note = _left_out(wanted, name)
@@ -43,7 +42,7 @@ def cell(records: Sequence[RunRecord], cases: Sequence[str], name: str) -> Cell:
 
 
 def difference(records: Sequence[RunRecord], reference: Sequence[RunRecord], name: str, absent: str = "") -> Cell:
-    """The mean of the differences of the cases that both rows have, and its interval, or why there is none.
+    """Compute the mean of the differences of the cases that both rows have, and its interval, or say why there is none.
 
     Args:
         records: of one row under one condition.
@@ -67,7 +66,7 @@ def difference(records: Sequence[RunRecord], reference: Sequence[RunRecord], nam
 def values_of(
     records: Sequence[RunRecord], name: str, quantity: Callable[[Score], float | None] = lambda score: score.value
 ) -> Values:
-    """By case and seed, of good records, a score's value (or another quantity of it) where there is one."""
+    """Gather by case and seed, from good records, a score's value (or another quantity of it) where there is one."""
     values: Values = defaultdict(dict)
     for record in records:
         score = record.scores.get(name) if record.status == "ok" else None

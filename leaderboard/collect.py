@@ -18,8 +18,7 @@ from rewild4d.files import replaced_folder
 from rewild4d.leaderboard.curves import MOMENT, moments
 from rewild4d.leaderboard.privacy import without_paths
 from rewild4d.leaderboard.records import FILE, RunRecord
-from rewild4d.leaderboard.tables import by_protocol
-from rewild4d.leaderboard.variants import latest, variants
+from rewild4d.leaderboard.variants import by_protocol, latest, variants
 from rewild4d.metrics.score import Score
 
 MARKER = "collection.json"

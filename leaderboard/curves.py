@@ -5,6 +5,7 @@ import re
 import statistics
 from collections import defaultdict
 from collections.abc import Sequence
+from itertools import count
 
 from rewild4d.metrics.score import Score
 
@@ -14,31 +15,35 @@ LEFT, RIGHT, TOP, BOTTOM = 46, 8, 22, 24
 MOMENT = re.compile(r" at (-?[0-9.]+) s$")
 
 
-def moments(score: Score, items: Sequence[str]) -> list[tuple[float, list[float]]]:
-    """The values of each moment, in the order of time.
+def times_of(score: Score, items: Sequence[str]) -> list[float]:
+    """Tell the time of each value of a score, in seconds; nothing where the items do not say.
 
     Args:
         score: with a value per item.
-        items: labels of the items ("view 3 at 0.0417 s"); scores that have another number of items are taken to have
-            one at each of the labels' moments, and else to be counted from 0.
+        items: labels of the items ("view 3 at 0.0417 s"); a score that has as many values as there are different
+            moments is taken to have one at each of them.
     """
-    places = [float(found[1]) for found in map(MOMENT.search, items) if found]
-    times = sorted(set(places))
-    if len(score.per_item) == len(places) == len(items):
-        pairs = list(zip(places, score.per_item, strict=True))
-    elif len(score.per_item) == len(times):
-        pairs = list(zip(times, score.per_item, strict=True))
-    else:
-        pairs = [(float(index), value) for index, value in enumerate(score.per_item)]
+    times = [float(found[1]) for found in map(MOMENT.search, items) if found]
+    moments = sorted(set(times))
+    if len(score.per_item) == len(times) == len(items):
+        return times
+    return moments if len(score.per_item) == len(moments) else []
+
+
+def moments(score: Score, items: Sequence[str]) -> list[tuple[float, list[float]]]:
+    """Group the values of a score by their moments, in the order of time; see `times_of`.
+
+    Where the items do not say the time, values are counted from 0.
+    """
     found: dict[float, list[float]] = defaultdict(list)
-    for time, value in pairs:
+    for time, value in zip(times_of(score, items) or map(float, count()), score.per_item, strict=False):
         if value is not None:
             found[time].append(value)
     return sorted(found.items())
 
 
 def curve(title: str, points: Sequence[tuple[float, list[float]]]) -> str:
-    """Mean over the values of a moment as a line, lowest to highest as a band.
+    """Draw the mean over the values of a moment as a line, lowest to highest as a band.
 
     Args:
         title: of the picture.

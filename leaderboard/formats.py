@@ -1,178 +1,169 @@
 """Writers of tables: Markdown, LaTeX (booktabs), HTML and CSV.
 
-Own code: ranks that mind the spread, notes by number and rows that compete with nobody have to be laid out first in any
-case, and what pandas' Styler would then save are the lines that join cells, for another half second of every start.
+pandas writes the CSV. Its Styler has no place for rules between kinds of rows, numbered notes and sort values, and
+`DataFrame.to_markdown` needs another package, so that the three formats for people are joined here.
 """
 
-import csv
 import html as escaping
-import io
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import groupby
+from typing import TYPE_CHECKING
 
-from rewild4d.leaderboard.layout import Cell, Column, Row, Table
+from rewild4d.leaderboard.layout import Cell, Row, Table
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 EDGE = ' class="edge"'
 ARROWS = {"higher": "↑", "lower": "↓", "": ""}
+TEX_SIGNS = str.maketrans({
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
+    "−": "$-$", "·": r"$\cdot$", "⊕": r"$\oplus$", "<": "$<$", ">": "$>$",
+})  # fmt: skip
 
 
 def markdown(table: Table) -> str:
-    """GitHub's Markdown; underlining is what it has no sign for, so the second is in italics."""
-    heads = [*table.stubs, *(_head(column, " ") for column in table.columns)]
-    ruler = ["---"] * len(table.stubs) + [
-        "---:" if column.better or column.score else "---:" for column in table.columns
-    ]
-    rows = [
-        [*_first_with(row, table, " [{}]"), *(_markdown_cell(cell, table) for cell in row.cells)] for row in table.rows
-    ]
-    lines = ["| " + " | ".join(_no_bars(row)) + " |" for row in [heads, ruler, *rows]]
-    notes = [f"[{number}] {note}" for number, note in enumerate(table.notes, 1)]
+    """Write GitHub's Markdown; it has no underline, so the second best is in italics."""
+    heads = [*table.stubs, *(" ".join(filter(None, (c.group, c.title, ARROWS[c.better]))) for c in table.columns)]
+    ruler = ["---"] * len(table.stubs) + ["---:"] * len(table.columns)
+    rows = [heads, ruler, *([*stubs, *cells] for _, stubs, cells in _MARKDOWN.rows(table))]
+    lines = ["| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in row) + " |" for row in rows]
     caption = f"**{table.title}**" + (f" ({table.caption})" if table.caption else "")
-    return "\n".join([caption, "", *lines, *(f"\n{line}" for line in [*notes, *table.remarks])])
+    return "\n".join([caption, "", *lines, *(f"\n{line}" for line in _MARKDOWN.notes(table))])
 
 
 def latex(table: Table) -> str:
-    """A table float with booktabs rules; needs no package but booktabs."""
-    groups = [(group, len(list(columns))) for group, columns in groupby(table.columns, key=lambda column: column.group)]
+    """Write a table float with booktabs rules; needs no package but booktabs."""
     heads = [*table.stubs, *(f"{column.title} {ARROWS[column.better]}".strip() for column in table.columns)]
     lines = [
         r"\begin{table}", r"\centering\small\setlength{\tabcolsep}{4pt}",
         rf"\caption{{{_tex(table.title)}. {_tex(table.caption)}}}",
         rf"\label{{tab:{table.name}}}", rf"\begin{{tabular}}{{{'l' * len(table.stubs)}{'r' * len(table.columns)}}}",
-        r"\toprule", *_latex_groups(groups, len(table.stubs)), " & ".join(map(_tex, heads)) + r" \\",
+        r"\toprule", *_latex_groups(table), " & ".join(map(_tex, heads)) + r" \\",
     ]  # fmt: skip
-    for _, rows in groupby(table.rows, key=lambda row: row.kind):
-        lines.append(r"\midrule")
-        for row in rows:
-            stubs = [_tex(stub) for stub in row.stubs]
-            stubs[0] = rf"\textbf{{{stubs[0]}}}" if row.summary else stubs[0]
-            stubs[-1] += _tex_number(table.number(*row.notes))
-            lines.append(" & ".join([*stubs, *(_latex_cell(cell, table) for cell in row.cells)]) + r" \\")
-    lines += [r"\bottomrule", r"\end{tabular}"]
-    notes = [f"{_tex_number(str(number))} {_tex(note)}" for number, note in enumerate(table.notes, 1)]
-    lines += [rf"\par\smallskip\raggedright\footnotesize {line}" for line in [*notes, *map(_tex, table.remarks)]]
-    return "\n".join([*lines, r"\end{table}"])
+    for _, rows in groupby(_LATEX.rows(table), key=lambda found: found[0].kind):
+        lines += [r"\midrule", *(" & ".join([*stubs, *cells]) + r" \\" for _, stubs, cells in rows)]
+    notes = [rf"\par\smallskip\raggedright\footnotesize {line}" for line in _LATEX.notes(table)]
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", *notes, r"\end{table}"])
 
 
 def html(table: Table) -> str:
-    """A table element; cells carry their value in `data-value`, so that a page can sort by it."""
-    groups = [(group, len(list(columns))) for group, columns in groupby(table.columns, key=lambda column: column.group)]
-    edges = _edges(groups)
-    columns = zip(edges, table.columns, strict=True)
-    head = [*(f"<th>{_text(stub)}</th>" for stub in table.stubs), *(_html_head(*column) for column in columns)]
+    """Write a table element; cells carry their value in `data-value`, so that a page can sort by it."""
+    edges = [EDGE if title and place == 0 else "" for title, span in table.groups for place in range(span)]
+    head = [f"<th>{_text(stub)}</th>" for stub in table.stubs]
+    head += [
+        f'<th{edge} data-better="{column.better}">{_text(column.title)} {ARROWS[column.better]}</th>'
+        for edge, column in zip(edges, table.columns, strict=True)
+    ]
     lines = [
         f'<table id="{_text(table.name)}">',
         f"<caption><span><b>{_text(table.title)}.</b> {_text(table.caption)}</span></caption>",
         "<thead>",
     ]
-    if any(group for group, _ in groups):
-        over = "".join(f'<th{EDGE} colspan="{span}">{_text(group)}</th>' for group, span in groups)
+    if any(title for title, _ in table.groups):
+        over = "".join(f'<th{EDGE} colspan="{span}">{_text(title)}</th>' for title, span in table.groups)
         lines.append(f'<tr><th colspan="{len(table.stubs)}"></th>{over}</tr>')
     lines += [f'<tr class="heads">{"".join(head)}</tr>', "</thead>", "<tbody>"]
-    for row in table.rows:
-        stubs = [f"<td>{_text(stub)}</td>" for stub in row.stubs]
-        number = table.number(*row.notes)
-        flags = "".join(f' <small class="flag">{_text(flag.partition(":")[0])}</small>' for flag in row.flags)
-        stubs[-1] = f"<td>{_text(row.stubs[-1])}{f'<sup>{number}</sup>' if number else ''}{flags}</td>"
-        cells = [_html_cell(edge, cell, table) for edge, cell in zip(edges, row.cells, strict=True)]
-        lines.append(f'<tr class="{row.kind}">{"".join(stubs + cells)}</tr>')
-    lines += ["</tbody>", "</table>"]
-    notes = [f"<sup>{number}</sup> {_text(note)}" for number, note in enumerate(table.notes, 1)]
-    return "\n".join([*lines, *(f'<p class="note">{line}</p>' for line in [*notes, *map(_text, table.remarks)])])
+    for row, stubs, cells in _HTML.rows(table):
+        stubs[-1] += "".join(f' <small class="flag">{_text(flag.partition(":")[0])}</small>' for flag in row.flags)
+        values = ["" if cell.value is None else f' data-value="{cell.value:.9g}"' for cell in row.cells]
+        shown = [f"<td>{stub}</td>" for stub in stubs]
+        shown += [f"<td{edge}{value}>{cell}</td>" for edge, value, cell in zip(edges, values, cells, strict=True)]
+        lines.append(f'<tr class="{row.kind}">{"".join(shown)}</tr>')
+    return "\n".join([*lines, "</tbody>", "</table>", *(f'<p class="note">{line}</p>' for line in _HTML.notes(table))])
+
+
+def tidy_frame(table: Table) -> "pd.DataFrame":
+    """Make a data frame with a row a figure; low and high are the ends of a difference's interval."""
+    import pandas as pd
+
+    heads = [*(stub or "row" for stub in table.stubs), "kind", "condition", "score", "better"]
+    rows = [
+        [*row.stubs, row.kind, column.group, column.score or column.title, column.better,
+         cell.text if cell.value is None and not column.score else cell.value, cell.deviation,
+         *(cell.interval or (None, None)), cell.mark, "; ".join(filter(None, (*row.notes, cell.note)))]
+        for row in table.rows for column, cell in zip(table.columns, row.cells, strict=True)
+    ]  # fmt: skip
+    return pd.DataFrame(rows, columns=[*heads, "value", "spread", "low", "high", "rank", "note"])
 
 
 def tidy_csv(table: Table) -> str:
-    """One line a figure, for programs; low and high are the ends of a difference's interval."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    stubs = [stub or "row" for stub in table.stubs]
-    writer.writerow([*stubs, "kind", "condition", "score", "better", "value", "spread", "low", "high", "rank", "note"])
-    for row in table.rows:
-        for column, cell in zip(table.columns, row.cells, strict=True):
-            value = cell.text if cell.value is None and not column.score else cell.value
-            notes = "; ".join(note for note in (*row.notes, cell.note) if note)
-            writer.writerow([*row.stubs, row.kind, column.group, column.score or column.title, column.better,
-                             value, cell.deviation, *(cell.interval or (None, None)), cell.mark, notes])  # fmt: skip
-    return out.getvalue().rstrip("\n")
+    """Write one line a figure, for programs; see `tidy_frame`."""
+    return tidy_frame(table).to_csv(index=False, lineterminator="\n").rstrip("\n")
 
 
 FORMATS: dict[str, Callable[[Table], str]] = {"md": markdown, "latex": latex, "html": html, "csv": tidy_csv}
 
 
-def _head(column: Column, between: str) -> str:
-    words = [column.group, column.title, ARROWS[column.better]]
-    return between.join(word for word in words if word)
+@dataclass(frozen=True)
+class _Style:
+    """How a format writes the parts of a table that hold text; patterns have one %s.
+
+    Attributes:
+        best, second: around a ranked figure.
+        spread: behind a figure.
+        number: of a note.
+        space: before that number.
+        summary: around the title of a row that sums up others.
+        text: escapes what has a meaning in the format.
+    """
+
+    best: str
+    second: str
+    spread: str
+    number: str
+    space: str
+    summary: str
+    text: Callable[[str], str]
+
+    def rows(self, table: Table) -> Iterator[tuple[Row, list[str], list[str]]]:
+        """Each row with its stubs and its cells as they are printed."""
+        for row in table.rows:
+            stubs = [self.text(stub) for stub in row.stubs]
+            stubs[0] = self.summary % stubs[0] if row.summary else stubs[0]
+            stubs[-1] += self._numbers(table.number(*row.notes))
+            yield row, stubs, [self._cell(cell, table) for cell in row.cells]
+
+    def notes(self, table: Table) -> list[str]:
+        """The numbered notes, then the remarks."""
+        numbered = [f"{self.number % number} {self.text(note)}" for number, note in enumerate(table.notes, 1)]
+        return [*numbered, *map(self.text, table.remarks)]
+
+    def _cell(self, cell: Cell, table: Table) -> str:
+        figure = {"best": self.best, "second": self.second, "": "%s"}[cell.mark] % self.text(cell.text)
+        return figure + (self.spread % cell.spread if cell.spread else "") + self._numbers(table.number(cell.note))
+
+    def _numbers(self, numbers: str) -> str:
+        return self.space + self.number % numbers if numbers else ""
 
 
-def _first_with(row: Row, table: Table, pattern: str) -> list[str]:
-    """The stubs, the first bold where the row sums up others, the numbers of the row's notes behind the last."""
-    number = table.number(*row.notes)
-    stubs = [f"**{row.stubs[0]}**" if row.summary else row.stubs[0], *row.stubs[1:]]
-    return [*stubs[:-1], stubs[-1] + (pattern.format(number) if number else "")]
-
-
-def _no_bars(cells: list[str]) -> Iterator[str]:
-    return (cell.replace("|", "\\|").replace("\n", " ") for cell in cells)
-
-
-def _markdown_cell(cell: Cell, table: Table) -> str:
-    frame = {"best": "**{}**", "second": "_{}_", "": "{}"}[cell.mark]
-    spread = f" ± {cell.spread}" if cell.spread else ""
-    number = table.number(cell.note)
-    return frame.format(cell.text) + spread + (f" [{number}]" if number else "")
-
-
-def _latex_groups(groups: list[tuple[str, int]], stubs: int) -> list[str]:
+def _latex_groups(table: Table) -> list[str]:
     """The line of group titles, with a rule under each."""
-    if not any(group for group, _ in groups):
+    if not any(title for title, _ in table.groups):
         return []
-    cells, rules, start = [" & " * (stubs - 1)], [], stubs + 1
-    for group, span in groups:
-        cells.append(rf"\multicolumn{{{span}}}{{c}}{{{_tex(group)}}}")
-        if group:
+    cells, rules, start = [" & " * (len(table.stubs) - 1)], [], len(table.stubs) + 1
+    for title, span in table.groups:
+        cells.append(rf"\multicolumn{{{span}}}{{c}}{{{_tex(title)}}}")
+        if title:
             rules.append(rf"\cmidrule(lr){{{start}-{start + span - 1}}}")
         start += span
     return [" & ".join(cells) + r" \\", " ".join(rules)]
 
 
-def _latex_cell(cell: Cell, table: Table) -> str:
-    frame = {"best": r"\textbf{%s}", "second": r"\underline{%s}", "": "%s"}[cell.mark]
-    spread = rf" {{\scriptsize $\pm$ {cell.spread}}}" if cell.spread else ""
-    return frame % _tex(cell.text) + spread + _tex_number(table.number(cell.note))
-
-
-def _tex_number(number: str) -> str:
-    return rf"\textsuperscript{{{number}}}" if number else ""
-
-
 def _tex(text: str) -> str:
-    signs = {
-        "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
-        "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
-        "−": "$-$", "·": r"$\cdot$", "⊕": r"$\oplus$", "<": "$<$", ">": "$>$",
-    }  # fmt: skip
-    escaped = "".join(signs.get(letter, letter) for letter in text)
-    coded = re.sub("`([^`]*)`", r"\\texttt{\1}", escaped)
+    coded = re.sub("`([^`]*)`", r"\\texttt{\1}", text.translate(TEX_SIGNS))
     return re.sub('"([^"]*)"', r"``\1''", coded)
-
-
-def _edges(groups: list[tuple[str, int]]) -> list[str]:
-    """Of each column, the attribute that draws a line before it where a group begins."""
-    return [EDGE if group and place == 0 else "" for group, span in groups for place in range(span)]
-
-
-def _html_head(edge: str, column: Column) -> str:
-    return f'<th{edge} data-better="{column.better}">{_text(column.title)} {ARROWS[column.better]}</th>'
-
-
-def _html_cell(edge: str, cell: Cell, table: Table) -> str:
-    value = "" if cell.value is None else f' data-value="{cell.value:.9g}"'
-    shown = {"best": "<b>{}</b>", "second": "<u>{}</u>", "": "{}"}[cell.mark].format(_text(cell.text))
-    spread = f" <small>± {_text(cell.spread)}</small>" if cell.spread else ""
-    number = table.number(cell.note)
-    return f"<td{edge}{value}>{shown}{spread}{f'<sup>{number}</sup>' if number else ''}</td>"
 
 
 def _text(text: str) -> str:
     return re.sub("`([^`]*)`", r"<code>\1</code>", escaping.escape(text))
+
+
+_MARKDOWN = _Style("**%s**", "_%s_", " ± %s", "[%s]", " ", "**%s**", str)
+_LATEX = _Style(
+    r"\textbf{%s}", r"\underline{%s}", r" {\scriptsize $\pm$ %s}", r"\textsuperscript{%s}", "", r"\textbf{%s}", _tex
+)
+_HTML = _Style("<b>%s</b>", "<u>%s</u>", " <small>± %s</small>", "<sup>%s</sup>", "", "%s", _text)

@@ -1,6 +1,8 @@
 """A table before it has a format: what every writer of rewild4d.leaderboard.formats prints."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
 
 Kind = str
 """Of a row: "method", "floor", "unranked" (it had what the others had not) or "reported" (by a paper)."""
@@ -88,12 +90,17 @@ class Table:
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
     remarks: tuple[str, ...] = ()
-    notes: tuple[str, ...] = field(init=False)
 
-    def __post_init__(self) -> None:
-        """Number the notes in the order in which they are met."""
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """Each note of a row or a cell once, in the order in which they are met."""
         found = [note for row in self.rows for note in (*row.notes, *(cell.note for cell in row.cells)) if note]
-        object.__setattr__(self, "notes", tuple(dict.fromkeys(found)))
+        return tuple(dict.fromkeys(found))
+
+    @cached_property
+    def groups(self) -> list[tuple[str, int]]:
+        """Title of each group of columns that stand together, and how many they are."""
+        return [(title, len(list(columns))) for title, columns in groupby(column.group for column in self.columns)]
 
     def number(self, *notes: str) -> str:
         """Numbers of notes among `notes`, from 1: "1,3", or ""."""

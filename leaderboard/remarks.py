@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from rewild4d.leaderboard.records import RunRecord
+from rewild4d.leaderboard.variants import grouped
 
 FEW = 12
 """More cases than these are counted, not named."""
@@ -35,7 +36,8 @@ def seeds_said(groups: Sequence[Sequence[RunRecord]]) -> str:
     Args:
         groups: the records behind each mean that competes as a method.
     """
-    known = [_has_spread(group) for group in groups if any(run.status == "ok" for run in group)]
+    good = [[run for run in group if run.status == "ok"] for group in groups]
+    known = [_has_spread(group) for group in good if group]
     unknown = "nothing is known of the spread over seeds: bold only orders the means."
     if not known:
         return ""
@@ -48,10 +50,7 @@ def seeds_said(groups: Sequence[Sequence[RunRecord]]) -> str:
     return f"No row has two seeds on all of its cases, so that {unknown}"
 
 
-def _has_spread(group: Sequence[RunRecord]) -> bool:
+def _has_spread(good: Sequence[RunRecord]) -> bool:
     """Whether two seeds have a result on every case, as `statistics.estimate` wants for a spread."""
-    seeds: dict[str, set[int]] = {}
-    for run in group:
-        if run.status == "ok":
-            seeds.setdefault(run.case, set()).add(run.seed)
-    return len(set.intersection(*seeds.values())) > 1 if seeds else False
+    by_case = grouped(good, lambda run: run.case).values()
+    return len(set.intersection(*({run.seed for run in runs} for runs in by_case))) > 1

@@ -18,8 +18,8 @@ from rewild4d.leaderboard.curves import curve, moments
 from rewild4d.leaderboard.formats import ARROWS, html
 from rewild4d.leaderboard.layout import Table
 from rewild4d.leaderboard.records import FILE, RunRecord
-from rewild4d.leaderboard.tables import by_protocol, columns_of, standings
-from rewild4d.leaderboard.variants import variants
+from rewild4d.leaderboard.tables import columns_of, standings
+from rewild4d.leaderboard.variants import by_protocol, flat, variants
 
 TITLE = "Reconstructing 4D animals from one video"
 MARKER = ".rewild4d-leaderboard"
@@ -82,7 +82,7 @@ def _write(parts: Sequence[Part], folder: Path) -> None:
         pictures = list(_copy_pictures(source, record, page))
         shutil.copyfile(source / FILE, page / FILE)
         text = pages.get_template("run.html").render(
-            title=f"{record.method} on {record.case}", record=record, scores=_scores(record), curves=_curves(record),
+            title=f"{record.method} on {record.case}", record=record, scores=list(_scores(record)),
             pictures=pictures, provenance=_provenance(record), **assets,
         )  # fmt: skip
         (page / "index.html").write_text(text, encoding="utf-8")
@@ -134,7 +134,8 @@ def _sections(records: Sequence[RunRecord], key: str) -> list[dict[str, Any]]:
         labels = {record.run_id: variant.label for variant in variants(group) for record in variant.records}
         protocol = group[0].protocol
         sections.append({
-            **_shown(table, key), "description": protocol.get("description", ""), "columns": columns_of(group),
+            **_shown(table, key), "description": protocol.get("description", ""),
+            "columns": columns_of(group, protocol["scores"]),
             "runs": [_run_row(record, labels[record.run_id]) for record in group],
         })  # fmt: skip
     return sections
@@ -142,34 +143,23 @@ def _sections(records: Sequence[RunRecord], key: str) -> list[dict[str, Any]]:
 
 def _run_row(record: RunRecord, label: str) -> dict[str, Any]:
     return {
-        "id": record.run_id, "href": f"{_place(record).as_posix()}/index.html", "case": record.case, "label": label,
-        "flags": [mark.partition(":")[0] for mark in record.marks], "preset": record.preset, "seed": record.seed,
-        "status": record.status, "seconds": record.timing.fit_seconds,
+        "record": record, "label": label, "href": f"{_place(record).as_posix()}/index.html",
+        "flags": [mark.partition(":")[0] for mark in record.marks],
         "cells": [cell([record], [record.case], name) for name in record.protocol["scores"]],
     }  # fmt: skip
 
 
-def _scores(record: RunRecord) -> list[dict[str, Any]]:
-    rows = []
-    for column in columns_of([record]):
-        score = record.scores.get(column.score)
-        if score is not None:
-            shown = cell([record], [record.case], column.score)
-            title = f"{column.title.partition(',')[0]} {ARROWS[column.better]}"
-            rows.append({"title": title, "value": score.value, "text": shown.text, "unit": score.unit,
-                         "count": score.count, "note": score.note})  # fmt: skip
-    return rows
-
-
-def _curves(record: RunRecord) -> list[Markup]:
-    """A curve of each score that has values at several moments."""
-    curves = []
-    for column in columns_of([record]):
-        score = record.scores.get(column.score)
-        points = moments(score, record.items) if score else []
-        if len(points) > 1:
-            curves.append(Markup(curve(column.title, points)))
-    return curves
+def _scores(record: RunRecord) -> Iterator[dict[str, Any]]:
+    """What a run's page shows of each score, with a curve of those that have values at several moments."""
+    names = [name for name in record.protocol["scores"] if name in record.scores]
+    for column in columns_of([record], names):
+        score = record.scores[column.score]
+        points = moments(score, record.items)
+        yield {
+            "title": f"{column.title.partition(',')[0]} {ARROWS[column.better]}", "score": score,
+            "text": cell([record], [record.case], column.score).text,
+            "curve": Markup(curve(column.title, points)) if len(points) > 1 else "",
+        }  # fmt: skip
 
 
 def _copy_pictures(source: Path, record: RunRecord, page: Path) -> Iterator[dict[str, Any]]:
@@ -193,12 +183,8 @@ def _provenance(record: RunRecord) -> list[tuple[str, list[tuple[str, str]]]]:
         "Time": {"started": record.timing.started, "fit, s": record.timing.fit_seconds,
                  "evaluation, s": record.timing.evaluate_seconds, "peak memory, MiB": record.timing.peak_memory_mib},
     }  # fmt: skip
-    return [(title, list(_rows(part))) for title, part in parts.items() if part]
-
-
-def _rows(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            yield from _rows(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    return [
+        (title, [(name, ", ".join(map(str, value)) if isinstance(value, list) else str(value))
+                 for name, value in flat(part).items()])
+        for title, part in parts.items() if part
+    ]  # fmt: skip

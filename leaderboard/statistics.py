@@ -113,24 +113,20 @@ def ranks(estimates: Sequence[Estimate | None], better: str, digits: int) -> lis
         digits: printed after the point; what prints alike is alike.
     """
     sign = -1 if better == "higher" else 1
-    known = [(sign * round(found.mean, digits), index) for index, found in enumerate(estimates) if found is not None]
+    known = sorted((sign * round(e.mean, digits), i, e.spread or 0.0) for i, e in enumerate(estimates) if e is not None)
     marks = [""] * len(estimates)
-    first = _leaders(sorted(known), estimates)
-    if len(first) == 1 and len(known) > 1:
+    if len(known) < 2:
+        return marks
+    first = _leaders(known)
+    if len(first) == 1:
         marks[first[0]] = "best"
-        first = _leaders(sorted(entry for entry in known if entry[1] != first[0]), estimates)
-    if len(known) > 1:
-        for index in first:
-            marks[index] = "second"
+        first = _leaders(known[1:])
+    for index in first:
+        marks[index] = "second"
     return marks
 
 
-def _leaders(ordered: Sequence[tuple[float, int]], estimates: Sequence[Estimate | None]) -> list[int]:
-    """Indices of the first and of all that the spread does not tell apart from it."""
-
-    def spread(index: int) -> float:
-        found = estimates[index]
-        return (found.spread or 0.0) if found else 0.0
-
-    value, best = ordered[0] if ordered else (0.0, 0)
-    return [index for other, index in ordered if other - value <= max(spread(best), spread(index))]
+def _leaders(ordered: Sequence[tuple[float, int, float]]) -> list[int]:
+    """Indices of the first of (value, index, spread) and of all that the spread does not tell apart from it."""
+    best, _, spread = ordered[0]
+    return [index for value, index, other in ordered if value - best <= max(spread, other)]

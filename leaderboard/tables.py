@@ -1,7 +1,6 @@
 """Tables from records, and from nothing else: one per protocol, or one whose rows somebody named."""
 
 import statistics
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -13,8 +12,17 @@ from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.remarks import cases_said, seeds_said
 from rewild4d.leaderboard.specs import Reported, ReportedCell
 from rewild4d.leaderboard.statistics import Estimate, estimate, ranks
-from rewild4d.leaderboard.titles import LESS_IS_BETTER, TITLES, digits_of
-from rewild4d.leaderboard.variants import Variant, coverage_text, is_floor, latest, marks, variants
+from rewild4d.leaderboard.titles import TITLES, better_of, digits_of
+from rewild4d.leaderboard.variants import (
+    Variant,
+    by_protocol,
+    coverage_text,
+    is_floor,
+    latest,
+    marks,
+    row_kind,
+    variants,
+)
 from rewild4d.metrics.names import KINDS
 
 POOLED = "KID and FVD in rows of the mean are means over cases; `table --pooled` computes them over all cases at once."
@@ -59,12 +67,12 @@ class Frame:
 
 
 def markdown(records: Sequence[RunRecord]) -> str:
-    """One Markdown table per (data set, protocol); see `protocol_tables`."""
+    """Write one Markdown table per (data set, protocol); see `protocol_tables`."""
     return "\n\n".join(map(to_markdown, protocol_tables(records))) or "no records"
 
 
 def protocol_tables(records: Sequence[RunRecord]) -> list[Table]:
-    """A table per (data set, protocol): a row per case and method, and the mean where cases are several.
+    """Make a table per (data set, protocol): a row per case and method, and the mean where cases are several.
 
     A cell is the mean over seeds, with the standard deviation where there are several. Methods are averaged over cases
     only where they were run on the same set of cases; otherwise a note says which are missing.
@@ -75,25 +83,18 @@ def protocol_tables(records: Sequence[RunRecord]) -> list[Table]:
         cases = list(dict.fromkeys(record.case for record in kept))
         named = variants(kept)
         frame = _frame(kept, remarks)
-        columns = (*_columns(frame, kept), Column("seeds"), Column("fit, s"))
-        rows = [
-            _timed_row(case, variant, [case], frame.scores)
-            for case in cases
-            for variant in named
-            if any(record.case == case for record in variant.records)
-        ]
-        if len(cases) > 1:
-            rows += [_timed_row("mean", variant, cases, frame.scores) for variant in named]
-            if any(name in scores for scores in KINDS.values() for name in frame.scores):
-                frame = replace(frame, remarks=(*frame.remarks, POOLED))
-        tables.append(
-            Table(frame.name, frame.title, frame.caption, ("case", "method"), columns, tuple(rows), frame.remarks)
-        )
+        columns = (*columns_of(kept, frame.scores), Column("seeds"), Column("fit, s"))
+        over = [[case] for case in cases] + [cases] * (len(cases) > 1)
+        rows = [row for some in over for variant in named if (row := _timed_row(variant, some, frame.scores))]
+        sets = len(cases) > 1 and any(name in scores for scores in KINDS.values() for name in frame.scores)
+        remarks = [*frame.remarks, *([POOLED] if sets else [])]
+        stubs = ("case", "method")
+        tables.append(Table(frame.name, frame.title, frame.caption, stubs, columns, tuple(rows), tuple(remarks)))
     return tables
 
 
 def standings(records: Sequence[RunRecord]) -> list[Table]:
-    """A table per (data set, protocol): one row a method, its mean over the cases, ranked."""
+    """Make a table per (data set, protocol): one row a method, its mean over the cases, ranked."""
     tables = []
     for group in by_protocol(records):
         kept, remarks = latest(group)
@@ -102,16 +103,8 @@ def standings(records: Sequence[RunRecord]) -> list[Table]:
     return tables
 
 
-def by_protocol(records: Sequence[RunRecord]) -> list[list[RunRecord]]:
-    """Records grouped by data set and protocol, in their names' order."""
-    groups: dict[tuple[str, str], list[RunRecord]] = defaultdict(list)
-    for record in records:
-        groups[record.dataset, record.protocol["name"]].append(record)
-    return [group for _, group in sorted(groups.items())]
-
-
 def named_table(frame: Frame, entrants: Sequence[Entrant], reported: Reported | None = None) -> Table:
-    """Rows are entrants, columns are scores under conditions, a cell is the mean over the cases of its condition.
+    """Make a table whose rows are entrants, columns scores under conditions, cells means over the cases of a condition.
 
     The best of a column is bold and the second underlined, as `rewild4d.leaderboard.statistics.ranks` tells them apart
     by the spread over seeds. Reported rows and those that had what the others had not are never ranked. Remarks say
@@ -122,10 +115,15 @@ def named_table(frame: Frame, entrants: Sequence[Entrant], reported: Reported | 
         entrants: rows with their records; the cases of a condition are those that any entrant was run on.
         reported: what the paper printed, below the others.
     """
-    everything = [record for entrant in entrants for under in entrant.records for record in under]
-    columns = _columns(frame, everything)
-    rows = [_named_row(entrant, entrants, columns, frame) for entrant in entrants]
-    rows = _apart(_ranked(rows, columns))
+    columns = columns_of(runs_of(entrants), frame.scores, frame.conditions)
+    cases = [cases_of(entrants, index) for index in range(len(frame.conditions))]
+    rows = ranked([
+        row_of(entrant, [
+            cell(under, names, score, entrant.absent)
+            for under, names in zip(entrant.records, cases, strict=True) for score in frame.scores
+        ])
+        for entrant in entrants
+    ], columns)  # fmt: skip
     remarks = [*rests_on(frame, entrants), *frame.remarks]
     if reported is not None:
         rows += _reported_rows(reported, columns)
@@ -134,7 +132,7 @@ def named_table(frame: Frame, entrants: Sequence[Entrant], reported: Reported | 
 
 
 def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) -> Table:
-    """Every row less a reference row: mean of the cases' differences, and its 95 % bootstrap interval in brackets.
+    """Subtract a reference row from every row: mean of the cases' differences, 95 % bootstrap interval in brackets.
 
     A row that is better than the reference, by an interval without 0, is bold; one that is worse by such an interval is
     not marked. Rows that had what the others had not are never marked.
@@ -145,18 +143,14 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
     reference = next((entrant for entrant in entrants if entrant.label.lower() == against.lower()), None)
     if reference is None:
         raise unknown_name("row", against, [entrant.label for entrant in entrants])
-    everything = [record for entrant in entrants for under in entrant.records for record in under]
-    columns = _columns(frame, everything)
+    columns = columns_of(runs_of(entrants), frame.scores, frame.conditions)
     rows = []
     for entrant in entrants:
-        if entrant is reference:
-            continue
-        pairs = zip(entrant.records, reference.records, strict=True)
-        cells = [difference(*pair, name, entrant.absent) for pair in pairs for name in frame.scores]
-        flags = marks([record for under in entrant.records for record in under])
-        if not flags:
-            cells = [_leading(cell, column.better) for cell, column in zip(cells, columns, strict=True)]
-        rows.append(Row((entrant.label,), tuple(cells), kind_of(entrant), (*entrant.notes, *flags), flags))
+        if entrant is not reference:
+            pairs = zip(entrant.records, reference.records, strict=True)
+            cells = [difference(*pair, name, entrant.absent) for pair in pairs for name in frame.scores]
+            row = row_of(entrant, cells)
+            rows.append(row if row.flags else _leading(row, columns))
     return Table(
         f"{frame.name}-difference",
         f"{frame.title}: difference to {reference.label}",
@@ -168,8 +162,19 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
     )
 
 
+def runs_of(entrants: Sequence[Entrant]) -> list[RunRecord]:
+    """Gather the records of entrants under all conditions."""
+    return [record for entrant in entrants for under in entrant.records for record in under]
+
+
+def row_of(entrant: Entrant, cells: Sequence[Cell]) -> Row:
+    """Make the row of an entrant, with what its records say beside their numbers."""
+    flags = marks(runs_of([entrant]))
+    return Row((entrant.label,), tuple(cells), kind_of(entrant), (*entrant.notes, *flags), flags)
+
+
 def rests_on(frame: Frame, entrants: Sequence[Entrant], words: str = "Mean over") -> list[str]:
-    """A sentence on the cases that the rows' figures are over, and one on their seeds; none where nothing was run."""
+    """Say over which cases and how many seeds the rows' figures are; nothing where nothing was run."""
     seeds = seeds_said([under for entrant in entrants if kind_of(entrant) != "floor" for under in entrant.records])
     return _over(frame, entrants, words) + ([seeds] if seeds else [])
 
@@ -181,7 +186,7 @@ def _over(frame: Frame, entrants: Sequence[Entrant], words: str) -> list[str]:
 
 
 def cases_of(entrants: Sequence[Entrant], condition: int) -> list[str]:
-    """The cases that any row was run on under a condition."""
+    """List the cases that any row was run on under a condition."""
     return list(dict.fromkeys(record.case for entrant in entrants for record in entrant.records[condition]))
 
 
@@ -195,16 +200,28 @@ def _difference_caption(reference: str, entrants: Sequence[Entrant]) -> str:
     )
 
 
-def _leading(found: Cell, better: str) -> Cell:
-    """The difference, marked where its whole interval is on the better side of 0."""
-    low, high = found.interval or (0.0, 0.0)
-    leads = low > 0 if better == "higher" else high < 0
-    return replace(found, mark="best") if leads else found
+def _leading(row: Row, columns: Sequence[Column]) -> Row:
+    """The row, with its differences marked whose whole interval is on the better side of 0."""
+    cells = []
+    for found, column in zip(row.cells, columns, strict=True):
+        low, high = found.interval or (0.0, 0.0)
+        leads = low > 0 if column.better == "higher" else high < 0
+        cells.append(replace(found, mark="best" if leads else ""))
+    return replace(row, cells=tuple(cells))
 
 
-def columns_of(records: Sequence[RunRecord]) -> tuple[Column, ...]:
-    """The columns of a protocol's scores."""
-    return _columns(_frame(records, ()), records)
+def columns_of(
+    records: Sequence[RunRecord], scores: Sequence[str], conditions: Sequence[str] = ("",)
+) -> tuple[Column, ...]:
+    """Make a column for each score under each condition, with unit and direction as the records say."""
+    known = {name: score for record in records for name, score in record.scores.items()}
+    columns = []
+    for condition in conditions:
+        for name in scores:
+            score = known.get(name)
+            unit = f", {score.unit}" if score and score.unit != "1" else ""
+            columns.append(Column(TITLES.get(name, name) + unit, better_of(name, known), condition, name))
+    return tuple(columns)
 
 
 def _frame(records: Sequence[RunRecord], remarks: Sequence[str]) -> Frame:
@@ -238,50 +255,25 @@ def _has_shape(record: RunRecord) -> bool:
     return all(score.value is not None for score in record.scores.values() if score.floor is not None)
 
 
-def _columns(frame: Frame, records: Sequence[RunRecord]) -> tuple[Column, ...]:
-    known = {name: score for record in records for name, score in record.scores.items()}
-    columns = []
-    for condition in frame.conditions:
-        for name in frame.scores:
-            score = known.get(name)
-            unit = f", {score.unit}" if score and score.unit != "1" else ""
-            less = score.better == "lower" if score else name.startswith(LESS_IS_BETTER)
-            columns.append(Column(TITLES.get(name, name) + unit, "lower" if less else "higher", condition, name))
-    return tuple(columns)
-
-
-def _timed_row(title: str, variant: Variant, cases: list[str], scores: Sequence[str]) -> Row:
-    """A row of one case or of the mean over several, with the number of seeds and the time of a fit."""
+def _timed_row(variant: Variant, cases: list[str], scores: Sequence[str]) -> Row | None:
+    """A row of one case or of the mean over several, with seeds and the time of a fit; None where nothing was run."""
     runs = [record for record in variant.records if record.case in cases]
+    if not runs:
+        return None
     good = [run for run in runs if run.status == "ok"]
     whole = {run.case for run in good} == set(cases)
-    seeds = "" if len(cases) > 1 else str(len(good)) if len(good) == len(runs) else f"{len(good)} of {len(runs)}"
+    mean = len(cases) > 1
+    seeds = "" if mean else str(len(good)) if len(good) == len(runs) else f"{len(good)} of {len(runs)}"
     seconds = f"{statistics.fmean(run.timing.fit_seconds for run in good):.0f}" if whole else "-"
     cells = (*(cell(runs, cases, name) for name in scores), Cell(seeds), Cell(seconds))
-    kind = "floor" if variant.is_floor else "method"
-    return Row((title, variant.label), cells, kind, variant.marks, variant.marks, summary=len(cases) > 1)
-
-
-def _named_row(entrant: Entrant, entrants: Sequence[Entrant], columns: Sequence[Column], frame: Frame) -> Row:
-    cells = []
-    for index in range(len(frame.conditions)):
-        cases = cases_of(entrants, index)
-        for name in frame.scores:
-            if entrant.absent or not cases:
-                cells.append(Cell("n/a", note=entrant.absent or "no record yet"))
-            else:
-                cells.append(cell(entrant.records[index], cases, name))
-    everything = [record for under in entrant.records for record in under]
-    flags = marks(everything)
-    return Row((entrant.label,), tuple(cells), kind_of(entrant), (*entrant.notes, *flags), flags)
+    said = marks(variant.records)
+    kind = "floor" if is_floor(variant.records[0]) else "method"
+    return Row(("mean" if mean else cases[0], variant.label), cells, kind, said, said, summary=mean)
 
 
 def kind_of(entrant: Entrant) -> str:
-    """Of its row: "method", "unranked" where it had what the others had not, or "floor"."""
-    records = [record for under in entrant.records for record in under]
-    if marks(records):
-        return "unranked"
-    return "floor" if records and is_floor(records[0]) else "method"
+    """Name the kind of its row: "method", "unranked" where it had what the others had not, or "floor"."""
+    return row_kind(runs_of([entrant]))
 
 
 def _apart(rows: list[Row]) -> list[Row]:
@@ -290,18 +282,21 @@ def _apart(rows: list[Row]) -> list[Row]:
     return sorted(rows, key=lambda row: order[row.kind])
 
 
-def _ranked(rows: list[Row], columns: Sequence[Column]) -> list[Row]:
-    """The same rows with the best and the second of each column marked; floors compete too."""
-    competing = [index for index, row in enumerate(rows) if row.kind != "unranked"]
+def ranked(rows: Sequence[Row], columns: Sequence[Column]) -> list[Row]:
+    """Put methods before those that are not ranked before floors, and mark best and second of each column.
+
+    Floors compete too; what prints alike is alike.
+    """
+    found = []
     for place, column in enumerate(columns):
-        cells = [rows[index].cells[place] for index in competing]
-        known = [Estimate(c.value, c.deviation, 0) if c.value is not None else None for c in cells]
-        digits = max((len(c.text.partition(".")[2]) for c in cells if c.value is not None), default=0)
-        for index, mark in zip(competing, ranks(known, column.better, digits), strict=True):
-            marked = list(rows[index].cells)
-            marked[place] = replace(marked[place], mark=mark)
-            rows[index] = replace(rows[index], cells=tuple(marked))
-    return rows
+        cells = [row.cells[place] if row.kind != "unranked" else Cell("") for row in rows]
+        known = [None if c.value is None else Estimate(c.value, c.deviation, 0) for c in cells]
+        digits = max((len(c.text.partition(" ")[0].partition(".")[2]) for c in cells), default=0)
+        found.append(ranks(known, column.better, digits))
+    return _apart([
+        replace(row, cells=tuple(replace(c, mark=marked[index]) for c, marked in zip(row.cells, found, strict=True)))
+        for index, row in enumerate(rows)
+    ])  # fmt: skip
 
 
 def _reported_rows(reported: Reported, columns: Sequence[Column]) -> list[Row]:

@@ -1,5 +1,9 @@
 """How scores are called and printed in tables."""
 
+from collections.abc import Mapping
+
+from rewild4d.metrics.score import Score
+
 TITLES = {
     "psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS-alex", "lpips_vgg": "LPIPS-vgg",
     "psnr_fg": "PSNR foreground", "psnr_union": "PSNR union", "psnr_crop": "PSNR crop", "iou": "mask IoU",
@@ -22,6 +26,11 @@ LESS_IS_BETTER = ("lpips", "chamfer", "kid", "fvd", "kvd")
 """Beginnings of such scores' names; asked only where no record says it."""
 
 
+def better_of(name: str, known: Mapping[str, Score]) -> str:
+    """Tell whether "higher" or "lower" is better: what a known score of that name says, else what the name says."""
+    return known[name].better if name in known else "lower" if name.startswith(LESS_IS_BETTER) else "higher"
+
+
 def digits_of(name: str, unit: str) -> int:
-    """Printed after the point: what the score's name says, else its unit, else three."""
+    """Tell how many digits are printed after the point: what the score's name says, else its unit, else three."""
     return DIGITS.get(name, DIGITS.get(unit, 3))

@@ -5,36 +5,46 @@ import json
 import re
 import statistics
 from collections import Counter, defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import PurePath
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 from rewild4d.leaderboard.records import RunRecord
+
+T = TypeVar("T")
 
 _BUILT_IN = re.compile(r"(builtin-v\d+)-[0-9a-f]{12}")
 """A folder of the built-in animals: their version, then a digest of the sources that made them."""
 
 
-@dataclass(frozen=True)
-class Variant:
+class Variant(NamedTuple):
     """A method with its settings.
 
     Attributes:
         label: method, with what tells it from other variants of it: preset, settings, prior.
         records: all its runs.
-        is_floor: whether the protocol names it as one.
-        marks: what the records say beside their numbers ("upper bound: ...").
     """
 
     label: str
     records: tuple[RunRecord, ...]
-    is_floor: bool
-    marks: tuple[str, ...]
+
+
+def grouped(records: Iterable[RunRecord], key: Callable[[RunRecord], T]) -> dict[T, list[RunRecord]]:
+    """Group records by a key, in the order in which the keys are met."""
+    groups: dict[T, list[RunRecord]] = defaultdict(list)
+    for record in records:
+        groups[key(record)].append(record)
+    return dict(groups)
+
+
+def by_protocol(records: Iterable[RunRecord]) -> list[list[RunRecord]]:
+    """Group records by data set and protocol, in their names' order."""
+    groups = grouped(records, lambda record: (record.dataset, record.protocol["name"]))
+    return [group for _, group in sorted(groups.items())]
 
 
 def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
-    """The records that may stand in one table, and sentences on those left out.
+    """Choose the records that may stand in one table, and say in sentences which are left out.
 
     Of equal runs by several versions of the code the latest one counts. Of a case whose data has changed, and of a
     protocol that has, only the runs on the latest one count. The built-in animals of one version, and folders that were
@@ -44,9 +54,7 @@ def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
     remarks = []
     kept: list[RunRecord] = []
     rounded: dict[str, list[str]] = defaultdict(list)
-    cases: dict[tuple[str, str, str], list[RunRecord]] = defaultdict(list)
-    for record in records:
-        cases[record.dataset, record.protocol["name"], record.case].append(record)
+    cases = grouped(records, lambda record: (record.dataset, record.protocol["name"], record.case))
     for (_, protocol, case), runs in cases.items():
         newest = max(runs, key=_age)
         same = [run for run in runs if _comparable(run, newest)]
@@ -54,10 +62,8 @@ def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
             remarks.append(f"{protocol}, {case}: {len(runs) - len(same)} older records of other data left out.")
         if len({_digests(run) for run in same}) > 1:
             rounded[protocol].append(case)
-        once: dict[tuple[str, int], RunRecord] = {}
-        for run in sorted(same, key=_age):
-            once[_identity(run), run.seed] = run
-        kept += [run for run in same if once[_identity(run), run.seed] is run]
+        last = {(_identity(run), run.seed): run for run in sorted(same, key=_age)}
+        kept += [run for run in same if last[_identity(run), run.seed] is run]
     remarks += [
         f"{protocol}: {', '.join(found)} rendered on several kinds of processor, equal up to rounding."
         for protocol, found in rounded.items()
@@ -69,29 +75,31 @@ def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
 
 
 def variants(records: Sequence[RunRecord]) -> list[Variant]:
-    """Records grouped by method, preset, settings and prior, in the order in which they are met."""
-    groups: dict[str, list[RunRecord]] = defaultdict(list)
-    for record in records:
-        groups[_identity(record)].append(record)
-    found = list(groups.values())
-    return [
-        Variant(_label(group[0], [other[0] for other in found]), tuple(group), is_floor(group[0]), marks(group))
-        for group in found
-    ]
+    """Group records by method, preset, settings and prior, in the order in which they are met."""
+    groups = grouped(records, _identity).values()
+    firsts = [group[0] for group in groups]
+    return [Variant(_label(group[0], firsts), tuple(group)) for group in groups]
 
 
 def is_floor(record: RunRecord) -> bool:
-    """Whether the record's protocol names its method as a floor."""
+    """Tell whether the record's protocol names its method as a floor."""
     return record.method in record.protocol.get("floors", ())
 
 
 def marks(records: Sequence[RunRecord]) -> tuple[str, ...]:
-    """What the records say beside their numbers, each sentence once."""
+    """List what the records say beside their numbers, each sentence once."""
     return tuple(dict.fromkeys(mark for record in records for mark in record.marks))
 
 
+def row_kind(records: Sequence[RunRecord]) -> str:
+    """Name the kind of a row of records: "method", "unranked" where it had what the others had not, or "floor"."""
+    if marks(records):
+        return "unranked"
+    return "floor" if records and is_floor(records[0]) else "method"
+
+
 def coverage_text(records: Sequence[RunRecord]) -> str:
-    """What the numbers lean on, averaged over the cases."""
+    """Say what the numbers lean on, averaged over the cases."""
     by_case = {record.case: record.coverage for record in records if record.coverage}
     parts = []
     for key, text in (("foreground", "of a held-out image is animal"), ("seen_surface", "of its surface ever shown")):
@@ -127,21 +135,19 @@ def _settings(record: RunRecord) -> dict[str, Any]:
     """Everything that tells variants of a method apart, flat: "deform.enabled" -> False."""
     fit = json.dumps(record.prior.get("config"), sort_keys=True).encode()
     seen = record.prior.get("keypoints", "none")
-    return _flat(record.config) | {
+    return flat(record.config) | {
         "--prior": record.prior.get("choice", record.prior.get("name")),
         "prior fit": hashlib.sha256(fit).hexdigest()[:4],
         **({"--use-keypoints": seen} if seen != "none" else {}),
     }
 
 
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
+def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Flatten nested settings: {"deform": {"enabled": True}} -> {"deform.enabled": True}."""
+    found: dict[str, Any] = {}
     for name, value in tree.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{name}.")
-        else:
-            flat[prefix + name] = value
-    return flat
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return found
 
 
 def _identity(record: RunRecord) -> str:
