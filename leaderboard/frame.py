@@ -1,5 +1,6 @@
 """Run records as pandas data frames: a row for each run and metric, or for each image of each run and metric."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -113,7 +114,7 @@ def items_frame(folder: Path) -> "pd.DataFrame":
                 rows.append({
                     **run, "metric": metric, "item": range(size), "value": score.per_item, "unit": score.unit,
                     "label": record.items if len(record.items) == size else [""] * size,
-                    "time": times_of(score, record.items) or [None] * size, "better": score.better,
+                    "time": times_of(score, record.items) or [math.nan] * size, "better": score.better,
                 })  # fmt: skip
     frame = pd.DataFrame(rows, columns=list(ITEMS)).explode(["item", "label", "time", "value"], ignore_index=True)
     return frame.astype({"item": int, "label": str, "time": float, "value": float})
