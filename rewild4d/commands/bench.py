@@ -63,7 +63,7 @@ class StepOptions:
         preset: of `ours`; its image size and number of Gaussians are those above.
         device: cpu or cuda.
         probes: measure peak memory too (on the CPU), in processes of their own.
-        kernels: time the step with each fused kernel switched off too, at presets quick and paper (on the CPU).
+        by_kernel: time the step with each fused kernel switched off too, at presets quick and paper (on the CPU).
         threads: that compute; torch's own number where it is left out.
         out: file for the data; results/speed/step-<processor>-<day>.json where it is left out.
         json: print the data as JSON, and nothing else, to standard output.
@@ -75,7 +75,7 @@ class StepOptions:
     preset: str = "paper"
     device: str = "cpu"
     probes: bool = True
-    kernels: bool = True
+    by_kernel: bool = True
     threads: int | None = None
     out: Path | None = None
     json: bool = False
@@ -126,7 +126,7 @@ def _step(arguments: list[str]) -> int:
     return _report(
         arguments, options, settings, {}, device,
         lambda: bench_step(
-            options.gaussians, options.sizes, options.repeats, options.preset, options.probes, device, options.kernels
+            options.gaussians, options.sizes, options.repeats, options.preset, options.probes, device, options.by_kernel
         ),
     )  # fmt: skip
 

@@ -21,6 +21,8 @@ class Options:
         data: where the data is now, if it was moved since.
         device: auto, cpu or cuda.
         rasterizer: what renders: auto, numba (CPU), triton or gsplat (CUDA), or reference (small scenes only).
+        kernels: auto (fused CPU kernels where they fit) or torch (plain torch everywhere, to try edited code); auto, or
+            what $REWILD4D_KERNELS says, where it is left out.
         json: print the records as a JSON array, and nothing else, to standard output.
     """
 
@@ -28,6 +30,7 @@ class Options:
     data: Path | None = None
     device: str = "auto"
     rasterizer: str = "auto"
+    kernels: str | None = None
     json: bool = False
 
 
@@ -35,10 +38,12 @@ def main(arguments: list[str]) -> int:
     options = parse_flags(Options, arguments, prog="rewild4d-bench evaluate", description=DESCRIPTION)
     if not options.runs:
         raise UserError("evaluate: expected the folder of at least one run, got none.")
+    from rewild4d.kernels.switch import choose_kernels
     from rewild4d.leaderboard.records import to_json
     from rewild4d.leaderboard.tables import markdown
     from rewild4d.running.rescoring import score_again
 
+    choose_kernels(options.kernels)
     records = [score_again(folder, options.data, options.device, options.rasterizer) for folder in options.runs]
     print("[" + ",\n".join(map(to_json, records)) + "]" if options.json else markdown(records))
     return 0

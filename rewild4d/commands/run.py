@@ -63,6 +63,8 @@ class Options:
             scored). Where it is left out: all of aptv2's and of a file's, none of BADJA's beside davis.
         device: auto, cpu or cuda.
         rasterizer: what renders: auto, numba (CPU), triton or gsplat (CUDA), or reference (small scenes only).
+        kernels: auto (fused CPU kernels where they fit) or torch (plain torch everywhere, to try edited code); auto, or
+            what $REWILD4D_KERNELS says, where it is left out.
         jobs: runs at a time (a case, a method and a seed each); 0 is one for each processor core (one in all on a GPU).
         threads: of torch in each run; other numbers than 1 may change the last digits. Our own kernels take idle cores
             unasked, which changes nothing but the time.
@@ -89,6 +91,7 @@ class Options:
     use_keypoints: Use | None = None
     device: str = "auto"
     rasterizer: str = "auto"
+    kernels: str | None = None
     jobs: int = 0
     threads: int = 1
     out: Path = Path("runs")
@@ -133,11 +136,13 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
     if not options.seeds:
         raise UserError("--seeds: expected at least one number, got none.")
     check_seeds(options.seeds)
+    from rewild4d.kernels.switch import choose_kernels
     from rewild4d.machine import pick_device
     from rewild4d.rasterizer import pick_rasterizer
     from rewild4d.running.runner import Entry, Plan, choose_cases
     from rewild4d.running.workers import usable_cores
 
+    choose_kernels(options.kernels)
     device = pick_device(options.device)
     rasterizer = pick_rasterizer(options.rasterizer, device)
     require_writable(options.out)

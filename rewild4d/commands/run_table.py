@@ -55,6 +55,8 @@ class Options:
         seeds: one run for each; the table's where they are left out.
         device: auto, cpu or cuda.
         rasterizer: what renders: auto, numba (CPU), triton or gsplat (CUDA), or reference (small scenes only).
+        kernels: auto (fused CPU kernels where they fit) or torch (plain torch everywhere, to try edited code); auto, or
+            what $REWILD4D_KERNELS says, where it is left out.
         jobs: runs at a time; 0 is one for each processor core (one in all on a GPU).
         threads: of torch in each run; other numbers than 1 may change the last digits. Our own kernels take idle cores
             unasked, which changes nothing but the time.
@@ -77,6 +79,7 @@ class Options:
     seeds: tuple[int, ...] = ()
     device: str = "auto"
     rasterizer: str = "auto"
+    kernels: str | None = None
     jobs: int = 0
     threads: int = 1
     out: Path = Path("runs")
@@ -124,12 +127,14 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
     check_numbers(options.jobs, options.threads)
     check_seeds(options.seeds)
     require_name("datasets", spec.dataset)
+    from rewild4d.kernels.switch import choose_kernels
     from rewild4d.machine import pick_device
     from rewild4d.rasterizer import pick_rasterizer
     from rewild4d.running import planning
     from rewild4d.running.runner import Plan
     from rewild4d.running.workers import usable_cores
 
+    choose_kernels(options.kernels)
     device = pick_device(options.device)
     rasterizer = pick_rasterizer(options.rasterizer, device)
     protocols = {one.protocol: planning.protocol_of(spec, one.protocol) for one in spec.conditions}

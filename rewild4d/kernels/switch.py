@@ -34,18 +34,18 @@ KERNELS: dict[str, "Kernel"] = {}
 _without: set[str] = set()
 
 
-def set_kernels(mode: str) -> None:
+def choose_kernels(mode: str | None) -> None:
     """Choose for this process and for those that it starts.
 
     Args:
-        mode: "auto" runs fused kernels where they fit, "torch" runs plain torch everywhere.
+        mode: "auto" runs fused kernels where they fit, "torch" runs plain torch everywhere; None keeps what is in force.
 
     Raises:
-        UserError: another mode.
+        UserError: another mode, here or in the environment.
     """
-    if mode not in MODES:
+    if mode is not None and mode not in MODES:
         raise unknown_name("mode of --kernels", mode, MODES)
-    os.environ[VARIABLE] = mode
+    os.environ[VARIABLE] = mode or kernel_mode()
 
 
 def kernel_mode() -> str:

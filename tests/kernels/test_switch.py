@@ -15,13 +15,14 @@ from numba.core.registry import CPUDispatcher
 
 import rewild4d.ours.fused
 from rewild4d.benchmarks.scenes import training
+from rewild4d.cli import main
 from rewild4d.errors import UserError
 from rewild4d.kernels import switch
 from rewild4d.kernels.switch import (
     KERNELS,
     Kernel,
+    choose_kernels,
     kernel_mode,
-    set_kernels,
     source_digest,
     twin_digest,
     without_kernels,
@@ -71,7 +72,7 @@ def test_layout_comments_docstrings_and_annotations_do_not_count(tmp_path: Path)
 
 def test_an_unknown_mode_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UserError, match="unknown mode of --kernels 'touch'. Did you mean 'torch'?"):
-        set_kernels("touch")
+        choose_kernels("touch")
     monkeypatch.setenv(switch.VARIABLE, "numba")
     with pytest.raises(UserError, match="REWILD4D_KERNELS: expected auto or torch, got 'numba'"):
         kernel_mode()
@@ -147,10 +148,10 @@ def test_one_kernel_can_be_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_children_get_the_mode(monkeypatch: pytest.MonkeyPatch) -> None:
-    set_kernels("torch")
+    choose_kernels("torch")
     assert os.environ[switch.VARIABLE] == "torch" and kernel_mode() == "torch"
     assert switch.chosen_kernels() == {"kernels": "torch"}
-    set_kernels("auto")
+    choose_kernels("auto")
     assert switch.chosen_kernels() == {}
 
 
@@ -159,3 +160,16 @@ def test_a_kernel_without_source_is_taken_as_it_is() -> None:
     assert source_digest((code,)) == ""
     lone = Kernel("lone", "0" * 12)
     assert lone.is_current() and KERNELS.pop("lone") is lone
+
+
+def test_the_flag_is_checked_before_anything_is_read(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["run", "--kernels", "numba", "--data", "/nowhere"])
+    assert stop.value.code == 2
+    assert "unknown mode of --kernels 'numba'" in capsys.readouterr().err
+    monkeypatch.setenv(switch.VARIABLE, "numba")
+    with pytest.raises(SystemExit) as stop:
+        main(["run", "--data", "/nowhere"])
+    assert stop.value.code == 2 and "REWILD4D_KERNELS: expected auto or torch, got 'numba'" in capsys.readouterr().err
