@@ -38,7 +38,7 @@ def choose_kernels(mode: str | None) -> None:
     """Choose for this process and for those that it starts.
 
     Args:
-        mode: "auto" runs fused kernels where they fit, "torch" runs plain torch everywhere; None keeps what is in force.
+        mode: "auto" runs fused kernels where they fit, "torch" plain torch everywhere; None keeps what is in force.
 
     Raises:
         UserError: another mode, here or in the environment.
