@@ -29,11 +29,11 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
+from rewild4d.baselines.common.saved import Root, gaussians_from_state, load_state, save_state, splats_of
+from rewild4d.baselines.common.splatting import Shape, SplatTraining, run_steps, surface_gaussians
+from rewild4d.baselines.common.volume import random_points, scene_frame
 from rewild4d.baselines.d3dgs_config import INFO, STAR_INFO, D3dgsConfig, D3dgsStarConfig, NetworkShape
 from rewild4d.baselines.d3dgs_network import DeformationNetwork
-from rewild4d.baselines.saved import Root, gaussians_from_state, load_state, save_state, splats_of
-from rewild4d.baselines.splatting import Shape, SplatTraining, run_steps, surface_gaussians
-from rewild4d.baselines.volume import random_points, scene_frame
 from rewild4d.contracts import Log, MethodInfo
 from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.checkpoint import fit_digest

@@ -2,7 +2,7 @@
 
 import msgspec
 
-from rewild4d.baselines.splatting_config import ImageLoss, Resets, SplatConfig
+from rewild4d.baselines.common.splatting_config import ImageLoss, Resets, SplatConfig
 from rewild4d.contracts import MethodInfo
 from rewild4d.ours.config import Canonical, Count, Degree, Density, Opacity, Positive, Rate, Share, Weight, Whole
 

@@ -29,14 +29,14 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from rewild4d.baselines.common.saved import Root, gaussians_from_state, load_state
+from rewild4d.baselines.common.splatting import SplatTraining, run_steps, surface_gaussians
 from rewild4d.baselines.gart_config import INFO, STAR_INFO, GartConfig, GartStarConfig
 from rewild4d.baselines.gart_reconstruction import GartReconstruction, GartStarReconstruction
 from rewild4d.baselines.gart_refine import refine_step
 from rewild4d.baselines.gart_skeleton import PoseTable, prior_poses
 from rewild4d.baselines.gart_skinning import ResidualField, posed
 from rewild4d.baselines.gart_smal import template_prior
-from rewild4d.baselines.saved import Root, gaussians_from_state, load_state
-from rewild4d.baselines.splatting import SplatTraining, run_steps, surface_gaussians
 from rewild4d.contracts import Log, MethodInfo
 from rewild4d.harmonics import C0
 from rewild4d.kernels.threads import torch_on_one

@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from rewild4d.baselines.splatting_config import GaussianRates, ImageLoss, Resets, SplatConfig
+from rewild4d.baselines.common.splatting_config import GaussianRates, ImageLoss, Resets, SplatConfig
 from rewild4d.contracts import MethodInfo
 from rewild4d.ours.config import (
     Canonical,

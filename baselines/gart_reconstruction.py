@@ -6,11 +6,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from rewild4d.baselines.common.saved import Root, save_state, splats_of
 from rewild4d.baselines.gart_config import GartConfig, GartStarConfig
 from rewild4d.baselines.gart_refine import refine_moments
 from rewild4d.baselines.gart_skeleton import PoseTable
 from rewild4d.baselines.gart_skinning import posed
-from rewild4d.baselines.saved import Root, save_state, splats_of
 from rewild4d.contracts import Log
 from rewild4d.ours.canonical import Gaussians
 from rewild4d.types import Camera, Frame, Splats

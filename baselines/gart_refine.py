@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from rewild4d.baselines.common.saved import Root
+from rewild4d.baselines.common.splatting import image_losses, render
 from rewild4d.baselines.gart_config import GartStarConfig
 from rewild4d.baselines.gart_skeleton import PoseTable
 from rewild4d.baselines.gart_skinning import posed
-from rewild4d.baselines.saved import Root
-from rewild4d.baselines.splatting import image_losses, render
 from rewild4d.contracts import Log
 from rewild4d.kernels.threads import torch_on_one
 from rewild4d.ours.canonical import Gaussians

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from rewild4d.baselines.splatting import Shape
+from rewild4d.baselines.common.splatting import Shape
 from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.config import Skinning
 from rewild4d.ours.fused.field import RESIDUAL_FIELD, sample_grid

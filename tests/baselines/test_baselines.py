@@ -10,13 +10,13 @@ import pytest
 import torch
 from dying import Killed, kill_late
 
+from rewild4d.baselines.common.saved import Root
+from rewild4d.baselines.common.splatting import reset_opacities, surface_gaussians
+from rewild4d.baselines.common.volume import SCENE_HALF, common_volume, random_points, scene_frame
 from rewild4d.baselines.d3dgs import D3dgs, D3dgsConfig, D3dgsStar, D3dgsStarConfig, random_gaussians
 from rewild4d.baselines.d3dgs_network import DeformationNetwork, NetworkShape, octave_code
 from rewild4d.baselines.gart import Gart, GartStar
 from rewild4d.baselines.gart_config import GartConfig, GartStarConfig
-from rewild4d.baselines.saved import Root
-from rewild4d.baselines.splatting import reset_opacities, surface_gaussians
-from rewild4d.baselines.volume import SCENE_HALF, common_volume, random_points, scene_frame
 from rewild4d.config import load_preset, preset_names
 from rewild4d.errors import UserError
 from rewild4d.kernels.halves import available

@@ -14,12 +14,12 @@ import torch
 from scipy import sparse
 from scipy.spatial.transform import Rotation, Slerp
 
+from rewild4d.baselines.common.splatting import surface_gaussians
 from rewild4d.baselines.gart import Gart, GartModel, GartTraining, spread
 from rewild4d.baselines.gart_config import GartConfig, GartSkinning, GartStarConfig
 from rewild4d.baselines.gart_skeleton import exponential_quats, pose_table, prior_poses, slerp
 from rewild4d.baselines.gart_skinning import ResidualField, posed
 from rewild4d.baselines.gart_smal import follow, template_prior
-from rewild4d.baselines.splatting import surface_gaussians
 from rewild4d.errors import UserError
 from rewild4d.harmonics import C0
 from rewild4d.ours.canonical import REST_GAIN, Gaussians

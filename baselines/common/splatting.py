@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from rewild4d.baselines.splatting_config import ImageLoss, SplatConfig
+from rewild4d.baselines.common.splatting_config import ImageLoss, SplatConfig
 from rewild4d.contracts import Log
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.checkpoint import load_checkpoint, save_checkpoint
