@@ -1,4 +1,4 @@
-"""`bench rasterizer`: forward and backward of the one rasterizer, of its peers, and the arithmetic floor."""
+"""`bench rasterizer`: forward and backward of our rasterizer, of its peers, and the arithmetic lower bound."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -25,7 +25,7 @@ Contenders = dict[tuple[str, str], Callable[[], object]]
 """Calls to time, by subject and quantity."""
 
 TURN = 10
-"""Calls in a row on a GPU, which works while the next call is being prepared; then it is waited for."""
+"""Consecutive calls on a GPU, which works while the next call is prepared, before it is waited for."""
 
 CPU = torch.device("cpu")
 
@@ -43,9 +43,9 @@ def bench_rasterizer(
     Args:
         counts: numbers of Gaussians.
         sizes: sides of the square images in pixels.
-        repeats: rounds of measurement for each scene.
-        peers: whom to compare with.
-        probe: measure peak memory too (of the largest scene), and on the CPU start-up, in processes of their own.
+        repeats: rounds of measurement of each scene.
+        peers: to compare with.
+        probe: measure peak memory too (of the largest scene) and, on the CPU, start-up, in their own processes.
         device: CPU, or a CUDA GPU.
     """
     scenes = [(count, size) for count in counts for size in sizes]
@@ -63,7 +63,7 @@ def bench_rasterizer(
 def scene_rows(
     scene: SplatScene, repeats: int, peers: Sequence[Peer], title: str, device: torch.device = CPU
 ) -> list[Row]:
-    """Everything that is measured on one scene, which is on the CPU."""
+    """Measure one scene, given on the CPU."""
     count, size = len(scene), scene.size
     blends, placed = count_blends(scene), scene.to(device)
     rows = [Row(subject="scene", quantity="useful blends", value=blends, unit="1", gaussians=count, size=size)]
@@ -91,7 +91,7 @@ def scene_rows(
 
 
 def _arithmetic(device: torch.device) -> tuple[Contenders, dict[tuple[str, str], int]]:
-    """Multiply-adds to time, and how many operations each call does."""
+    """Return the multiply-adds to time, and the operations of each call."""
     if device.type == "cuda":
         from rewild4d.benchmarks import floor_cuda  # needs Triton
 
@@ -103,7 +103,7 @@ def _arithmetic(device: torch.device) -> tuple[Contenders, dict[tuple[str, str],
 
 
 def _turn(call: Callable[[], object], device: torch.device) -> Callable[[], object]:
-    """What is timed: a call, or on a GPU `TURN` of them and the wait for the last."""
+    """Return the timed unit: a call, or on a GPU `TURN` of them and the wait for the last."""
     if device.type != "cuda":
         return call
 
@@ -116,7 +116,7 @@ def _turn(call: Callable[[], object], device: torch.device) -> Callable[[], obje
 
 
 def _admit(peer: Peer, scene: SplatScene) -> tuple[Contenders, list[Row]]:
-    """The calls of a peer whose image is ours, and rows that say how alike it is or why it is not timed."""
+    """Return the calls of a peer that renders our image, and rows with its PSNR or the reason why it is not timed."""
 
     def row(quantity: str, value: float | None, unit: str, note: str = "") -> Row:
         return Row(

@@ -1,6 +1,6 @@
-"""What is timed: an animal-like cloud of Gaussians, and a training step of `ours` on a clip of it.
+"""Scenes to time: an animal-like cloud of Gaussians, and a training step of `ours` on a clip of it.
 
-Everything is procedural and decided by the seed, so that two machines time the same work.
+All of it is procedural and seeded, so that two machines time the same work.
 """
 
 import math
@@ -38,36 +38,29 @@ DISTANCE, AZIMUTH = 12.0, math.radians(40)
 FRAMES, FPS = 8, 10.0
 
 PROGRESS = 0.175
-"""Share of the iterations at which a step is timed: under `paper` the deformation is fully there (0.15), colour has its
+"""Share of the iterations at which a step is timed: under `paper` the deformation is complete (0.15), colour has its
 last degree (0.15), and the pull to the prior (until 0.2) and the geometric losses (until 0.5) still act."""
 
 
 @dataclass(frozen=True)
 class SplatScene:
-    """One call of the rasterizer.
+    """One call of the rasterizer."""
 
-    Attributes:
-        gaussians: means [N, 3], quats [N, 4], scales [N, 3], opacities [N] and colours in [0, 1] [N, 3], float32.
-        world_to_camera: [1, 4, 4].
-        intrinsics: [1, 3, 3].
-        size: side of the square image in pixels.
-    """
-
-    gaussians: tuple[Tensor, ...]
-    world_to_camera: Tensor
-    intrinsics: Tensor
-    size: int
+    gaussians: tuple[Tensor, ...]  # means, quats, scales, opacities, colors [N, ...], float32
+    world_to_camera: Tensor  # [1, 4, 4]
+    intrinsics: Tensor  # [1, 3, 3]
+    size: int  # side of the square image in pixels
 
     def __len__(self) -> int:
         return len(self.gaussians[0])
 
     def to(self, device: torch.device) -> "SplatScene":
-        """The same scene on a device."""
+        """Move the scene to a device."""
         moved = tuple(tensor.to(device) for tensor in self.gaussians)
         return SplatScene(moved, self.world_to_camera.to(device), self.intrinsics.to(device), self.size)
 
     def render(self, gaussians: tuple[Tensor, ...] | None = None, backend: str = "auto") -> tuple[Tensor, Tensor]:
-        """Image [3, size, size] on black and alpha [size, size], of these Gaussians or of others in their place."""
+        """Render image [3, size, size] on black and alpha [size, size], of the scene's or other Gaussians."""
         means, quats, scales, opacities, colors = gaussians or self.gaussians
         image, alpha, _ = rasterize(
             means, quats, scales, opacities, colors, self.world_to_camera, self.intrinsics, self.size, self.size,
@@ -77,17 +70,17 @@ class SplatScene:
 
 
 def coverage(scene: SplatScene) -> float:
-    """Share of pixels that are more animal than background."""
+    """Return the share of pixels with alpha above one half."""
     return float((scene.render()[1] > 0.5).float().mean())
 
 
 def splat_scene(count: int, size: int, seed: int = 0) -> SplatScene:
-    """The template at rest, seen from its front left, covering a quarter of a square image.
+    """Build the template at rest, seen from its front left, covering a quarter of a square image.
 
     Args:
         count: number of Gaussians.
         size: side of the image in pixels.
-        seed: of the places and colours.
+        seed: of positions and colours.
     """
     generator = torch.Generator().manual_seed(seed)
     surface = sample_surface(_still_prior(), count, generator)
@@ -108,7 +101,7 @@ def splat_scene(count: int, size: int, seed: int = 0) -> SplatScene:
 
 
 def step_config(size: int, gaussians: int, preset: str) -> Config:
-    """A preset of `ours` with image size and number of Gaussians overridden, and that number kept (no densification).
+    """Load a preset of `ours` with another image size and a fixed number of Gaussians (no densification).
 
     Raises:
         UserError: no such preset.
@@ -123,13 +116,13 @@ def step_config(size: int, gaussians: int, preset: str) -> Config:
 
 
 def training(size: int, gaussians: int, preset: str, device: torch.device | None = None) -> tuple[Training, int]:
-    """A main stage of `ours` in its midst, and the index of its next step.
+    """Build a main stage of `ours` in its middle; return it and the index of its next step.
 
     Args:
         size: side of the square frames in pixels.
-        gaussians: how many.
+        gaussians: number of Gaussians.
         preset: of `ours`.
-        device: the CPU where it is left out.
+        device: the CPU by default.
 
     Raises:
         UserError: no such preset.
@@ -146,7 +139,7 @@ def training(size: int, gaussians: int, preset: str, device: torch.device | None
 
 
 def posed_clip(size: int, gaussians: int) -> tuple[Clip, Prior]:
-    """The template swings its legs while a camera walks a quarter around it; the prior is the true motion."""
+    """Build a clip of the template swinging its legs before a moving camera; the prior is the true motion."""
     prior = _prior(_swing(0.5), [AZIMUTH + math.pi / 2 * index / FRAMES for index in range(FRAMES)], size)
     generator = torch.Generator().manual_seed(1)
     surface = sample_surface(prior, gaussians, generator)
@@ -167,7 +160,7 @@ def _frame(surface: SurfaceSample, colors: Tensor, prior: Prior, index: int) -> 
 
 
 def _camera(azimuth: float, focal: float, size: int) -> Camera:
-    """A camera that looks at the middle of the template at rest from a little above."""
+    """Build a camera that looks at the middle of the template at rest from a little above."""
     target = quadruped().vertices.aminmax(dim=0)
     middle = ((target.min + target.max) / 2).double()
     offset = DISTANCE * torch.tensor((math.sin(azimuth), 0.25, math.cos(azimuth)), dtype=torch.float64)
@@ -177,7 +170,7 @@ def _camera(azimuth: float, focal: float, size: int) -> Camera:
 
 
 def _swing(amplitude: float) -> Tensor:
-    """Transforms of legs that swing by an amplitude in radians, diagonal pairs together, [FRAMES, J, 4, 4]."""
+    """Return transforms of legs that swing by an amplitude in radians, diagonal pairs together, [FRAMES, J, 4, 4]."""
     phase = torch.arange(1, FRAMES + 1) * (2 * math.pi / FRAMES)
     angles = torch.zeros(FRAMES, len(PARENTS), 3)
     for bone, sign in ((10, 1), (16, 1), (13, -1), (19, -1)):

@@ -1,4 +1,4 @@
-"""Markdown tables of a result; ratios are made here, from the rows."""
+"""Markdown tables of a result; ratios are computed from its rows."""
 
 import math
 from collections.abc import Sequence
@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from rewild4d.benchmarks.results import BOTH, FLOOR, FORWARD, OURS, Result, Row
 
 KERNELS = "step, preset "
-"""How quantities begin that are timed with fused kernels switched off."""
+"""Prefix of quantities that are timed with fused kernels switched off."""
 
 
 def markdown(result: Result) -> str:
-    """What a result says: where it was measured, and its tables."""
+    """Format a result: where it was measured, and its tables."""
     tables = {"rasterizer": _raster_tables, "step": _step_tables}[result.benchmark](result.rows)
     timed = [row for row in result.rows if row.unit == "ms" and row.value is not None]
     notes = list(dict.fromkeys(f"{row.subject}: {row.note}." for row in timed if row.note))
@@ -35,7 +35,7 @@ def _plural(count: int, noun: str) -> str:
 
 
 def _raster_tables(rows: Sequence[Row]) -> list[str]:
-    """Scenes in lines: ours and the floor, then each peer; below them what processes of their own showed."""
+    """Tabulate the scenes with ours and the floor, then each peer; below them the probes."""
     places = dict.fromkeys(_place_of(row) for row in rows if row.quantity == FORWARD)
     peers = [name for name in dict.fromkeys(row.subject for row in rows if row.quantity == FORWARD)
              if name not in (OURS, FLOOR)]  # fmt: skip
@@ -71,7 +71,7 @@ def _against(rows: Sequence[Row], peer: str, place: tuple[int | None, int | None
 
 
 def _step_tables(rows: Sequence[Row]) -> list[str]:
-    """Times of a step and of a frame, with steps or frames a second; then the operators of each image side."""
+    """Tabulate times of steps and frames, and the operators of each image side."""
     timed = [row for row in rows if row.unit == "ms" and not row.quantity.startswith(KERNELS)]
     times = _table(
         ["what", "whose", "Gaussians", "image", "ms", "least, ms", "quartiles apart, ms", "a second"],
@@ -95,7 +95,7 @@ def _step_tables(rows: Sequence[Row]) -> list[str]:
 
 
 def _kernel_table(rows: Sequence[Row]) -> str:
-    """Whole steps of one preset with each fused kernel switched off alone, and what it saves."""
+    """Tabulate steps of one preset with each fused kernel switched off alone."""
     base = rows[0].value or math.nan
     lines = [
         [row.subject, *_scene(_place_of(row)), _number(row), f"{(row.value or math.nan) - base:+.2f}",
@@ -106,7 +106,7 @@ def _kernel_table(rows: Sequence[Row]) -> str:
 
 
 def _list(rows: Sequence[Row]) -> str:
-    """One number a line."""
+    """Tabulate one number a line."""
     return _table(
         ["what", "Gaussians", "image", "value", "note"],
         [[row.quantity, *_scene(_place_of(row)), _with_unit(row), row.note] for row in rows],
@@ -146,14 +146,14 @@ def _number(row: Row | None) -> str:
 
 
 def _text(value: float | None) -> str:
-    """Three digits; all of a larger number's."""
+    """Format three digits, or all integer digits."""
     if value is None:
         return "-"
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:#.3g}".rstrip(".") if value else "0"
 
 
 def _table(head: list[str], lines: list[list[str]]) -> str:
-    """Columns that hold a number lean to the right."""
+    """Format a table; columns that hold a number are right-aligned."""
     columns = zip(*lines, strict=True) if lines else [()] * len(head)
     rule = ["---:" if any(cell[:1].isdigit() for cell in column) else "---" for column in columns]
     return "\n".join("| " + " | ".join(row) + " |" for row in [head, rule, *lines])

@@ -1,4 +1,4 @@
-"""Checkpoints: the full state of a fit, written atomically, tied to what it was made from."""
+"""Checkpoints: the full state of a fit, written atomically, tied to its inputs."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ NAME = "checkpoint.pt"
 
 
 def fit_digest(config: msgspec.Struct, clip: Clip, prior: Prior, seed: int) -> str:
-    """Identifies a fit: two fits of one digest on one machine give one result."""
+    """Identify a fit: equal digests give equal results on one machine."""
     return digest(msgspec.json.encode(config), clip.digest, prior.digest, str(seed), torch.__version__)
 
 
@@ -23,12 +23,8 @@ def save_checkpoint(folder: Path, identity: str, state: dict[str, Any]) -> None:
 
 
 def load_checkpoint(folder: Path, identity: str) -> tuple[dict[str, Any] | None, str | None]:
-    """The state of an interrupted fit, or None, and a message where a checkpoint was found but cannot be used.
-
-    Args:
-        folder: where it may be.
-        identity: from `fit_digest`; a checkpoint of another fit is ignored.
-    """
+    """Return the state of the fit ``identity`` (from `fit_digest`) or None, and a message if a checkpoint cannot be
+    used."""
     path = folder / NAME
     if not path.exists():
         return None, None

@@ -1,4 +1,4 @@
-"""First colours of the canonical Gaussians: what the input images show where each one projects."""
+"""Initial colours of the canonical Gaussians, from the input images where they project."""
 
 import torch
 from scipy.spatial import cKDTree
@@ -12,10 +12,10 @@ from rewild4d.transforms import mirror_points, quat_to_matrix
 
 @torch.no_grad()
 def initial_colors(model: Model, supervision: Supervision) -> Tensor:
-    """Mean colour over the frames that see a Gaussian; for one that none sees, of the nearest mirrored Gaussian.
+    """Average the colour over the frames that see a Gaussian; take the nearest mirrored Gaussian's where none does.
 
-    A Gaussian counts as seen where its normal faces the camera and its pixel lies well inside the mask; other parts in
-    front of it are ignored, training sorts that out.
+    A Gaussian counts as seen where its normal faces the camera and its pixel lies well inside the mask; occlusion is
+    ignored.
 
     Args:
         model: with the poses after the warm-up.
@@ -44,11 +44,11 @@ def initial_colors(model: Model, supervision: Supervision) -> Tensor:
 
 
 def project_colors(points: Tensor, normals: Tensor, target: Target) -> tuple[Tensor, Tensor]:
-    """Colour of each point in one image, and whether it may be trusted.
+    """Read the colour of points in one image, and whether they are seen.
 
     Args:
         points: posed, in the object frame, [n, 3].
-        normals: their outward normals, [n, 3].
+        normals: outward, [n, 3].
         target: the image and its camera.
 
     Returns:

@@ -35,7 +35,7 @@ class DensityControl:
 
     @torch.no_grad()
     def round(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer, generator: torch.Generator) -> None:
-        """Refine where the mean gradient is large, as many as the cap allows, then prune; statistics start anew."""
+        """Refine where the mean gradient is large, as many as the cap allows, then prune; reset the statistics."""
         config = self.config
         mean = self.gradient / self.seen.clamp_min(1)
         opacities, scales = gaussians.opacities(), gaussians.scales_log().exp()
@@ -63,7 +63,7 @@ class DensityControl:
 def replace_gaussians(
     gaussians: Gaussians, optimizer: torch.optim.Optimizer, values: dict[str, Tensor], source: Tensor, kept: int
 ) -> None:
-    """Exchange the learnable tensors; the first ``kept`` rows keep their Adam moments, the others start from zero.
+    """Replace the learnable tensors; the first ``kept`` rows keep their Adam moments, the others start from zero.
 
     Args:
         gaussians: changed in place.

@@ -1,4 +1,4 @@
-"""The training loop: warm-up, then the stage-aware losses of METHOD section 6; one object holds all state."""
+"""Training loop: warm-up, then the stage-aware losses of METHOD section 6."""
 
 import logging
 import math
@@ -20,7 +20,7 @@ from rewild4d.ours.density import DensityControl
 from rewild4d.ours.gradients import all_finite, clip_gradients
 from rewild4d.ours.losses.images import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.losses.regularizers import compact_loss, neighbours, rigid_loss, smooth_loss
-from rewild4d.ours.losses.skeleton import neighbour_keys, stance
+from rewild4d.ours.losses.skeleton import neighbour_keys, posture
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.pose import blend_poses, pose_distance
 from rewild4d.ours.schedule import exponential, fade, ramp
@@ -37,7 +37,7 @@ class Training:
     """The main stage.
 
     Attributes:
-        model: everything that learns.
+        model: all that learns.
         gaussian_optimizer: one group per attribute, in the order of `canonical.NAMES`.
         network_optimizer: groups skinning, pose, deform.
     """
@@ -61,7 +61,7 @@ class Training:
         self.near: Tensor | None = None
 
     def step(self, index: int) -> dict[str, float]:
-        """One iteration; returns the figures for the log."""
+        """Take one step; return the figures for the log."""
         progress = index / self.config.iterations
         self._set_rates(progress)
         key = self.supervision.draw(self.generator, self.config.mirrored, self.config.cameras)
@@ -84,16 +84,7 @@ class Training:
         return {"loss": sum(figures.values()), "gaussians": len(self.model.gaussians)} | figures
 
     def losses(self, key: Key, target: Target, index: int) -> tuple[dict[str, Tensor], RasterInfo | None]:
-        """All weighted losses of one view.
-
-        Args:
-            key: the view.
-            target: its image.
-            index: the iteration.
-
-        Returns:
-            Scalars by name, and the render info of the deformed branch.
-        """
+        """Compute all weighted losses of a view at an iteration, and the render info of the deformed branch."""
         config, model = self.config, self.model
         progress = index / config.iterations
         keys, own = neighbour_keys([key], self.supervision.frames, config.geometry)
@@ -102,7 +93,7 @@ class Training:
         if config.prior.blend:
             prior_pose = self.supervision.prior_pose(keys)
             poses = blend_poses(poses, *prior_pose, fade(progress, config.prior.blend_until))
-        pose, transforms, skeleton = stance(model, poses, own, config.geometry)
+        pose, transforms, skeleton = posture(model, poses, own, config.geometry)
         probabilities = model.field.probabilities()
         delta = config.geometry.tv_delta if self._varies(index) else None
         weights, variation = model.field.sample_and_vary(probabilities, model.gaussians.means, delta)
@@ -130,7 +121,7 @@ class Training:
         return losses, info
 
     def _times(self, keys: list[Key], progress: float) -> Tensor:
-        """(i + 1) / T, jittered by a share of a frame early on; neighbours share the jitter."""
+        """Return (i + 1) / T, jittered early on by a share of a frame that neighbours share."""
         frames, pose = self.supervision.frames, self.config.pose
         noise = float(torch.randn((), generator=self.generator)) * pose.time_noise
         noise *= fade(progress, pose.time_noise_until)
@@ -148,7 +139,7 @@ class Training:
         return image[0], alpha[0], info
 
     def _image_losses(self, pose_alpha: Tensor, rgb: Tensor, alpha: Tensor, target: Target) -> dict[str, Tensor]:
-        """L_pose and L_deform of one view."""
+        """Compute L_pose and L_deform of one view."""
         weights = self.config.loss
         window = union_window([pose_alpha, alpha, target.mask], WINDOW - 1)
         background = torch.rand(3, generator=self.generator).to(rgb) if weights.random_background else rgb.new_ones(3)
@@ -161,7 +152,7 @@ class Training:
         }
 
     def _varies(self, index: int) -> bool:
-        """Whether the total variation of the skinning field counts in this step."""
+        """Tell whether the total variation of the skinning field counts in this step."""
         config = self.config.geometry
         lasts = index < config.until * self.config.iterations and self.config.skinning.learn
         return lasts and config.tv > 0 and index % config.tv_every == 0
@@ -169,7 +160,7 @@ class Training:
     def _geometry_losses(
         self, index: int, weights: Tensor, opacities: Tensor, posed: Posed, deformed: Posed
     ) -> dict[str, Tensor]:
-        """Compactness and smoothness while they last, and neighbour rigidity."""
+        """Compute compactness and smoothness while they last, and neighbour rigidity."""
         config, own = self.config.geometry, self.model.gaussians
         losses: dict[str, Tensor] = {}
         if index < config.until * self.config.iterations:
@@ -196,7 +187,7 @@ class Training:
             group["lr"] = exponential(*pair, progress) * ramp(progress, 0.0, rates.rise)
 
     def _check_gradients(self, index: int) -> None:
-        """Bound the networks' gradients; a value that is not finite stops the fit with its name."""
+        """Clip the networks' gradients; raise where a gradient is not finite."""
         norms = [clip_gradients(self.groups[name], self.config.rates.clip) for name in ("pose", "deform")]
         if all(map(math.isfinite, norms)) and all_finite(list(self.model.gaussians.parameters())):
             return
@@ -214,7 +205,7 @@ class Training:
             self.near = None
 
     def state(self) -> dict[str, Any]:
-        """Everything that a resumed run needs beside the generator."""
+        """Return all that a resumed run needs beside the generator."""
         return {
             "model": self.model.state_dict(),
             "gaussian_optimizer": self.gaussian_optimizer.state_dict(),
@@ -247,15 +238,12 @@ def train(
 
     Args:
         clip: the frames.
-        prior: a start.
-        config: every choice.
+        prior: the start.
+        config: all settings.
         seed: of the one generator.
-        device: where to compute.
+        device: to compute on.
         log: progress over both stages.
-        workdir: where checkpoints go; a checkpoint of the same fit there is continued.
-
-    Returns:
-        The trained model.
+        workdir: of checkpoints; one of the same fit is continued.
 
     Raises:
         UserError: the clip or the prior cannot be used.
@@ -305,7 +293,7 @@ def _save(workdir: Path, identity: str, step: int, warmup: WarmUp, main: Trainin
 
 
 def _fixed_rate(rates: Rates, name: str) -> float:
-    """Learning rate of a Gaussian attribute; that of the means is set at every step."""
+    """Return the learning rate of a Gaussian attribute; that of the means is set at every step."""
     return 0.0 if name == "means" else getattr(rates, name)
 
 

@@ -1,4 +1,4 @@
-"""What a fit leaves behind: a function from time to Gaussians in the world."""
+"""The result of a fit: a function from time to Gaussians in the world."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -44,7 +44,8 @@ class OursReconstruction:
 
     @torch.no_grad()
     def at(self, time: float) -> Splats:
-        """The Gaussians at a time in seconds in the world; between frames the networks and the root interpolate."""
+        """Return the Gaussians at a time in seconds in the world; between frames the networks and the root
+        interpolate."""
         position = frame_position(self.times, time)
         pose = self._pose(torch.tensor([position]))
         strength = ramp(1.0, self.config.deform.ramp_start, self.config.deform.ramp_end)
@@ -56,11 +57,11 @@ class OursReconstruction:
         return replace(world, colors=own.splat_colors(world.quats))
 
     def camera(self, time: float) -> Camera | None:
-        """The input camera at a time, in the world frame; between frames it interpolates."""
+        """Return the input camera at a time, in the world frame; between frames it interpolates."""
         return camera_between(self.cameras, frame_position(self.times, time))
 
     def canonical(self) -> Splats:
-        """The Gaussians at rest, in the object frame; `weights` [n, J] belong to the same rows."""
+        """Return the Gaussians at rest, in the object frame; `weights` [n, J] belong to the same rows."""
         return self.model.gaussians.splats()
 
     @property
@@ -75,18 +76,17 @@ class OursReconstruction:
 
     @torch.no_grad()
     def articulation(self, time: float) -> tuple[Tensor, Tensor]:
-        """Rest -> posed transforms, [J, 4, 4], and object_to_world, [4, 4]; the deformation network is not in them."""
+        """Return rest -> posed transforms, [J, 4, 4], without the deformation, and object_to_world, [4, 4]."""
         position = frame_position(self.times, time)
         pose = self._pose(torch.tensor([position]))
         return self.model.transforms(pose)[0], interpolate_similarity(self.object_to_world, position)
 
     @torch.no_grad()
     def diagnostics(self) -> dict[str, float | list[float]]:
-        """Figures that show silent failures: per joint, how far it turns and moves and whether that changes over time.
+        """Return figures that show silent failures.
 
-        Returns:
-            Angles against the parent in degrees and shifts over the rest diagonal (mean and standard deviation over the
-            frames, a list over the joints), the number of Gaussians and their mean opacity.
+        These are angles against the parent in degrees and shifts over the rest diagonal (mean and standard deviation
+        over the frames, a list over the joints), the number of Gaussians and their mean opacity.
         """
         pose = self._pose(torch.arange(len(self.times), dtype=torch.float32))
         angles = relative_turn(pose.quats, self.model.parents)
@@ -128,17 +128,17 @@ def _camera_state(camera: Camera | None) -> dict[str, Tensor | list[int]] | None
 
 
 def from_fit(model: Model, config: Config, clip: Clip, prior: Prior, rows: list[int]) -> OursReconstruction:
-    """The reconstruction of a clip; ``rows`` are the prior's rows of its frames."""
+    """Build the reconstruction of a clip; ``rows`` are the prior's rows of its frames."""
     times = torch.tensor(clip.times, dtype=torch.float64)
     cameras = tuple(frame.camera for frame in clip.frames)
     return OursReconstruction(model, config, times, prior.object_to_world[rows].double(), cameras)
 
 
 def load_reconstruction(folder: Path, device: torch.device) -> OursReconstruction:
-    """Read back what `OursReconstruction.save` wrote.
+    """Read a reconstruction that `OursReconstruction.save` wrote.
 
     Raises:
-        UserError: a file is missing or is not what `save` writes.
+        UserError: a file is missing or cannot be read.
     """
     for name in (STATE, CONFIG):
         if not (folder / name).is_file():

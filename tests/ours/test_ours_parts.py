@@ -11,14 +11,7 @@ from rewild4d.ours.config import Config, Deform, Density, Pose, Skinning
 from rewild4d.ours.deform import DeformNetwork, Posed
 from rewild4d.ours.density import replace_gaussians
 from rewild4d.ours.losses.images import colour_losses, silhouette_loss, ssim_map, union_window
-from rewild4d.ours.losses.regularizers import (
-    attach_loss,
-    compact_loss,
-    limit_loss,
-    neighbours,
-    relative_turn,
-    tv_loss,
-)
+from rewild4d.ours.losses.regularizers import attach_loss, compact_loss, limit_loss, neighbours, relative_turn, tv_loss
 from rewild4d.ours.motion import frame_position, interpolate_similarity
 from rewild4d.ours.pose import Pose as Poses
 from rewild4d.ours.pose import PoseNetwork, blend_poses, joint_transforms, time_code

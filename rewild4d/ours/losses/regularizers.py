@@ -1,4 +1,4 @@
-"""Regularisers: total variation of the skinning field, compact parts, smooth normals, and a skeleton's own."""
+"""Regularizers: total variation of the skinning field, compact parts, smooth normals, and a skeleton's."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from rewild4d.types import OBJECT_DIAGONAL
 
 
 def tv_loss(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
-    """L_tv: mean over the axes of the mean Huber function of forward differences.
+    """Compute L_tv: the mean over the axes of the mean Huber function of forward differences.
 
     Args:
         probabilities: of the field, x slowest, [R^3, J].
@@ -35,14 +35,13 @@ def tv_loss(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
 
 
 def compact_loss(clouds: Sequence[Tensor], weights: Tensor, opacities: Tensor, power: float) -> Tensor:
-    """L_compact: mean over clouds and parts of the two smaller eigenvalues of a part's covariance.
+    """Compute L_compact: the mean over clouds and parts of the two smaller eigenvalues of a part's covariance.
 
     They are tr C - v^T C v with v the top eigenvector of the detached C: exactly the eigenvalues' gradient, and defined
-    where the two coincide. Parts of mass below 1 are skipped; weights and opacities are taken as given, otherwise the
-    weights would move to cut the loss.
+    where the two coincide. Parts of mass below 1 are skipped; weights and opacities get no gradient.
 
     Args:
-        clouds: places of the same Gaussians, [n, 3] each.
+        clouds: positions of the same Gaussians, [n, 3] each.
         weights: skinning weights, [n, J].
         opacities: [n].
         power: exponent on the weights.
@@ -66,10 +65,9 @@ def compact_loss(clouds: Sequence[Tensor], weights: Tensor, opacities: Tensor, p
 
 
 def smooth_loss(posed: Posed, opacities: Tensor, size: int, generator: torch.Generator) -> Tensor:
-    """L_smooth: neighbouring pixels of a rendered normal map agree, from a random viewpoint around the animal.
+    """Compute L_smooth: agreement of neighbouring pixels of a rendered normal map, from a random viewpoint.
 
-    A Gaussian's normal is the axis of its smallest scale, turned towards the camera before blending. Only the normals
-    get gradients; the blending weights and the mattes are constants.
+    A Gaussian's normal is the axis of its smallest scale, pointing to the camera. Only the normals get gradients.
 
     Args:
         posed: deformed Gaussians.
@@ -94,7 +92,7 @@ def smooth_loss(posed: Posed, opacities: Tensor, size: int, generator: torch.Gen
 
 
 def _normals(quats: Tensor, log_scales: Tensor, means: Tensor, eye: Tensor) -> Tensor:
-    """The axis of each Gaussian's smallest scale, turned towards ``eye`` [3], [n, 3]."""
+    """Return the axis of each Gaussian's smallest scale, pointing to ``eye`` [3], [n, 3]."""
     if NORMALS.takes(quats):
         return smallest_axes(quats, log_scales, means, eye)
     axis = log_scales.argmin(-1)[:, None, None].expand(-1, 3, 1)
@@ -104,7 +102,7 @@ def _normals(quats: Tensor, log_scales: Tensor, means: Tensor, eye: Tensor) -> T
 
 
 def _disagreement(image: Tensor, matte: Tensor) -> Tensor:
-    """Mean of 1 - |cos| between neighbouring pixels' vectors [3, h, w], weighted by both mattes [h, w]; scalar."""
+    """Compute the mean of 1 - |cos| between neighbouring pixels' vectors [3, h, w], weighted by both mattes [h, w]."""
     if NORMALS.takes(image):
         return disagreement(image, matte)
     # torch's own norm over the channels takes longer than the rest of this function.
@@ -119,7 +117,7 @@ def _disagreement(image: Tensor, matte: Tensor) -> Tensor:
 
 
 def limit_loss(pose: Pose, parents: Tensor, degrees: float) -> Tensor:
-    """Mean squared excess of cos(half the angle between a bone and its parent) below that of ``degrees``."""
+    """Compute the mean squared excess of cos(half the angle of a bone to its parent) below that of ``degrees``."""
     has_parent = parents >= 0
     if not bool(has_parent.any()):
         return pose.quats.sum() * 0.0
@@ -129,7 +127,7 @@ def limit_loss(pose: Pose, parents: Tensor, degrees: float) -> Tensor:
 
 
 def attach_loss(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
-    """Mean squared gap between a joint and its parent's copy of it, over the squared diagonal."""
+    """Compute the mean squared gap between a joint and its parent's copy of it, over the squared diagonal."""
     has_parent = parents >= 0
     if not bool(has_parent.any()):
         return transforms.sum() * 0.0
@@ -137,7 +135,7 @@ def attach_loss(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
 
 
 def joint_gaps(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
-    """From each joint's place as its parent carries it to its own, zero for a root, [B, J, 3].
+    """Return each joint's position relative to its parent's copy, zero for a root, [B, J, 3].
 
     Args:
         transforms: rest -> posed, [B, J, 4, 4].
@@ -152,9 +150,9 @@ def joint_gaps(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
 def sagittal_losses(
     pose: Pose, transforms: Tensor, pivots: Tensor, parents: Tensor, mirror: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """How far bones turn out of the planes along the body, and how far limbs gape sideways: means over what they count.
+    """Compute mean rotations of bones out of the planes along the body, and mean gaps of limbs across it.
 
-    A turn against the parent within such a plane is about x. Limbs are the bones that have another on the other side.
+    Rotations within such a plane are about x. Limbs are the bones that have a counterpart on the other side.
 
     Args:
         pose: unit quaternions.
@@ -164,8 +162,8 @@ def sagittal_losses(
         mirror: bone on the other side, [J].
 
     Returns:
-        Squares of the y and z of the quaternion against the parent, of limbs and of other bones; and the squared x of
-        the limbs' gaps (`joint_gaps`) over the squared diagonal.
+        Squared y and z of the quaternion against the parent, of limbs and of other bones; squared x of the limbs' gaps
+            (`joint_gaps`) over the squared diagonal.
     """
     limbs = (mirror != torch.arange(len(mirror), device=mirror.device)).to(pose.quats)
     rest = pose.quats.new_tensor((1.0, 0, 0, 0))
@@ -178,7 +176,7 @@ def sagittal_losses(
 
 
 def temporal_loss(pose: Pose) -> Tensor:
-    """Mean squared second difference of rotations and shifts over triples of neighbouring frames, B = 3 k."""
+    """Compute the mean squared second difference of rotations and shifts over triples of frames, B = 3 k."""
     quats, shifts = pose.quats.unflatten(0, (-1, 3)), pose.shifts.unflatten(0, (-1, 3))
     middle = quats[:, 1]
     bend = aligned(quats[:, 0], middle) + aligned(quats[:, 2], middle) - 2 * middle
@@ -187,10 +185,10 @@ def temporal_loss(pose: Pose) -> Tensor:
 
 
 def still_loss(pose: Pose, step: float) -> Tensor:
-    """Mean of s v^2 / (v^2 + s^2) over the steps v of rotations within triples of frames, B = 3 k, plus that of shifts.
+    """Compute the mean of s v^2 / (v^2 + s^2) over steps v of rotations within triples of frames, B = 3 k, plus that of
+    shifts.
 
-    Steps much longer than s cost s and feel nothing: what moves is left alone, what drifts slowly is held still
-    (Geman and McClure's function).
+    Steps much longer than s cost s and get no gradient; slow drift is held still (Geman and McClure's function).
     """
     quats, shifts = pose.quats.unflatten(0, (-1, 3)), pose.shifts.unflatten(0, (-1, 3))
     turned = quats[:, 1:] - aligned(quats[:, :-1], quats[:, 1:])
@@ -200,17 +198,17 @@ def still_loss(pose: Pose, step: float) -> Tensor:
 
 
 def neighbours(points: Tensor, count: int) -> Tensor:
-    """Indices of the nearest other points, of all others where there are fewer, [n, 3] -> [n, min(count, n - 1)]."""
+    """Return indices of the nearest other points, [n, 3] -> [n, min(count, n - 1)]."""
     place = points.detach().cpu().double().numpy()
     _, index = cKDTree(place).query(place, k=list(range(1, min(count, len(place) - 1) + 2)))
     return torch.from_numpy(np.ascontiguousarray(index[:, 1:]))
 
 
 def rigid_loss(canonical: Tensor, deformed: Tensor, near: Tensor) -> Tensor:
-    """As isometric as possible: mean change of distance between canonical neighbours.
+    """Compute the mean change of distance between canonical neighbours (as isometric as possible).
 
     Args:
-        canonical: [n, 3], a constant here.
+        canonical: no gradient, [n, 3].
         deformed: [n, 3].
         near: from `neighbours`, [n, k].
     """
@@ -220,7 +218,7 @@ def rigid_loss(canonical: Tensor, deformed: Tensor, near: Tensor) -> Tensor:
 
 
 def relative_turn(quats: Tensor, parents: Tensor) -> Tensor:
-    """Rotation of each bone against its parent in degrees (against rest for a root), [..., J, 4] -> [..., J]."""
+    """Compute each bone's rotation against its parent (rest for a root) in degrees, [..., J, 4] -> [..., J]."""
     conjugate = quats * quats.new_tensor((1.0, -1.0, -1.0, -1.0))
     above = torch.where(
         (parents >= 0)[:, None], conjugate[..., parents.clamp_min(0), :], quats.new_tensor((1.0, 0, 0, 0))
