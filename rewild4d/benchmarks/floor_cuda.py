@@ -16,15 +16,15 @@ WARPS = 4
 @triton.jit
 def _chains(end: tl.tensor, rounds: tl.tensor) -> None:
     """Run eight independent chains of multiply-adds; they start as data, so that nothing is folded."""
-    place = tl.program_id(0) * LANES + tl.arange(0, LANES)
-    x = 0.1 + place.to(tl.float32) / (LANES * tl.num_programs(0))
+    index = tl.program_id(0) * LANES + tl.arange(0, LANES)
+    x = 0.1 + index.to(tl.float32) / (LANES * tl.num_programs(0))
     y = 0.5 * x
     a, b, c, d = x, x + y, x - y, x * y
     e, f, g, h = a + b, b + c, c + d, d + a
     for _ in range(rounds):
         a, b, c, d = tl.fma(a, x, y), tl.fma(b, x, y), tl.fma(c, x, y), tl.fma(d, x, y)
         e, f, g, h = tl.fma(e, x, y), tl.fma(f, x, y), tl.fma(g, x, y), tl.fma(h, x, y)
-    tl.store(end + place, a + b + c + d + e + f + g + h)
+    tl.store(end + index, a + b + c + d + e + f + g + h)
 
 
 def multiply_adds(device: torch.device) -> None:

@@ -50,8 +50,8 @@ def bench_rasterizer(
     """
     scenes = [(count, size) for count in counts for size in sizes]
     rows: list[Row] = []
-    for place, (count, size) in enumerate(scenes, 1):
-        title = f"[{place}/{len(scenes)}] {count:,} at {size}²"
+    for index, (count, size) in enumerate(scenes, 1):
+        title = f"[{index}/{len(scenes)}] {count:,} at {size}²"
         rows += scene_rows(splat_scene(count, size), repeats, peers, title, device)
     if not probe:
         return rows

@@ -17,9 +17,9 @@ from rewild4d.ours.model import build_model
 from rewild4d.ours.symmetry import Supervision
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.motion import SurfaceSample, pose_gaussians, quats_from_normals, sample_surface
-from rewild4d.priors.template import MIRROR, PARENTS, quadruped
+from rewild4d.priors.template import PARENTS, posed_prior, quadruped
 from rewild4d.rasterizer import rasterize
-from rewild4d.transforms import look_at, mirror_camera, mirror_transforms
+from rewild4d.transforms import look_at
 from rewild4d.types import Camera, Clip, Frame, Prior
 
 COVERED = 0.25
@@ -83,7 +83,7 @@ def splat_scene(count: int, size: int, seed: int = 0) -> SplatScene:
         seed: of positions and colours.
     """
     generator = torch.Generator().manual_seed(seed)
-    surface = sample_surface(_still_prior(), count, generator)
+    surface = sample_surface(_prior(_swing(0.0), [AZIMUTH] * FRAMES, 64), count, generator)
     scales = torch.tensor((1.0, 1.0, FLATNESS)) * TILING * surface.radius
     gaussians = (
         surface.points,
@@ -178,28 +178,9 @@ def _swing(amplitude: float) -> Tensor:
     return pose(angles, quadruped().bones[:, 0], PARENTS)
 
 
-def _still_prior() -> Prior:
-    return _prior(_swing(0.0), [AZIMUTH] * FRAMES, 64)
-
-
 def _prior(transforms: Tensor, azimuths: list[float], size: int) -> Prior:
-    template, mirror = quadruped(), torch.tensor(MIRROR)
-    cameras = tuple(_camera(azimuth, 2.4 * size, size) for azimuth in azimuths)
-    return Prior(
-        name="bench",
-        provenance="the template itself",
-        vertices=template.vertices,
-        faces=template.faces,
-        weights=template.weights,
-        bones=template.bones,
-        parents=torch.tensor(PARENTS),
-        mirror=mirror,
-        times=torch.arange(FRAMES, dtype=torch.float64) / FPS,
-        object_to_world=torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1),
-        cameras=cameras,
-        transforms=transforms,
-        cameras_flip=tuple(mirror_camera(camera) for camera in cameras),
-        transforms_flip=mirror_transforms(transforms, mirror),
-        quality={},
-        digest="bench",
-    )
+    cameras = [_camera(azimuth, 2.4 * size, size) for azimuth in azimuths]
+    world = torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)
+    times = torch.arange(FRAMES, dtype=torch.float64) / FPS
+    given = quadruped(), transforms, world, cameras, times
+    return posed_prior(*given, name="bench", provenance="the template itself", digest="bench")

@@ -7,6 +7,7 @@ take a 1D float32 array and the index of the first lane.
 # numba fixes the shape of an intrinsic: it takes the typing context and returns a signature and a code generator.
 import operator
 from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -71,13 +72,13 @@ def elementwise(kind: types.Type) -> Callable[[Callable[..., Any]], Any]:
     """Make an intrinsic on vectors of a type from a function that generates its code: (builder, *vectors) -> vector."""
 
     def decorate(emit: Callable[..., Any]) -> Any:
+        @wraps(emit)  # numba reads the number of vectors from its signature
         def definition(typing: Any, *given: Any) -> Any:
             def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
                 return emit(builder, *args)
 
             return signature(kind, *[kind] * len(given)), generate
 
-        definition.__name__, definition.__doc__ = emit.__name__, emit.__doc__
         return intrinsic(definition)
 
     return decorate

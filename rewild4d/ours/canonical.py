@@ -82,12 +82,12 @@ class Gaussians(nn.Module):
         if COLORS.takes(means, owner=self):
             return seen_rgb(self.colors, means, quats, self.quats, eye, degree, REST_GAIN)
         directions = normalize(means.detach() - eye.to(means), dim=-1)
-        canonical = torch.einsum("na,nab->nb", directions, self.turns(quats.detach()))
+        canonical = torch.einsum("na,nab->nb", directions, self.rotations_to(quats.detach()))
         values = basis(canonical, degree)[:, 1:] / REST_GAIN
         rest = torch.einsum("nk,nkc->nc", values, self.colors[:, 1 : (degree + 1) ** 2])
         return (self.colors[:, 0] + rest).clamp_min(0)
 
-    def turns(self, quats: Tensor) -> Tensor:
+    def rotations_to(self, quats: Tensor) -> Tensor:
         """Return each Gaussian's rotation from rest to an orientation, [n, 4] -> [n, 3, 3]."""
         rest = normalize(self.quats.detach(), dim=-1)
         return quat_to_matrix(quat_multiply(quats, rest * rest.new_tensor((1.0, -1.0, -1.0, -1.0))))
@@ -98,7 +98,7 @@ class Gaussians(nn.Module):
         if self.colors.shape[1] == 1:
             return self.rgb()[:, None]
         constant = (self.colors[:, :1] - 0.5) / C0
-        return rotated(torch.cat((constant, self.colors[:, 1:] / REST_GAIN), dim=1), self.turns(quats))
+        return rotated(torch.cat((constant, self.colors[:, 1:] / REST_GAIN), dim=1), self.rotations_to(quats))
 
     def splats(self) -> Splats:
         """Return the canonical Gaussians, activated, detached."""
@@ -125,7 +125,15 @@ def initial_gaussians(
     Returns:
         The five attributes by name; colours are mid-grey.
     """
-    means, quats, scales = (_on_surface if shape else _in_box)(prior, count, config.thickness, generator)
+    if shape:
+        surface = sample_surface(prior, count, generator)
+        means, quats = surface.points, quats_from_normals(surface.normals)
+        scales = surface.radius * torch.tensor((1.0, 1.0, config.thickness))
+    else:
+        low, high = prior.vertices.float().aminmax(dim=0)
+        means = low + (high - low) * torch.rand(count, 3, generator=generator)
+        quats = normalize(torch.randn(count, 4, generator=generator), dim=-1)
+        scales = 0.5 * ((high - low).prod() / count) ** (1 / 3) * torch.ones(3)
     colors = torch.zeros(count, (config.sh_degree + 1) ** 2, 3)
     colors[:, 0] = 0.5
     return {
@@ -135,19 +143,3 @@ def initial_gaussians(
         "logit_opacities": torch.full((count,), math.log(config.opacity / (1 - config.opacity))),
         "colors": colors,
     }
-
-
-def _on_surface(
-    prior: Prior, count: int, thickness: float, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor]:
-    surface = sample_surface(prior, count, generator)
-    scales = surface.radius * torch.tensor((1.0, 1.0, thickness))
-    return surface.points, quats_from_normals(surface.normals), scales
-
-
-def _in_box(prior: Prior, count: int, thickness: float, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-    """Sample round Gaussians in the bounding box; returns as `_on_surface`."""
-    low, high = prior.vertices.float().aminmax(dim=0)
-    means = low + (high - low) * torch.rand(count, 3, generator=generator)
-    quats = normalize(torch.randn(count, 4, generator=generator), dim=-1)
-    return means, quats, 0.5 * ((high - low).prod() / count) ** (1 / 3) * torch.ones(3)

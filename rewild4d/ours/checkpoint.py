@@ -1,5 +1,6 @@
 """Checkpoints: the full state of a fit, written atomically, tied to its inputs."""
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import torch
 from rewild4d.files import digest, load_tensors, save_tensors
 from rewild4d.types import Clip, Prior
 
+logger = logging.getLogger(__name__)
 NAME = "checkpoint.pt"
 
 
@@ -22,13 +24,12 @@ def save_checkpoint(folder: Path, identity: str, state: dict[str, Any]) -> None:
     save_tensors({"digest": identity, "state": state}, folder / NAME)
 
 
-def load_checkpoint(folder: Path, identity: str) -> tuple[dict[str, Any] | None, str | None]:
-    """Return the state of the fit ``identity`` (from `fit_digest`) or None, and a message if a checkpoint cannot be
-    used."""
-    path = folder / NAME
-    if not path.exists():
-        return None, None
+def load_checkpoint(folder: Path | None, identity: str) -> dict[str, Any] | None:
+    """Return the state of the interrupted fit ``identity`` (from `fit_digest`), or None; warn of another fit's."""
+    if folder is None or not (path := folder / NAME).exists():
+        return None
     content = load_tensors(path, "checkpoint (remove it to start anew)")
     if content.get("digest") != identity:
-        return None, f"{path}: is of another configuration, clip, prior or seed; starting anew."
-    return content["state"], None
+        logger.warning("%s: is of another configuration, clip, prior or seed; starting anew.", path)
+        return None
+    return content["state"]

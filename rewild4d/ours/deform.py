@@ -9,7 +9,7 @@ from rewild4d.kernels.simd import LANES
 from rewild4d.ours.config import Deform as DeformConfig
 from rewild4d.ours.fused.deformation import DEFORMATION, deform
 from rewild4d.ours.fused.folding import Layers, fold
-from rewild4d.ours.fused.queries import Reach
+from rewild4d.ours.fused.queries import Scales
 from rewild4d.ours.pose import seed_linears
 from rewild4d.transforms import quat_multiply
 from rewild4d.types import OBJECT_DIAGONAL
@@ -66,25 +66,25 @@ class DeformNetwork(nn.Module):
         if DEFORMATION.takes(posed.means, owner=self) and (anchors is None or anchors.shape[1] <= LANES):
             return Posed(*self._fused(features, weights, anchors, posed, strength, offset))
         parts = weights if anchors is None else weights @ anchors
-        query = torch.cat((parts, self._place(posed)), dim=-1)
+        query = torch.cat((parts, self._position_code(posed)), dim=-1)
         hidden = self._attend(query, features) + self.skip(query)
         hidden = hidden + self.down(torch.relu(self.up(torch.relu(hidden))))
         out = strength * self.out(torch.relu(hidden))
-        turn = torch.cat((torch.ones_like(out[:, :1]), out[:, 3:6]), dim=-1)
+        rotation = torch.cat((torch.ones_like(out[:, :1]), out[:, 3:6]), dim=-1)
         return Posed(
             posed.means + self.config.reach * out[:, :3],
-            quat_multiply(posed.quats, nn.functional.normalize(turn, dim=-1)),
+            quat_multiply(posed.quats, nn.functional.normalize(rotation, dim=-1)),
             posed.log_scales + self.config.max_log_scale * out[:, 6:].tanh(),
         )
 
-    def _place(self, posed: Posed) -> Tensor:
+    def _position_code(self, posed: Posed) -> Tensor:
         """Return position code, orientation (w >= 0) and log scale, detached, [n, 46]."""
         means, quats, log_scales = (tensor.detach() for tensor in posed)
-        place = means * (2 / OBJECT_DIAGONAL)
-        octaves = 2.0 ** torch.arange(self.config.frequencies, dtype=place.dtype, device=place.device)
-        angles = (place[:, None] * octaves[:, None]).flatten(1)
+        position = means * (2 / OBJECT_DIAGONAL)
+        octaves = 2.0 ** torch.arange(self.config.frequencies, dtype=position.dtype, device=position.device)
+        angles = (position[:, None] * octaves[:, None]).flatten(1)
         upright = torch.where(quats[:, :1] < 0, -quats, quats)
-        return torch.cat((place, angles.sin(), angles.cos(), upright, log_scales), dim=-1)
+        return torch.cat((position, angles.sin(), angles.cos(), upright, log_scales), dim=-1)
 
     def _attend(self, query: Tensor, features: Tensor) -> Tensor:
         """Apply multi-head cross-attention over the parts, [n, inputs] and [J, K] -> [n, width]."""
@@ -112,7 +112,7 @@ class DeformNetwork(nn.Module):
         numbers = Layers(*(number for layer in layers for number in (layer.weight, layer.bias)))
         flat, sizes = fold(features, numbers, config.heads)
         parts = weights.shape[1] if anchors is None else anchors.shape[1]
-        reach = Reach(
+        scales = Scales(
             2 / OBJECT_DIAGONAL, config.frequencies, parts, float(strength), config.reach, config.max_log_scale
         )
-        return deform(flat, sizes, reach, config.half, weights, anchors, *posed, config.sampled, offset)
+        return deform(flat, sizes, scales, config.half, weights, anchors, *posed, config.sampled, offset)

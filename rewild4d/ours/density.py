@@ -52,8 +52,8 @@ class DensityControl:
         values = {name: getattr(gaussians, name).detach()[source].clone() for name in NAMES}
         fresh = slice(len(stay) + len(clone), None)
         offset = torch.randn(2 * len(split), 3, generator=generator).to(scales) * scales[source[fresh]]
-        turn = quat_to_matrix(gaussians.quats.detach()[source[fresh]])
-        values["means"][fresh] += (turn @ offset[..., None])[..., 0]
+        rotation = quat_to_matrix(gaussians.quats.detach()[source[fresh]])
+        values["means"][fresh] += (rotation @ offset[..., None])[..., 0]
         # Two halves of 1 / 1.6 of the size cover the parent (3DGS).
         values["log_scales"][fresh] = scales[source[fresh]].log() - torch.log(torch.tensor(1.6))
         replace_gaussians(gaussians, optimizer, values, source, len(stay))

@@ -1,6 +1,5 @@
 """Training loop: warm-up, then the stage-aware losses of METHOD section 6."""
 
-import logging
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +13,7 @@ from rewild4d.kernels.threads import torch_on_one
 from rewild4d.ours.canonical import NAMES
 from rewild4d.ours.checkpoint import fit_digest, load_checkpoint, save_checkpoint
 from rewild4d.ours.coloring import initial_colors
-from rewild4d.ours.config import Config, Rates
+from rewild4d.ours.config import Config
 from rewild4d.ours.deform import Posed
 from rewild4d.ours.density import DensityControl
 from rewild4d.ours.gradients import all_finite, clip_gradients
@@ -29,7 +28,6 @@ from rewild4d.ours.warmup import WarmUp
 from rewild4d.rasterizer import RasterInfo, rasterize
 from rewild4d.types import Clip, Prior
 
-logger = logging.getLogger(__name__)
 LOG_EVERY = 20
 
 
@@ -45,8 +43,10 @@ class Training:
     def __init__(self, model: Model, supervision: Supervision, config: Config, generator: torch.Generator) -> None:
         self.model, self.supervision, self.config, self.generator = model, supervision, config, generator
         own, rates = model.gaussians, config.rates
+        # The rate of the means is set at every step.
+        fixed = {name: 0.0 if name == "means" else getattr(rates, name) for name in NAMES}
         self.gaussian_optimizer = torch.optim.Adam(
-            [{"params": [getattr(own, name)], "lr": _fixed_rate(rates, name)} for name in NAMES], eps=1e-15, fused=True
+            [{"params": [getattr(own, name)], "lr": fixed[name]} for name in NAMES], eps=1e-15, fused=True
         )
         self.groups = {
             "skinning": list(model.field.parameters()),
@@ -181,9 +181,8 @@ class Training:
     def _set_rates(self, progress: float) -> None:
         rates = self.config.rates
         self.gaussian_optimizer.param_groups[NAMES.index("means")]["lr"] = exponential(*rates.means, progress)
-        for group, pair in zip(
-            self.network_optimizer.param_groups, (rates.skinning, rates.pose, rates.deform), strict=True
-        ):
+        pairs = rates.skinning, rates.pose, rates.deform
+        for group, pair in zip(self.network_optimizer.param_groups, pairs, strict=True):
             group["lr"] = exponential(*pair, progress) * ramp(progress, 0.0, rates.rise)
 
     def _check_gradients(self, index: int) -> None:
@@ -225,9 +224,8 @@ class Training:
         self.gaussian_optimizer.load_state_dict(state["gaussian_optimizer"])
         self.network_optimizer.load_state_dict(state["network_optimizer"])
         device = self.model.pivots.device
-        self.density.gradient, self.density.seen, self.density.radius = (
-            part.to(device).clone() for part in state["density"]
-        )
+        density = (part.to(device).clone() for part in state["density"])
+        self.density.gradient, self.density.seen, self.density.radius = density
         self.near = state["near"]
 
 
@@ -255,52 +253,22 @@ def train(
     warmup = WarmUp(model, small, prior, config, generator)
     main = Training(model, supervision, config, generator)
     identity = fit_digest(config, clip, prior, seed)
-    saved = _resume(workdir, identity)
-    start = 0
-    if saved is not None:
+    start, total = 0, warmup.total + config.iterations
+    if saved := load_checkpoint(workdir, identity):
         start = saved["step"]
         main.restore(saved["main"])
         warmup.optimizer.load_state_dict(saved["warmup"])
         generator.set_state(saved["generator"])
     with torch_on_one():
-        for index in range(start, warmup.total + config.iterations):
-            _iterate(index, warmup, main, log)
-            if workdir is not None and (index + 1) % config.checkpoint_every == 0:
-                _save(workdir, identity, index + 1, warmup, main)
+        for index in range(start, total):
+            if index == warmup.total:
+                model.gaussians.colors.data[:, 0] = initial_colors(model, supervision)
+            figures = warmup.step(index) if index < warmup.total else main.step(index - warmup.total)
+            done = index + 1
+            if index % LOG_EVERY == 0 or done == total:
+                log(done, total, figures)
+            if workdir is not None and done % config.checkpoint_every == 0 and done < total:
+                state = {"step": done, "main": main.state(), "warmup": warmup.optimizer.state_dict()}
+                save_checkpoint(workdir, identity, state | {"generator": generator.get_state()})
     model.gaussians.blur.fill_(supervision.missing_blur())
     return model
-
-
-def _iterate(index: int, warmup: WarmUp, main: Training, log: Log) -> None:
-    total = warmup.total + main.config.iterations
-    if index == warmup.total:
-        main.model.gaussians.colors.data[:, 0] = initial_colors(main.model, main.supervision)
-    figures = warmup.step(index) if index < warmup.total else main.step(index - warmup.total)
-    if index % LOG_EVERY == 0 or index + 1 == total:
-        log(index + 1, total, figures)
-
-
-def _save(workdir: Path, identity: str, step: int, warmup: WarmUp, main: Training) -> None:
-    if step == warmup.total + main.config.iterations:
-        return
-    state = {
-        "step": step,
-        "main": main.state(),
-        "warmup": warmup.optimizer.state_dict(),
-        "generator": main.generator.get_state(),
-    }
-    save_checkpoint(workdir, identity, state)
-
-
-def _fixed_rate(rates: Rates, name: str) -> float:
-    """Return the learning rate of a Gaussian attribute; that of the means is set at every step."""
-    return 0.0 if name == "means" else getattr(rates, name)
-
-
-def _resume(workdir: Path | None, identity: str) -> dict[str, Any] | None:
-    if workdir is None:
-        return None
-    saved, message = load_checkpoint(workdir, identity)
-    if message:
-        logger.warning(message)
-    return saved

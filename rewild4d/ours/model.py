@@ -76,13 +76,13 @@ class Model(nn.Module):
         """
         own, log_scales = self.gaussians, self.gaussians.scales_log()
         if SKINNING.takes(own.means, owner=self):
-            live_means, live_quats, means, turned = skin_both(own.means, own.quats, weights, transforms, quats)
+            live_means, live_quats, means, quats = skin_both(own.means, own.quats, weights, transforms, quats)
             live = Posed(live_means, live_quats, log_scales)
-            return live, Posed(means, turned, log_scales) if self.config.loss.isolated else live
+            return live, Posed(means, quats, log_scales) if self.config.loss.isolated else live
         rest = nn.functional.normalize(own.quats, dim=-1)
         live, still = (
-            Posed(skin_points(own.means, weights, matrices), skin_quats(rest, weights, turns), log_scales)
-            for matrices, turns in ((transforms, quats), (transforms.detach(), quats.detach()))
+            Posed(skin_points(own.means, weights, matrices), skin_quats(rest, weights, rotations), log_scales)
+            for matrices, rotations in ((transforms, quats), (transforms.detach(), quats.detach()))
         )
         return live, still if self.config.loss.isolated else live
 

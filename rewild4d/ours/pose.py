@@ -99,10 +99,8 @@ class PoseNetwork(nn.Module):
         # The modules' own generator of parameters takes longer than a layer.
         layers = (each for layer in self._layers for each in layer._parameters.values() if each is not None)
         parameters = [self.anchors, *layers]
-        reach = config.reach * OBJECT_DIAGONAL
-        sizes = sizes_of(
-            joints, anchor, anchor + code.shape[1], config.width, config.heads, config.blocks, reach, len(code)
-        )
+        network = (config.width, config.heads, config.blocks, config.reach * OBJECT_DIAGONAL)
+        sizes = sizes_of(joints, anchor, anchor + code.shape[1], *network, len(code))
         if flipped is None or mirror is None:
             return Pose(*poses(sizes, parameters, code, np.zeros(len(code), np.bool_), np.arange(joints)))
         return Pose(*poses(sizes, parameters, code, np.array(flipped), mirror.numpy()))
@@ -178,5 +176,5 @@ def aligned(quats: Tensor, reference: Tensor) -> Tensor:
 
 def pose_distance(pose: Pose, quats: Tensor, shifts: Tensor) -> Tensor:
     """Compute the mean over joints of |q^ - q|^2 + |d^ - d|^2 / diagonal^2, scalar."""
-    turn = (pose.quats - aligned(quats, pose.quats).detach()).square().sum(-1)
-    return (turn + (pose.shifts - shifts).square().sum(-1) / OBJECT_DIAGONAL**2).mean()
+    rotation = (pose.quats - aligned(quats, pose.quats).detach()).square().sum(-1)
+    return (rotation + (pose.shifts - shifts).square().sum(-1) / OBJECT_DIAGONAL**2).mean()

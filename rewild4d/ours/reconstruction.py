@@ -11,7 +11,7 @@ from rewild4d.errors import UserError
 from rewild4d.files import atomic, load_tensors, save_tensors
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.config import Config
-from rewild4d.ours.losses.regularizers import relative_turn
+from rewild4d.ours.losses.regularizers import relative_angles
 from rewild4d.ours.model import Model
 from rewild4d.ours.motion import camera_between, frame_position, interpolate_similarity
 from rewild4d.ours.pose import Pose
@@ -29,7 +29,7 @@ class OursReconstruction:
 
     Attributes:
         model: in the object frame.
-        config: what it was trained with.
+        config: of the training.
         times: of the clip's frames in seconds, float64, [T].
         object_to_world: similarity at each frame, float64, [T, 4, 4].
         cameras: of the frames, in the world.
@@ -89,19 +89,14 @@ class OursReconstruction:
         over the frames, a list over the joints), the number of Gaussians and their mean opacity.
         """
         pose = self._pose(torch.arange(len(self.times), dtype=torch.float32))
-        angles = relative_turn(pose.quats, self.model.parents)
+        angles = relative_angles(pose.quats, self.model.parents)
         shifts = pose.shifts.norm(dim=-1) / OBJECT_DIAGONAL
-        lists = {
-            "joint_angle_mean": angles.mean(0), "joint_angle_std": angles.std(0, correction=0),
-            "joint_shift_mean": shifts.mean(0), "joint_shift_std": shifts.std(0, correction=0),
-        }  # fmt: skip
-        figures: dict[str, float | list[float]] = {
-            name: [round(x, 4) for x in value.tolist()] for name, value in lists.items()
-        }
-        return figures | {
-            "gaussians": float(len(self.model.gaussians)),
-            "opacity_mean": float(self.model.gaussians.opacities().mean()),
-        }
+        figures: dict[str, float | list[float]] = {}
+        for name, values in (("angle", angles), ("shift", shifts)):
+            for kind, value in (("mean", values.mean(0)), ("std", values.std(0, correction=0))):
+                figures[f"joint_{name}_{kind}"] = [round(x, 4) for x in value.tolist()]
+        gaussians = self.model.gaussians
+        return figures | {"gaussians": float(len(gaussians)), "opacity_mean": float(gaussians.opacities().mean())}
 
     def save(self, folder: Path) -> None:
         """Write the state and the config into an existing, empty folder."""

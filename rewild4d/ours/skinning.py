@@ -58,9 +58,9 @@ class SkinningField(nn.Module):
         if FIELD.takes(probabilities, owner=self):
             return sample_grid(probabilities, points, self.origin, self.pitch, self.resolution)[0]
         last = self.resolution - 1
-        place = ((points.detach() - self.origin) / self.pitch).clamp(0, last)
-        base = place.floor().clamp(max=last - 1)
-        part = place - base
+        position = ((points.detach() - self.origin) / self.pitch).clamp(0, last)
+        base = position.floor().clamp(max=last - 1)
+        part = position - base
         x, y, z = (torch.stack((1 - part[:, axis], part[:, axis]), dim=-1) for axis in range(3))
         factors = torch.einsum("na,nb,nc->nabc", x, y, z).flatten(1)
         step = torch.tensor((self.resolution**2, self.resolution, 1), device=points.device)

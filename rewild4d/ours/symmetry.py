@@ -67,8 +67,10 @@ class Supervision:
         self._targets: dict[Key, Target] = {}
         for index, (frame, row) in enumerate(zip(clip.frames, rows, strict=True)):
             rgb, mask = (_reduced(image, size).to(device) for image in (frame.rgb, frame.mask))
-            plain = _check_camera(prior.cameras[row], frame.mask).resized(mask.shape[2], mask.shape[1])
-            flip = _check_camera(prior.cameras_flip[row], frame.mask).resized(mask.shape[2], mask.shape[1])
+            plain, flip = (
+                _check_camera(cameras[row], frame.mask).resized(mask.shape[2], mask.shape[1])
+                for cameras in (prior.cameras, prior.cameras_flip)
+            )
             side = animal_side(mask, clip.name, index)
             image, mirrored = (rgb, mask), (rgb.flip(-1), mask.flip(-1))
             choices = {

@@ -79,12 +79,12 @@ class WarmUp:
         """
         stage = self.config.warmup
         copied = index < stage.regress
-        place = index / stage.regress if copied else (index - stage.regress) / stage.iterations
+        progress = index / stage.regress if copied else (index - stage.regress) / stage.iterations
         rate = stage.regress_rate if copied else stage.rate
         if index == stage.regress:
             self.optimizer.state.clear()
         for group in self.optimizer.param_groups:
-            group["lr"] = rate * min(1.0, 0.01 + 10 * place, 1.5 * (1 - place))
+            group["lr"] = rate * min(1.0, 0.01 + 10 * progress, 1.5 * (1 - progress))
 
     def _silhouette(self, key: Key, transforms: Tensor, progress: float) -> Tensor:
         """Compute L2 (per pixel of the animal's box) + Dice of blurred mattes."""

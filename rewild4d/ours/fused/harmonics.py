@@ -23,7 +23,7 @@ COLORS = Kernel(
     "colours from harmonics",
     "0848b962f5dd",
     "rewild4d.ours.canonical:Gaussians.seen_rgb",
-    "rewild4d.ours.canonical:Gaussians.rotations",
+    "rewild4d.ours.canonical:Gaussians.rotations_to",
 )
 
 CHUNK = 8 * BLOCK

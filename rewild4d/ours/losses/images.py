@@ -36,8 +36,8 @@ def _extent(alphas: list[Tensor]) -> tuple[tuple[int, int], tuple[int, int]]:
     union = torch.stack([alpha[0].detach() for alpha in alphas]).amax(0) > 0
     ends = []
     for marks in (union.any(dim=1), union.any(dim=0)):
-        places = torch.arange(len(marks), device=marks.device)
-        ends += [torch.where(marks, places, len(marks)).amin(), torch.where(marks, places, -1).amax()]
+        positions = torch.arange(len(marks), device=marks.device)
+        ends += [torch.where(marks, positions, len(marks)).amin(), torch.where(marks, positions, -1).amax()]
     top, bottom, left, right = torch.stack(ends).tolist()  # one look: each waits for a GPU
     return ((top, bottom), (left, right)) if top <= bottom else ((0, 0), (0, 0))
 
@@ -111,8 +111,8 @@ def ssim_map(x: Tensor, y: Tensor) -> Tensor:
 @cache
 def blur_matrix(size: int, sigma: float, radius: int, device: torch.device, dtype: torch.dtype) -> Tensor:
     """Return the banded matrix that blurs a column of pixels by a normalised Gaussian, zero padding, [size, size]."""
-    place = torch.arange(size, dtype=torch.float64)
-    offset = place[:, None] - place
+    position = torch.arange(size, dtype=torch.float64)
+    offset = position[:, None] - position
     kernel = torch.exp(-(torch.arange(-radius, radius + 1, dtype=torch.float64) ** 2) / (2 * sigma**2)).sum()
     band = torch.exp(-(offset**2) / (2 * sigma**2)) * (offset.abs() <= radius) / kernel
     return band.to(device, dtype)

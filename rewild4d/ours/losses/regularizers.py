@@ -191,16 +191,16 @@ def still_loss(pose: Pose, step: float) -> Tensor:
     Steps much longer than s cost s and get no gradient; slow drift is held still (Geman and McClure's function).
     """
     quats, shifts = pose.quats.unflatten(0, (-1, 3)), pose.shifts.unflatten(0, (-1, 3))
-    turned = quats[:, 1:] - aligned(quats[:, :-1], quats[:, 1:])
+    rotated = quats[:, 1:] - aligned(quats[:, :-1], quats[:, 1:])
     moved = (shifts[:, 1:] - shifts[:, :-1]) / OBJECT_DIAGONAL
-    squares = torch.stack([way.square().sum(-1) for way in (turned, moved)])
+    squares = torch.stack([each.square().sum(-1) for each in (rotated, moved)])
     return 2 * step * (squares / (squares + step**2)).mean()
 
 
 def neighbours(points: Tensor, count: int) -> Tensor:
     """Return indices of the nearest other points, [n, 3] -> [n, min(count, n - 1)]."""
-    place = points.detach().cpu().double().numpy()
-    _, index = cKDTree(place).query(place, k=list(range(1, min(count, len(place) - 1) + 2)))
+    positions = points.detach().cpu().double().numpy()
+    _, index = cKDTree(positions).query(positions, k=list(range(1, min(count, len(positions) - 1) + 2)))
     return torch.from_numpy(np.ascontiguousarray(index[:, 1:]))
 
 
@@ -217,7 +217,7 @@ def rigid_loss(canonical: Tensor, deformed: Tensor, near: Tensor) -> Tensor:
     return (moved - rest).abs().mean()
 
 
-def relative_turn(quats: Tensor, parents: Tensor) -> Tensor:
+def relative_angles(quats: Tensor, parents: Tensor) -> Tensor:
     """Compute each bone's rotation against its parent (rest for a root) in degrees, [..., J, 4] -> [..., J]."""
     conjugate = quats * quats.new_tensor((1.0, -1.0, -1.0, -1.0))
     above = torch.where(

@@ -61,8 +61,8 @@ def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geomet
         total = total + config.limit * limit_loss(pose, model.parents, config.limit_degrees)
     if config.attach:
         total = total + config.attach * attach_loss(transforms, model.pivots, model.parents)
-    planes, skeleton = _plane_weights(config), (model.pivots, model.parents, model.mirror)
-    for weight, loss in zip(planes, sagittal_losses(pose, transforms, *skeleton), strict=True):
+    planes = sagittal_losses(pose, transforms, model.pivots, model.parents, model.mirror)
+    for weight, loss in zip((config.limb_plane, config.body_plane, config.sideways), planes, strict=True):
         total = total + weight * loss
     if config.temporal and triples:
         total = total + config.temporal * temporal_loss(pose)
@@ -72,19 +72,7 @@ def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geomet
 
 
 def _weights(config: Geometry, triples: bool) -> Weights:
+    planes = (config.limb_plane, config.body_plane, config.sideways)
     cosine = math.cos(math.radians(config.limit_degrees) / 2)
-    temporal, still = (config.temporal, config.still) if triples else (0.0, 0.0)
-    return Weights(
-        config.limit,
-        *_plane_weights(config),
-        cosine,
-        config.attach,
-        temporal,
-        still,
-        config.still_step,
-        OBJECT_DIAGONAL,
-    )
-
-
-def _plane_weights(config: Geometry) -> tuple[float, float, float]:
-    return config.limb_plane, config.body_plane, config.sideways
+    steps = (config.temporal, config.still) if triples else (0.0, 0.0)
+    return Weights(config.limit, *planes, cosine, config.attach, *steps, config.still_step, OBJECT_DIAGONAL)
