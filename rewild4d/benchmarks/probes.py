@@ -80,19 +80,14 @@ def _start_rows(title: str, found: Mapping[str, float]) -> list[Row]:
 
 
 def _memory_row(found: Mapping[str, float], count: int, size: int) -> Row:
-    missing = not found
+    value, note = None, f"not measured: no {STATUS} here"
+    if found:
+        value = found["peak"] - found["before"]
+        note = f"above the {found['before']:.0f} MiB that the process held with its inputs"
     return Row(
-        subject=OURS,
-        quantity="peak memory",
-        value=None if missing else found["peak"] - found["before"],
-        unit="MiB",
-        gaussians=count,
-        size=size,
-        repeats=0 if missing else 1,
-        note=f"not measured: no {STATUS} here"
-        if missing
-        else f"above the {found['before']:.0f} MiB that the process held with its inputs",
-    )
+        subject=OURS, quantity="peak memory", value=value, unit="MiB", gaussians=count, size=size,
+        repeats=int(bool(found)), note=note,
+    )  # fmt: skip
 
 
 def _child(module: str, *words: str, environment: Mapping[str, str] | None = None) -> dict[str, float]:

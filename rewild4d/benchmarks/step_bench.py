@@ -149,7 +149,7 @@ def kernel_rows(repeats: int) -> list[Row]:
         before = {name: kernel.calls for name, kernel in KERNELS.items()}
         stepper.turn()
         used = [name for name, kernel in KERNELS.items() if kernel.calls > before[name]]
-        choices = {ALL: (), **{f"without {name}": (name,) for name in used}, NONE: tuple(used)}
+        choices: dict[str, tuple[str, ...]] = {ALL: (), **{f"without {name}": (name,) for name in used}, NONE: tuple(used)}
 
         def turn(names: tuple[str, ...], stepper: Stepper = stepper) -> None:
             with without_kernels(*names):

@@ -18,7 +18,7 @@ from rewild4d.kernels.simd import LANES, divide, fma, load, maximum, minimum, sp
 from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.threads import run_tickets
 from rewild4d.ours.fused.layers import BLOCK, Factors, Layout, backward_block, forward_block, pair_layers, round_up
-from rewild4d.ours.fused.quaternions import back_times, row, times
+from rewild4d.ours.fused.quaternions import back_times, read_row, times
 from rewild4d.ours.fused.queries import Scales, mix_back, read_query
 from rewild4d.ours.fused.sampled_rows import sample_rows
 
@@ -68,7 +68,7 @@ def _apply(
         for i in range(3):
             new_means[n, i] = means[n, i] + out[i * BLOCK + lane]
             new_log_scales[n, i] = log_scales[n, i] + out[(6 + i) * BLOCK + lane]
-        moved = times(row(quats, n), _quaternion(out, lane))
+        moved = times(read_row(quats, n), _quaternion(out, lane))
         for i in range(4):
             new_quats[n, i] = moved[i]
 
@@ -94,7 +94,7 @@ def _apply_back(
             change = out[(6 + i) * BLOCK + lane]
             grad_out[(6 + i) * BLOCK + lane] = (steep - bend * change * change) * g_log_scales[n, i]
         w, x, y, z = _quaternion(out, lane)
-        (a, b, c, d), (p, q, r, s) = row(quats, n), row(g_quats, n)
+        (a, b, c, d), (p, q, r, s) = read_row(quats, n), read_row(g_quats, n)
         v_w = p * a + q * b + r * c + s * d
         v_x = -p * b + q * a + r * d - s * c
         v_y = -p * c - q * d + r * a + s * b
@@ -115,8 +115,8 @@ def _rotation_back(
         if begin >= len(quats):
             return
         for n in range(begin, min(begin + CHUNK, len(quats))):
-            w, x, y, z = back_times(row(quats, n), row(new_quats, n))
-            p, q, r, s = row(g_quats, n)
+            w, x, y, z = back_times(read_row(quats, n), read_row(new_quats, n))
+            p, q, r, s = read_row(g_quats, n)
             on_quats[n, 0] = p * w + q * x + r * y + s * z
             on_quats[n, 1] = -p * x + q * w - r * z + s * y
             on_quats[n, 2] = -p * y + q * z + r * w - s * x

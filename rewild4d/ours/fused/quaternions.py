@@ -60,7 +60,7 @@ def back_times(p: tuple, q: tuple) -> tuple:
 
 
 @inlined
-def row(quats: np.ndarray, n: int) -> tuple:
+def read_row(quats: np.ndarray, n: int) -> tuple:
     """Read a row of an array."""
     return quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
 
@@ -75,7 +75,7 @@ def unit(q: tuple) -> tuple:
 @inlined
 def unit_row(quats: np.ndarray, n: int) -> tuple:
     """Normalise a row of a float32 array in single precision; append one over the length."""
-    a, b, c, d = row(quats, n)
+    a, b, c, d = read_row(quats, n)
     inverse = np.float32(1 / max(math.sqrt(a * a + b * b + c * c + d * d), SHORTEST))
     return a * inverse, b * inverse, c * inverse, d * inverse, inverse
 
