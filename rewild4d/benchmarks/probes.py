@@ -15,7 +15,7 @@ from pathlib import Path
 
 import torch
 
-from rewild4d.benchmarks.results import OURS, Row
+from rewild4d.benchmarks.results import OURS, Row, single_row
 from rewild4d.benchmarks.scenes import SplatScene, splat_scene, training
 from rewild4d.benchmarks.timing import progress
 
@@ -64,19 +64,15 @@ def step_row(count: int, size: int, preset: str) -> Row:
 
 
 def _start_rows(title: str, found: Mapping[str, float]) -> list[Row]:
-    def row(quantity: str, key: str, unit: str, note: str = "") -> Row:
-        return Row(
-            subject=OURS, quantity=quantity, value=found[key], unit=unit, gaussians=START_COUNT, size=START_SIZE,
-            note=note,
-        )  # fmt: skip
-
-    return [
-        row(title, "seconds", "s", "interpreter, imports, first image with gradients, and the process's end"),
-        row(f"{title}: torch", "torch", "s", "its own import, whatever comes after"),
-        row(f"{title}: after torch", "after_torch", "s", "imports of the rasterizer, first image with gradients"),
-        row(f"{title}: first image", "first_image", "s"),
-        row(f"{title}: kernels compiled", "compiled", "1"),
-    ]
+    rows = (
+        ("", "seconds", "s", "interpreter, imports, first image with gradients, and the process's end"),
+        (": torch", "torch", "s", "its own import, whatever comes after"),
+        (": after torch", "after_torch", "s", "imports of the rasterizer, first image with gradients"),
+        (": first image", "first_image", "s", ""),
+        (": kernels compiled", "compiled", "1", ""),
+    )
+    scene = START_COUNT, START_SIZE
+    return [single_row(OURS, title + part, found[key], unit, *scene, note) for part, key, unit, note in rows]
 
 
 def _memory_row(found: Mapping[str, float], count: int, size: int) -> Row:
@@ -84,10 +80,7 @@ def _memory_row(found: Mapping[str, float], count: int, size: int) -> Row:
     if found:
         value = found["peak"] - found["before"]
         note = f"above the {found['before']:.0f} MiB that the process held with its inputs"
-    return Row(
-        subject=OURS, quantity="peak memory", value=value, unit="MiB", gaussians=count, size=size,
-        repeats=int(bool(found)), note=note,
-    )  # fmt: skip
+    return single_row(OURS, "peak memory", value, "MiB", count, size, note)
 
 
 def _child(module: str, *words: str, environment: Mapping[str, str] | None = None) -> dict[str, float]:

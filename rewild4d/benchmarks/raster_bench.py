@@ -17,7 +17,7 @@ from rewild4d.benchmarks.floor import (
     multiply_adds_flops,
 )
 from rewild4d.benchmarks.peers import PEERS, SAME_PSNR, NotTimed, Peer, Render, psnr
-from rewild4d.benchmarks.results import BOTH, FLOOR, FORWARD, OURS, Row, timed_row
+from rewild4d.benchmarks.results import BOTH, FLOOR, FORWARD, OURS, Row, single_row, timed_row
 from rewild4d.benchmarks.scenes import SplatScene, splat_scene
 from rewild4d.benchmarks.timing import measure, per
 
@@ -38,15 +38,9 @@ def bench_rasterizer(
     probe: bool = True,
     device: torch.device = CPU,
 ) -> list[Row]:
-    """Time every number of Gaussians at every image side.
+    """Time every number of Gaussians at every image side in pixels, on the CPU or a CUDA GPU.
 
-    Args:
-        counts: numbers of Gaussians.
-        sizes: sides of the square images in pixels.
-        repeats: rounds of measurement of each scene.
-        peers: to compare with.
-        probe: measure peak memory too (of the largest scene) and, on the CPU, start-up, in their own processes.
-        device: CPU, or a CUDA GPU.
+    ``probe`` adds peak memory (of the largest scene) and, on the CPU, start-up, in their own processes.
     """
     scenes = [(count, size) for count in counts for size in sizes]
     rows: list[Row] = []
@@ -66,7 +60,7 @@ def scene_rows(
     """Measure one scene, given on the CPU."""
     count, size = len(scene), scene.size
     blends, placed = count_blends(scene), scene.to(device)
-    rows = [Row(subject="scene", quantity="useful blends", value=blends, unit="1", gaussians=count, size=size)]
+    rows = [single_row("scene", "useful blends", blends, "1", count, size)]
     admitted = {peer: _admit(peer, placed) for peer in peers}
     contenders = _calls(OURS, lambda gaussians: placed.render(gaussians)[0], placed)
     for calls, _ in admitted.values():
@@ -80,10 +74,9 @@ def scene_rows(
         return [timed_row(*key, samples[key], count, size, note) for key in contenders if key[0] == subject]
 
     gflops = max(flops[key] / samples[key].median / 1e6 for key in arithmetic)
-    rows.append(Row(subject=FLOOR, quantity="multiply-adds", value=gflops, unit="GFLOP/s", gaussians=count, size=size))
+    rows.append(single_row(FLOOR, "multiply-adds", gflops, "GFLOP/s", count, size))
     for quantity, each in ((FORWARD, FLOPS_FORWARD), (BOTH, FLOPS_BOTH)):
-        floor = floor_ms(blends, each, gflops)
-        rows.append(Row(subject=FLOOR, quantity=quantity, value=floor, unit="ms", gaussians=count, size=size))
+        rows.append(single_row(FLOOR, quantity, floor_ms(blends, each, gflops), "ms", count, size))
     rows += timed(OURS)
     for peer, (_, found) in admitted.items():
         rows += [*found, *timed(peer.name, peer.note)]
@@ -119,10 +112,7 @@ def _admit(peer: Peer, scene: SplatScene) -> tuple[Contenders, list[Row]]:
     """Return the calls of a peer that renders our image, and rows with its PSNR or the reason why it is not timed."""
 
     def row(quantity: str, value: float | None, unit: str, note: str = "") -> Row:
-        return Row(
-            subject=peer.name, quantity=quantity, value=value, unit=unit, gaussians=len(scene), size=scene.size,
-            repeats=int(value is not None), note=note,
-        )  # fmt: skip
+        return single_row(peer.name, quantity, value, unit, len(scene), scene.size, note)
 
     try:
         render = peer.prepare(scene)

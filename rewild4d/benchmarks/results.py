@@ -56,6 +56,16 @@ class Result(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     code: dict[str, str] = msgspec.field(default_factory=code_version)  # version of rewild4d and digest of its sources
 
 
+def single_row(
+    subject: str, quantity: str, value: float | None, unit: str, gaussians: int, size: int, note: str = ""
+) -> Row:
+    """Return the row of a number that was measured once, or (None) not at all."""
+    return Row(
+        subject=subject, quantity=quantity, value=value, unit=unit, gaussians=gaussians, size=size,
+        repeats=int(value is not None), note=note,
+    )  # fmt: skip
+
+
 def timed_row(subject: str, quantity: str, sample: Sample, gaussians: int, size: int, note: str = "") -> Row:
     """Return the row of a measured time."""
     return Row(

@@ -75,13 +75,7 @@ def coverage(scene: SplatScene) -> float:
 
 
 def splat_scene(count: int, size: int, seed: int = 0) -> SplatScene:
-    """Build the template at rest, seen from its front left, covering a quarter of a square image.
-
-    Args:
-        count: number of Gaussians.
-        size: side of the image in pixels.
-        seed: of positions and colours.
-    """
+    """Build the template at rest, seen from its front left, covering a quarter of a square image."""
     generator = torch.Generator().manual_seed(seed)
     surface = sample_surface(_prior(_swing(0.0), [AZIMUTH] * FRAMES, 64), count, generator)
     scales = torch.tensor((1.0, 1.0, FLATNESS)) * TILING * surface.radius
@@ -117,12 +111,6 @@ def step_config(size: int, gaussians: int, preset: str) -> Config:
 
 def training(size: int, gaussians: int, preset: str, device: torch.device | None = None) -> tuple[Training, int]:
     """Build a main stage of `ours` in its middle; return it and the index of its next step.
-
-    Args:
-        size: side of the square frames in pixels.
-        gaussians: number of Gaussians.
-        preset: of `ours`.
-        device: the CPU by default.
 
     Raises:
         UserError: no such preset.

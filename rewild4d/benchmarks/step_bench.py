@@ -58,16 +58,10 @@ def bench_step(
     device: torch.device = CPU,
     kernels: bool = False,
 ) -> list[Row]:
-    """Time steps at every image side, in turns; profile them; render the result.
+    """Time steps with ``count`` Gaussians at every image side, in turns; profile them; render the result.
 
-    Args:
-        count: Gaussians.
-        sizes: sides of the square frames in pixels.
-        repeats: rounds of measurement.
-        preset: of `ours`.
-        probe: measure memory too (on the CPU), in its own processes.
-        device: CPU, or a CUDA GPU.
-        kernels: time the step with each fused kernel switched off too (on the CPU).
+    ``probe`` adds memory, in its own processes, and ``kernels`` the step with each fused kernel switched off (CPU
+    only).
 
     Raises:
         UserError: no such preset.
@@ -91,8 +85,7 @@ def bench_step(
 class Stepper:
     """A training that continues from turn to turn.
 
-    Attributes:
-        period: steps of a turn; some losses act only in every n-th step, so single steps differ.
+    A turn has ``period`` steps: some losses act only in every n-th step, so single steps differ.
     """
 
     def __init__(self, count: int, size: int, preset: str, device: torch.device = CPU) -> None:
@@ -149,7 +142,11 @@ def kernel_rows(repeats: int) -> list[Row]:
         before = {name: kernel.calls for name, kernel in KERNELS.items()}
         stepper.turn()
         used = [name for name, kernel in KERNELS.items() if kernel.calls > before[name]]
-        choices: dict[str, tuple[str, ...]] = {ALL: (), **{f"without {name}": (name,) for name in used}, NONE: tuple(used)}
+        choices: dict[str, tuple[str, ...]] = {
+            ALL: (),
+            **{f"without {name}": (name,) for name in used},
+            NONE: tuple(used),
+        }
 
         def turn(names: tuple[str, ...], stepper: Stepper = stepper) -> None:
             with without_kernels(*names):

@@ -46,16 +46,9 @@ def measure(
     budget: float = BUDGET,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[Name, Sample]:
-    """Time all contenders in rounds, each one once a round.
+    """Time all contenders in rounds, each one once a round, within a ``budget`` in seconds.
 
     Each turn is an untimed call, since the last contender left its own data in the caches, and a timed one.
-
-    Args:
-        contenders: what to call, by name.
-        repeats: rounds.
-        title: of the progress bar.
-        budget: see `BUDGET`.
-        clock: returns seconds.
     """
     times: dict[Name, list[float]] = {name: [] for name in contenders}
     spent = dict.fromkeys(contenders, 0.0)

@@ -32,14 +32,10 @@ def four_rows(columns: np.ndarray, first: int, lane: int) -> tuple[Any, Any, Any
 
 @kernel
 def read_columns(rows: np.ndarray, begin: int, end: int, columns: np.ndarray, wide: int) -> None:
-    """Set columns [numbers, wide] to the rows begin..end of [n, numbers]; lanes past the end get zeros.
+    """Set columns [numbers, wide] to the rows begin..end of [n, numbers], at most ``wide``; lanes past the end get
+    zeros.
 
-    Args:
-        rows: C-contiguous.
-        begin: first row.
-        end: one past the last; at most ``wide`` rows.
-        columns: flat, with room for a multiple of sixteen numbers; those past the rows' own are undefined.
-        wide: lanes, a multiple of sixteen.
+    ``columns`` is flat, with room for a multiple of sixteen numbers; those past the rows' own are undefined.
     """
     numbers = rows.shape[1]
     flat, length = rows.reshape(-1), rows.size

@@ -91,15 +91,9 @@ def add_pair_product(
     a: np.ndarray, a_first: int, a_row: int, b: np.ndarray, b_first: int, b_row: int, depth: int, c: np.ndarray,
     c_first: int, c_row: int, rows: int, columns: int,
 ) -> None:  # fmt: skip
-    """Compute C += A B.
+    """Compute C += A B of words, as `matrix.add_product`.
 
-    Args:
-        a: words of A [rows, depth], pairs along a row, from a_first, rows a_row words apart.
-        b: words of B [depth, columns], pairs along a column, from b_first, rows b_row words apart.
-        depth: in words: half the length of a sum.
-        c: C [rows, columns] from c_first, rows c_row apart.
-        rows: a multiple of 8.
-        columns: a multiple of 16.
+    A [rows, depth] has pairs along a row, B [depth, columns] along a column; ``depth`` counts words.
     """
     column = 0
     while column < columns:
@@ -155,12 +149,10 @@ def _rounded(bits: int) -> int:
 def pair_matrix(
     bits: np.ndarray, first: int, rows: int, columns: int, along: np.ndarray, across: np.ndarray, index: int
 ) -> None:
-    """Set words of a matrix as a left factor, and of its transpose.
+    """Set words of a matrix and of its transpose, both from ``index`` on.
 
-    Args:
-        bits: float32 numbers as int32; the matrix [rows, columns], both even, begins at ``first``.
-        along: int32, words of the matrix, [rows, columns / 2] from ``index``.
-        across: int32, words of its transpose, [columns, rows / 2] from ``index``.
+    ``bits`` are float32 numbers as int32; the matrix [rows, columns], both even, begins at ``first``. ``along`` gets
+    [rows, columns / 2] words, ``across`` [columns, rows / 2].
     """
     for row in range(rows):
         for column in range(0, columns, 2):

@@ -78,13 +78,7 @@ def _shade(
 
 
 def shade(colors: Tensor, means: Tensor, eye: Tensor) -> Tensor:
-    """Compute colours [n, 3], at least 0, from a point; float32 on the CPU, no gradients.
-
-    Args:
-        colors: coefficients of degree 1 to 3, offset by 0.5, [n, 4 or 9 or 16, 3].
-        means: [n, 3].
-        eye: [3].
-    """
+    """Compute colours [n, 3], at least 0, from a point; coefficients offset by 0.5, float32 on the CPU."""
     seen = torch.empty(len(means), 3)
     degree = math.isqrt(colors.shape[1]) - 1
     run_tickets(_shade, array(colors), array(means), array(eye), degree, seen.numpy())

@@ -12,17 +12,10 @@ from rewild4d.transforms import mirror_points, quat_to_matrix
 
 @torch.no_grad()
 def initial_colors(model: Model, supervision: Supervision) -> Tensor:
-    """Average the colour over the frames that see a Gaussian; take the nearest mirrored Gaussian's where none does.
+    """Average the colour over the frames that see a Gaussian, [n, 3]; take the nearest mirrored one's where none does.
 
     A Gaussian counts as seen where its normal faces the camera and its pixel lies well inside the mask; occlusion is
     ignored.
-
-    Args:
-        model: with the poses after the warm-up.
-        supervision: the clip's views.
-
-    Returns:
-        RGB, [n, 3].
     """
     own = model.gaussians
     weights = model.field.sample(model.field.probabilities(), own.means)
@@ -44,16 +37,7 @@ def initial_colors(model: Model, supervision: Supervision) -> Tensor:
 
 
 def project_colors(points: Tensor, normals: Tensor, target: Target) -> tuple[Tensor, Tensor]:
-    """Read the colour of points in one image, and whether they are seen.
-
-    Args:
-        points: posed, in the object frame, [n, 3].
-        normals: outward, [n, 3].
-        target: the image and its camera.
-
-    Returns:
-        RGB, [n, 3], and seen, boolean, [n].
-    """
+    """Read the colour of posed points [n, 3] in one image, and whether they are seen, by outward normals [n, 3]."""
     camera = target.camera
     pixels, depth = camera.project(points)
     grid = (pixels / points.new_tensor((camera.width, camera.height)) * 2 - 1)[None, None]

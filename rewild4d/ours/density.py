@@ -63,14 +63,9 @@ class DensityControl:
 def replace_gaussians(
     gaussians: Gaussians, optimizer: torch.optim.Optimizer, values: dict[str, Tensor], source: Tensor, kept: int
 ) -> None:
-    """Replace the learnable tensors; the first ``kept`` rows keep their Adam moments, the others start from zero.
+    """Replace the learnable tensors by ``values``, whose rows come from the old rows ``source``.
 
-    Args:
-        gaussians: changed in place.
-        optimizer: Adam whose groups follow `NAMES`.
-        values: new tensors by name, [n', ...].
-        source: old row of each new row, [n'].
-        kept: rows that only moved.
+    The first ``kept`` rows keep their Adam moments, the others start from zero.
     """
     for group, name in zip(optimizer.param_groups, NAMES, strict=True):
         old = group["params"][0]

@@ -232,16 +232,7 @@ class Training:
 def train(
     clip: Clip, prior: Prior, config: Config, seed: int, device: torch.device, log: Log, workdir: Path | None
 ) -> Model:
-    """Fit the model to a clip.
-
-    Args:
-        clip: the frames.
-        prior: the start.
-        config: all settings.
-        seed: of the one generator.
-        device: to compute on.
-        log: progress over both stages.
-        workdir: of checkpoints; one of the same fit is continued.
+    """Fit the model to a clip; a checkpoint of the same fit in ``workdir`` is continued.
 
     Raises:
         UserError: the clip or the prior cannot be used.

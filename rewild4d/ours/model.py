@@ -65,14 +65,9 @@ class Model(nn.Module):
         return joint_transforms(pose.quats, pose.shifts, self.pivots)
 
     def skin(self, weights: Tensor, quats: Tensor, transforms: Tensor) -> tuple[Posed, Posed]:
-        """Skin the canonical Gaussians for the pose branch and for the appearance branch.
+        """Skin the canonical Gaussians by weights [n, J] for the pose branch and for the appearance branch.
 
         Both have the same values; gradients of the second do not reach the joints, unless `loss.isolated` is off.
-
-        Args:
-            weights: of each Gaussian, [n, J].
-            quats: rotation of each joint, [J, 4].
-            transforms: rest -> posed, [J, 4, 4].
         """
         own, log_scales = self.gaussians, self.gaussians.scales_log()
         if SKINNING.takes(own.means, owner=self):
@@ -87,15 +82,7 @@ class Model(nn.Module):
         return live, still if self.config.loss.isolated else live
 
     def deformed(self, pose: Pose, weights: Tensor, posed: Posed, strength: float, offset: float = 0.0) -> Posed:
-        """Apply the deformation network to skinned Gaussians.
-
-        Args:
-            pose: of one code; its features condition the network.
-            weights: of each Gaussian, [n, J].
-            posed: skinned Gaussians of the appearance branch.
-            strength: of the deformation, in [0, 1].
-            offset: see `DeformNetwork.forward`.
-        """
+        """Apply the deformation network to skinned Gaussians at a pose of one code; see `DeformNetwork.forward`."""
         if strength == 0 or not self.config.deform.enabled:
             return posed
         features = pose.features[0].detach() if self.config.deform.detach_features else pose.features[0]

@@ -17,15 +17,10 @@ def for_clip(config: C, frames: int) -> C:
 
 
 def for_clip_of_ours(config: Config, frames: int, *, filmed: bool = False) -> Config:
-    """Resolve settings for a clip: fewer steps if short, a finer time code if long, `Footage` if filmed.
+    """Resolve settings for a clip: fewer steps if short, a finer time code if long, `Footage` if its cameras are
+    unknown.
 
-    Args:
-        config: as chosen.
-        frames: of the clip.
-        filmed: its cameras are not known.
-
-    Returns:
-        Settings that stay the same for a clip of any length.
+    The result stays the same for a clip of any length.
     """
     config = _for_footage(config) if filmed and config.footage.use else config
     pose = config.pose

@@ -70,15 +70,9 @@ class SkinningField(nn.Module):
 
 
 def build_field(vertices: Tensor, weights: Tensor, mirror: Tensor, config: Skinning) -> SkinningField:
-    """Spread the prior's skinning weights over a cube around its rest shape.
+    """Spread the prior's skinning weights [n, J] over a cube around its rest shape [n, 3].
 
     Per voxel the inverse-distance mean of the nearest vertices' weights, then sweeps of neighbour averaging.
-
-    Args:
-        vertices: rest shape, [n, 3].
-        weights: rows sum to one, [n, J].
-        mirror: bone on the other side of each bone, [J].
-        config: resolution and fill.
     """
     low, high = vertices.amin(0), vertices.amax(0)
     half = config.margin * 0.5 * (high - low).max()

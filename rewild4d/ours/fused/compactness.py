@@ -1,7 +1,4 @@
-"""Compactness of the parts: matrix products of the Gaussians' masses, 64 Gaussians side by side.
-
-The torch twin is `compact_loss` (ours/losses/regularizers.py).
-"""
+"""Compactness of the parts: matrix products of the Gaussians' masses, 64 Gaussians side by side."""
 
 from collections.abc import Sequence
 from typing import Any

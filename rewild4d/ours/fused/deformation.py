@@ -1,7 +1,4 @@
-"""Deformation of all Gaussians, block by block in the cache; the backward pass recomputes each block.
-
-The torch twin is `DeformNetwork.forward` (ours/deform.py), which also prepares the flat parameters.
-"""
+"""Deformation of all Gaussians, block by block in the cache; the backward pass recomputes each block."""
 
 from typing import Any
 
@@ -24,7 +21,7 @@ from rewild4d.ours.fused.sampled_rows import sample_rows
 
 DEFORMATION = Kernel(
     "deformation",
-    "ce3470813534",
+    "0688f8e6e69d",
     "rewild4d.ours.deform:DeformNetwork.forward",
     "rewild4d.ours.deform:DeformNetwork._position_code",
     "rewild4d.ours.deform:DeformNetwork._attend",
@@ -191,23 +188,11 @@ def deform(
     flat: Tensor, sizes: Layout, scales: Scales, half: bool, weights: Tensor, anchors: Tensor | None, means: Tensor,
     quats: Tensor, log_scales: Tensor, sampled: int = 0, offset: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Deform Gaussians; float32 on the CPU.
+    """Deform Gaussians as `DeformNetwork.forward`, whose layers are folded into ``flat``; float32 on the CPU.
 
-    Args:
-        flat: matrices and biases, [sizes.total].
-        sizes: their layout.
-        scales: units of the outputs.
-        half: round the factors of products to bfloat16 where the CPU multiplies such pairs; sums stay in float32.
-        weights: skinning weights, no gradient, [n, J].
-        anchors: of the parts, [J, D] with D at most 16; the query holds their weighted sum, or the weights where None.
-        means: [n, 3]; like quats and log_scales, differentiable as what is moved, not as the network's input.
-        quats: unit, [n, 4].
-        log_scales: [n, 3].
-        sampled: number of Gaussians that represent all in the gradients of ``flat`` and ``anchors``; 0 uses all.
-        offset: of the draw, uniform in [0, 1).
-
-    Returns:
-        Means [n, 3], quats [n, 4] and log scales [n, 3].
+    ``half`` rounds the factors of products to bfloat16 where the CPU multiplies such pairs. Means, quats and log_scales
+    are differentiable as what is moved, not as the network's input. ``sampled`` Gaussians (0: all), drawn by
+    ``offset``, give the gradients of ``flat`` and ``anchors`` [J, D], D at most 16.
     """
     half = half and available()
     return _Deform.apply(flat, anchors, means, quats, log_scales, weights, sizes, scales, half, sampled, offset)

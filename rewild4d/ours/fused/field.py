@@ -1,7 +1,4 @@
-"""Skinning field: trilinear samples at the Gaussians, and the total variation, with one gradient for both.
-
-The torch twins are `SkinningField.sample` (ours/skinning.py) and `tv_loss` (ours/losses/regularizers.py).
-"""
+"""Skinning field: trilinear samples at the Gaussians, and the total variation, with one gradient for both."""
 
 from typing import Any
 
@@ -20,7 +17,7 @@ from rewild4d.kernels.threads import run_tickets
 
 FIELD = Kernel(
     "skinning field",
-    "bbcf56220f1f",
+    "22cb95aaf892",
     "rewild4d.ours.skinning:SkinningField.sample",
     "rewild4d.ours.skinning:SkinningField.sample_and_vary",
     "rewild4d.ours.losses.regularizers:tv_loss",
@@ -170,18 +167,11 @@ def _sample_backward(
 def sample_grid(
     table: Tensor, points: Tensor, origin: Tensor, pitch: Tensor, size: int, delta: float | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Sample a cubic grid of vectors trilinearly, and compute its total variation; float32 on the CPU.
+    """Sample a cubic grid of vectors [size^3, J], x slowest, at points [n, 3], and compute its `tv_loss`; float32 on
+    the CPU.
 
-    Args:
-        table: x slowest, [size^3, J]; the only differentiable input.
-        points: [n, 3].
-        origin: centre of the first voxel, [3].
-        pitch: [3].
-        size: voxels along each axis, at least 2.
-        delta: Huber threshold of the variation; None skips it.
-
-    Returns:
-        Samples [n, J], and the mean over the axes of the mean Huber function of forward differences.
+    Only the table gets a gradient. ``origin`` is the centre of the first voxel; without ``delta`` the variation is
+    skipped.
     """
     return _Sample.apply(table, points, origin, pitch, size, delta)
 

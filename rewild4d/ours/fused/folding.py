@@ -1,7 +1,5 @@
-"""Flatten the deformation network, with its few keys and values folded into the first matrices.
-
-The torch twin is `DeformNetwork._attention` (ours/deform.py).
-"""
+"""Flatten the deformation network, its few keys and values folded into the first matrices
+(`DeformNetwork._attention`)."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""Norm and scaling of many gradients in one call; the torch twins are in ours/gradients.py."""
+"""Norm and scaling of many gradients in one call."""
 
 import math
 

@@ -1,7 +1,4 @@
-"""Colour of every Gaussian from one viewpoint, whose direction is first rotated into the canonical frame.
-
-The torch twin is `Gaussians.seen_rgb` (ours/canonical.py).
-"""
+"""Colour of every Gaussian from one viewpoint, whose direction is first rotated into the canonical frame."""
 
 from typing import Any
 
@@ -21,7 +18,7 @@ from rewild4d.ours.fused.quaternions import dot, times_back
 
 COLORS = Kernel(
     "colours from harmonics",
-    "0848b962f5dd",
+    "7fcc9a0fde99",
     "rewild4d.ours.canonical:Gaussians.seen_rgb",
     "rewild4d.ours.canonical:Gaussians.rotations_to",
 )
@@ -137,16 +134,9 @@ def _backward(
 def seen_rgb(
     colors: Tensor, means: Tensor, quats: Tensor, rest: Tensor, eye: Tensor, degree: int, gain: float
 ) -> Tensor:
-    """Compute colours [n, 3] from a viewpoint; float32 on the CPU, gradients for the colours only.
+    """Compute `Gaussians.seen_rgb`; float32 on the CPU, gradients for the colours only.
 
-    Args:
-        colors: RGB, then ``gain`` times the coefficients above degree 0, [n, k, 3].
-        means: posed, [n, 3].
-        quats: posed, any length, [n, 4].
-        rest: canonical, any length, [n, 4].
-        eye: [3].
-        degree: in use, 1 to 3.
-        gain: of the coefficients.
+    ``quats`` (posed) and ``rest`` (canonical) may have any length; ``gain`` multiplies the coefficients above degree 0.
     """
     if not 1 <= degree <= 3:
         raise ValueError(f"expected a degree from 1 to 3, got {degree}")

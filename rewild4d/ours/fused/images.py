@@ -1,7 +1,4 @@
-"""Image losses and their gradients, strip by strip: L1 and SSIM of two composed images, BCE and Dice of two mattes.
-
-The torch twins are in ours/losses/images.py.
-"""
+"""Image losses and their gradients, strip by strip: L1 and SSIM of two composed images, BCE and Dice of two mattes."""
 
 import math
 from typing import Any
@@ -19,7 +16,7 @@ from rewild4d.kernels.threads import run_tickets
 
 COLOUR_LOSSES = Kernel(
     "colour losses",
-    "0a0096d03ed4",
+    "9b896ed85346",
     "rewild4d.ours.losses.images:colour_losses",
     "rewild4d.ours.losses.images:ssim_map",
     "rewild4d.ours.losses.images:blur_matrix",
@@ -207,17 +204,10 @@ def colour_means(
     image: Tensor, matte: Tensor, truth: Tensor, mask: Tensor, background: Tensor, window: tuple[int, int, int, int],
     inner: tuple[int, int, int, int], area: float,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Compute `colour_losses`: sums of |x - y| over a window and of 1 - SSIM inside it; float32 on the CPU.
+    """Compute `colour_losses`, divided by ``area``; float32 on the CPU, gradients for image and matte.
 
-    Args:
-        image: premultiplied, differentiable, [3, h, w].
-        matte: differentiable, [1, h, w].
-        truth: premultiplied, [3, h, w].
-        mask: [1, h, w].
-        background: RGB, [3].
-        window: top, left, height, width.
-        inner: first and end row, first and end column, from the window's corner, of the pixels whose SSIM counts.
-        area: divisor of both sums.
+    ``window`` is top, left, height, width; ``inner`` are first and end row, first and end column, from the window's
+    corner, of the pixels whose SSIM counts.
     """
     return _Colour.apply(image, matte, truth, mask, background, window, inner, area)
 

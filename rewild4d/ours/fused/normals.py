@@ -1,7 +1,4 @@
-"""Normals of Gaussians, and how well those of neighbouring pixels agree.
-
-The torch twins are in ours/losses/regularizers.py.
-"""
+"""Normals of Gaussians, and how well those of neighbouring pixels agree."""
 
 import math
 from typing import Any

@@ -1,7 +1,4 @@
-"""Poses of codes: the pose network in one forward and one backward pass.
-
-The torch twin is `PoseNetwork.forward` (ours/pose.py).
-"""
+"""Poses of codes: the pose network in one forward and one backward pass."""
 
 import math
 from collections.abc import Sequence
@@ -145,17 +142,9 @@ def _starts(counts: tuple[int, ...]) -> np.ndarray:
 def poses(
     sizes: Sizes, parameters: Sequence[Tensor], code: Tensor, flipped: np.ndarray, mirror: np.ndarray
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute poses of a batch of codes; float32 on the CPU, gradients for the parameters only.
+    """Compute quats [B, J, 4], shifts [B, J, 3] and features [B, J, K] of codes [B, E]; float32 on the CPU.
 
-    Args:
-        sizes: of the network.
-        parameters: float32, in the network's own order.
-        code: [B, E].
-        flipped: which poses are mirrored, bool, [B].
-        mirror: joint on the other side, int64, [J].
-
-    Returns:
-        Quats [B, J, 4], shifts [B, J, 3] and features [B, J, K].
+    Only the parameters, in the network's own order, get gradients; ``flipped`` [B] poses are mirrored.
     """
     return _Poses.apply(sizes, code, flipped, mirror, torch.is_grad_enabled(), *parameters)
 

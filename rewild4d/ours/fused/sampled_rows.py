@@ -88,19 +88,9 @@ def sample_rows(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Draw about ``wanted`` of n Gaussians in proportion to the gradients of the network's outputs.
 
-    Args:
-        far: displacement per unit of output.
-        grow: change of log scale per unit of output.
-        quats: deformed orientations, unit, [n, 4].
-        g_means: [n, 3].
-        g_quats: [n, 4].
-        g_log_scales: [n, 3].
-        wanted: at least 1.
-        offset: uniform in [0, 1); the only randomness.
-
-    Returns:
-        Ascending rows, int64 [k], and their weights, float32 [k]; all rows with weight 1 where a gradient is not
-            finite, none where all are zero.
+    ``far`` and ``grow`` are displacement and change of log scale per unit of output; ``offset`` in [0, 1) is the only
+    randomness. Returns ascending rows and their weights [k]: all with weight 1 where a gradient is not finite, none
+    where all are zero.
     """
     count = len(quats)
     worth, totals = np.empty(count), np.empty(-(-count // CHUNK))

@@ -1,6 +1,6 @@
 """Poses as transforms, with the skeleton's regularizers: a few hundred numbers, one thread.
 
-The torch twins are in ours/losses/skeleton.py. Each loss is computed with its gradient; the backward pass scales it.
+Each loss is computed with its gradient; the backward pass scales it.
 """
 
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from rewild4d.kernels.switch import Kernel
 from rewild4d.ours.fused.quaternions import dot, rotation, rotation_grad, side, unit, unit_grad
 
 POSTURE = Kernel(
-    "posture", "3b43920b19d4", "rewild4d.ours.losses.skeleton:posture", "rewild4d.ours.losses.skeleton:skeleton_losses"
+    "posture", "c6a13064e900", "rewild4d.ours.losses.skeleton:posture", "rewild4d.ours.losses.skeleton:skeleton_losses"
 )
 
 
@@ -269,21 +269,8 @@ def posture_and_losses(
     mirror: Tensor,
     weights: Weights,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Select rows of a batch of poses with their transforms, and sum the regularizers of all; float32 on the CPU.
-
-    Args:
-        quats: [B, J, 4].
-        shifts: [B, J, 3].
-        features: [B, J, K].
-        rows: k indices.
-        pivots: [J, 3].
-        parents: -1 for a root, [J].
-        mirror: bone on the other side, [J].
-        weights: of the regularizers.
-
-    Returns:
-        Quats, shifts and features of the rows [k, J, ...], transforms [k, J, 4, 4], and the weighted sum, scalar.
-    """
+    """Select rows of a batch of poses with their transforms [k, J, 4, 4], and sum the regularizers of all; float32,
+    CPU."""
     return _Posture.apply(quats, shifts, features, rows, pivots, parents, mirror, weights)
 
 

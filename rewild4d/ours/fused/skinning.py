@@ -1,7 +1,6 @@
 """Linear blend skinning for both branches: one forward pass, and one backward pass that keeps their gradients apart.
 
-64 Gaussians at a time: their numbers are rows, Gaussians are lanes, and blending is a small matrix product. The torch
-twins are `transforms.skin_points` and `skin_quats`, called once a branch.
+64 Gaussians at a time: their numbers are rows, Gaussians are lanes, and blending is a small matrix product.
 """
 
 from typing import Any, NamedTuple
@@ -22,7 +21,7 @@ from rewild4d.ours.fused.quaternions import back_times, times, times_back, unit_
 
 SKINNING = Kernel(
     "skinning",
-    "6c5e2f94d72b",
+    "f97e862003c8",
     "rewild4d.ours.model:Model.skin",
     "rewild4d.transforms:skin_points",
     "rewild4d.transforms:skin_quats",
@@ -224,18 +223,10 @@ def _tables(transforms: Tensor, quats: Tensor) -> Joints:
 def skin_both(
     means: Tensor, quats: Tensor, weights: Tensor, transforms: Tensor, joint_quats: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Skin positions and orientations for two branches of equal values; float32 on the CPU.
+    """Skin rest positions [n, 3] and orientations [n, 4] of any length by joints; float32 on the CPU.
 
-    Args:
-        means: rest positions, [n, 3].
-        quats: rest orientations, any length, [n, 4].
-        weights: [n, J].
-        transforms: rest -> posed, [J, 4, 4].
-        joint_quats: their rotations, [J, 4].
-
-    Returns:
-        Means [n, 3] and unit quats [n, 4] whose gradients reach the joints, then the same without gradients to the
-            joints; they share memory, so none may be changed in place.
+    Returns means and unit quats whose gradients reach the joints, then the same without gradients to the joints; they
+    share memory, so none may be changed in place.
     """
     return _Skin.apply(means, quats, weights, transforms, joint_quats)
 

@@ -19,12 +19,9 @@ from rewild4d.types import OBJECT_DIAGONAL
 
 
 def tv_loss(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
-    """Compute L_tv: the mean over the axes of the mean Huber function of forward differences.
+    """Compute L_tv of a field [R^3, J]: the mean over the axes of the mean Huber function of forward differences.
 
-    Args:
-        probabilities: of the field, x slowest, [R^3, J].
-        resolution: R.
-        delta: x^2 / 2 inside, delta (|x| - delta / 2) outside.
+    The Huber function is x^2 / 2 inside delta, delta (|x| - delta / 2) outside.
     """
     grid = probabilities.view(resolution, resolution, resolution, -1)
     terms = [
@@ -35,16 +32,11 @@ def tv_loss(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
 
 
 def compact_loss(clouds: Sequence[Tensor], weights: Tensor, opacities: Tensor, power: float) -> Tensor:
-    """Compute L_compact: the mean over clouds and parts of the two smaller eigenvalues of a part's covariance.
+    """Compute L_compact: the mean over clouds [n, 3] and parts of the two smaller eigenvalues of a part's covariance.
 
     They are tr C - v^T C v with v the top eigenvector of the detached C: exactly the eigenvalues' gradient, and defined
-    where the two coincide. Parts of mass below 1 are skipped; weights and opacities get no gradient.
-
-    Args:
-        clouds: positions of the same Gaussians, [n, 3] each.
-        weights: skinning weights, [n, J].
-        opacities: [n].
-        power: exponent on the weights.
+    where the two coincide. Masses are opacity times weight to a ``power``, without gradients; parts of mass below 1 are
+    skipped.
     """
     if COMPACTNESS.takes(*clouds):
         return compactness(clouds, weights, opacities, power)
@@ -65,15 +57,10 @@ def compact_loss(clouds: Sequence[Tensor], weights: Tensor, opacities: Tensor, p
 
 
 def smooth_loss(posed: Posed, opacities: Tensor, size: int, generator: torch.Generator) -> Tensor:
-    """Compute L_smooth: agreement of neighbouring pixels of a rendered normal map, from a random viewpoint.
+    """Compute L_smooth: agreement of neighbouring pixels of a rendered normal map, ``size`` pixels wide.
 
-    A Gaussian's normal is the axis of its smallest scale, pointing to the camera. Only the normals get gradients.
-
-    Args:
-        posed: deformed Gaussians.
-        opacities: [n].
-        size: side of the image, pixels.
-        generator: draws azimuth in [0, 360) and elevation in [-10, 60) degrees.
+    The viewpoint is random: azimuth in [0, 360), elevation in [-10, 60) degrees. A Gaussian's normal is the axis of its
+    smallest scale, pointing to the camera. Only the normals get gradients.
     """
     means, log_scales = posed.means.detach(), posed.log_scales.detach()
     azimuth, elevation = torch.rand(2, generator=generator).tolist()
@@ -135,13 +122,7 @@ def attach_loss(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
 
 
 def joint_gaps(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
-    """Return each joint's position relative to its parent's copy, zero for a root, [B, J, 3].
-
-    Args:
-        transforms: rest -> posed, [B, J, 4, 4].
-        pivots: [J, 3].
-        parents: -1 for a root, [J].
-    """
+    """Return each joint's position relative to its parent's copy, zero for a root, [B, J, 3]."""
     carrier = torch.where(parents >= 0, parents, torch.arange(len(parents), device=parents.device))
     pivot = torch.nn.functional.pad(pivots, (0, 1), value=1.0)[..., None]
     return ((transforms - transforms[:, carrier]) @ pivot)[..., :3, 0]
@@ -153,13 +134,6 @@ def sagittal_losses(
     """Compute mean rotations of bones out of the planes along the body, and mean gaps of limbs across it.
 
     Rotations within such a plane are about x. Limbs are the bones that have a counterpart on the other side.
-
-    Args:
-        pose: unit quaternions.
-        transforms: of the same poses, rest -> posed, [B, J, 4, 4].
-        pivots: [J, 3].
-        parents: -1 for a root, [J].
-        mirror: bone on the other side, [J].
 
     Returns:
         Squared y and z of the quaternion against the parent, of limbs and of other bones; squared x of the limbs' gaps
@@ -205,13 +179,7 @@ def neighbours(points: Tensor, count: int) -> Tensor:
 
 
 def rigid_loss(canonical: Tensor, deformed: Tensor, near: Tensor) -> Tensor:
-    """Compute the mean change of distance between canonical neighbours (as isometric as possible).
-
-    Args:
-        canonical: no gradient, [n, 3].
-        deformed: [n, 3].
-        near: from `neighbours`, [n, k].
-    """
+    """Compute the mean change of distance to canonical neighbours ``near`` [n, k] (as isometric as possible)."""
     rest = (canonical.detach()[:, None] - canonical.detach()[near]).norm(dim=-1)
     moved = ((deformed[:, None] - deformed[near]).square().sum(-1) + 1e-12).sqrt()
     return (moved - rest).abs().mean()

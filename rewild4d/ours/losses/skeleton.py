@@ -30,16 +30,9 @@ def neighbour_keys(keys: list[Key], frames: int, config: Geometry) -> tuple[list
 
 
 def posture(model: Model, poses: Pose, rows: list[int], config: Geometry) -> tuple[Pose, Tensor, Tensor]:
-    """Select poses of a batch, with their transforms, and compute the regularizers of the whole batch.
+    """Select poses of a batch, with their transforms, and sum the weighted regularizers of the whole batch.
 
-    Args:
-        model: provides the skeleton.
-        poses: [B, J, ...]; where B = 3 k, triples of neighbouring frames from `neighbour_keys`.
-        rows: k selected rows.
-        config: weights of joint limits, attachment, planes and (over triples) temporal smoothness and stillness.
-
-    Returns:
-        Poses [k, J, ...], transforms [k, J, 4, 4] and the weighted sum, scalar.
+    Where B = 3 k, the poses are triples of neighbouring frames from `neighbour_keys`, ``rows`` the k selected ones.
     """
     triples = len(poses.quats) == 3 * len(rows)
     skeleton = model.pivots, model.parents, model.mirror
