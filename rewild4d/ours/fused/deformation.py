@@ -14,7 +14,15 @@ from rewild4d.kernels.powers import LOG2_E, exp2
 from rewild4d.kernels.simd import LANES, divide, fma, load, maximum, minimum, splat, square_root, store, take_ticket
 from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.threads import run_tickets
-from rewild4d.ours.fused.layers import BLOCK, Factors, Layout, backward_block, forward_block, pair_layers, round_up
+from rewild4d.ours.fused.layers import (
+    BLOCK,
+    Factors,
+    Layout,
+    allocate_blocks,
+    backward_block,
+    forward_block,
+    pair_layers,
+)
 from rewild4d.ours.fused.quaternions import back_times, read_row, times
 from rewild4d.ours.fused.queries import Scales, mix_back, read_query
 from rewild4d.ours.fused.sampled_rows import sample_rows
@@ -56,18 +64,16 @@ def _activate(scales: Scales, out: np.ndarray) -> None:
 
 
 @kernel
-def _apply(
-    begin: int, end: int, out: np.ndarray, means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray,
-    new_means: np.ndarray, new_quats: np.ndarray, new_log_scales: np.ndarray,
-) -> None:  # fmt: skip
+def _apply(begin: int, end: int, out: np.ndarray, posed: tuple, moved: tuple) -> None:
+    (means, quats, log_scales), (new_means, new_quats, new_log_scales) = posed, moved
     for lane in range(end - begin):
         n = begin + lane
         for i in range(3):
             new_means[n, i] = means[n, i] + out[i * BLOCK + lane]
             new_log_scales[n, i] = log_scales[n, i] + out[(6 + i) * BLOCK + lane]
-        moved = times(read_row(quats, n), _quaternion(out, lane))
+        rotated = times(read_row(quats, n), _quaternion(out, lane))
         for i in range(4):
-            new_quats[n, i] = moved[i]
+            new_quats[n, i] = rotated[i]
 
 
 @inlined
@@ -77,10 +83,10 @@ def _quaternion(out: np.ndarray, lane: int) -> tuple:
 
 @kernel
 def _apply_back(
-    begin: int, end: int, scales: Scales, out: np.ndarray, quats: np.ndarray, g_means: np.ndarray, g_quats: np.ndarray,
-    g_log_scales: np.ndarray, grad_out: np.ndarray,
-) -> None:  # fmt: skip
+    begin: int, end: int, scales: Scales, out: np.ndarray, quats: np.ndarray, grads: tuple, grad_out: np.ndarray
+) -> None:
     """Compute the gradients of the outputs from those of the deformed Gaussians."""
+    g_means, g_quats, g_log_scales = grads
     grad_out[:] = 0
     strength, far = np.float32(scales.strength), np.float32(scales.offset * scales.strength)
     steep, bend = np.float32(scales.log_scale * scales.strength), np.float32(scales.strength / scales.log_scale)
@@ -123,63 +129,42 @@ def _rotation_back(
 @kernel
 def _forward(
     tickets: np.ndarray, sizes: Layout, scales: Scales, net: Factors, weights: np.ndarray, anchors: np.ndarray,
-    means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, new_means: np.ndarray, new_quats: np.ndarray,
-    new_log_scales: np.ndarray,
+    posed: tuple, moved: tuple,
 ) -> None:  # fmt: skip
-    count, wide = len(means), round_up(sizes.width) * BLOCK
-    query = np.empty(round_up(sizes.inputs) * BLOCK, np.float32)
-    shares = np.empty(round_up(sizes.scores) * BLOCK, np.float32)
-    first, opened, middle, last = (
-        np.empty(wide, np.float32), np.empty(wide, np.float32), np.empty(wide, np.float32), np.empty(wide, np.float32)
-    )  # fmt: skip
-    out = np.empty(LANES * BLOCK, np.float32)
-    words = np.empty(max(wide, len(shares), len(query)), np.float32)
+    blocks, count = allocate_blocks(sizes), len(weights)
     while True:
         begin = take_ticket(tickets) * BLOCK
         if begin >= count:
             return
         end = min(begin + BLOCK, count)
-        read_query(begin, end, scales, weights, anchors, means, quats, log_scales, query)
-        forward_block(net, sizes, query, words, shares, first, opened, middle, last, out)
-        _activate(scales, out)
-        _apply(begin, end, out, means, quats, log_scales, new_means, new_quats, new_log_scales)
+        read_query(begin, end, scales, weights, anchors, posed, blocks.query)
+        forward_block(net, sizes, blocks)
+        _activate(scales, blocks.out)
+        _apply(begin, end, blocks.out, posed, moved)
 
 
 @kernel
 def _backward(
     tickets: np.ndarray, rotation_call: tuple, chunk: int, sizes: Layout, scales: Scales, net: Factors,
-    weights: np.ndarray, anchors: np.ndarray, means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray,
-    g_means: np.ndarray, g_quats: np.ndarray, g_log_scales: np.ndarray, gradients: np.ndarray, on_anchors: np.ndarray,
+    weights: np.ndarray, anchors: np.ndarray, posed: tuple, grads: tuple, gradients: np.ndarray, on_anchors: np.ndarray,
 ) -> None:  # fmt: skip
     """Compute the parameters' gradients from these Gaussians; first run `_rotation_back` on all."""
     _rotation_back(*rotation_call)
-    count, wide = len(means), round_up(sizes.width) * BLOCK
-    query = np.empty(round_up(sizes.inputs) * BLOCK, np.float32)
-    scores = round_up(sizes.scores) * BLOCK
-    shares, on_shares = np.empty(scores, np.float32), np.empty(scores, np.float32)
-    first, opened, middle, last = (
-        np.empty(wide, np.float32), np.empty(wide, np.float32), np.empty(wide, np.float32), np.empty(wide, np.float32)
-    )  # fmt: skip
-    grad, inner = np.empty(wide, np.float32), np.empty(wide, np.float32)
-    transposed = np.empty(max(wide, scores, len(query)), np.float32)
-    words = np.empty_like(transposed)
-    out, grad_out, on_query = (
-        np.empty(LANES * BLOCK, np.float32), np.empty(LANES * BLOCK, np.float32), np.empty(LANES * BLOCK, np.float32)
-    )  # fmt: skip
+    blocks, count = allocate_blocks(sizes), len(weights)
+    on_shares, transposed = np.empty_like(blocks.shares), np.empty_like(blocks.words)
+    grad, inner = np.empty_like(blocks.first), np.empty_like(blocks.first)
+    grad_out, on_query = np.empty_like(blocks.out), np.empty_like(blocks.out)
     while True:
         unit = take_ticket(tickets)
         if unit >= len(gradients):
             return
         for begin in range(unit * chunk, min((unit + 1) * chunk, count), BLOCK):
             end = min(begin + BLOCK, count)
-            read_query(begin, end, scales, weights, anchors, means, quats, log_scales, query)
-            forward_block(net, sizes, query, words, shares, first, opened, middle, last, out)
-            _activate(scales, out)
-            _apply_back(begin, end, scales, out, quats, g_means, g_quats, g_log_scales, grad_out)
-            backward_block(
-                net, sizes, query, words, shares, opened, middle, last, grad_out, grad, inner, on_shares, transposed,
-                gradients[unit], on_query,
-            )  # fmt: skip
+            read_query(begin, end, scales, weights, anchors, posed, blocks.query)
+            forward_block(net, sizes, blocks)
+            _activate(scales, blocks.out)
+            _apply_back(begin, end, scales, blocks.out, posed[1], grads, grad_out)
+            backward_block(net, sizes, blocks, grad_out, grad, inner, on_shares, transposed, gradients[unit], on_query)
             if len(anchors) > 0:
                 mix_back(begin, end, weights, on_query, transposed, on_anchors[unit])
 
@@ -218,8 +203,8 @@ class _Deform(torch.autograd.Function):
         ctx.network = sizes, scales, _factors(array(flat), sizes, half)
         ctx.wide, ctx.anchors = wide.ravel(), None if anchors is None else anchors.shape
         ctx.sampled, ctx.offset = sampled, offset
-        moved = map(array, (means, quats, log_scales))
-        run_tickets(_forward, *ctx.network, array(weights), ctx.wide, *moved, *(tensor.numpy() for tensor in made))
+        posed, moved = tuple(map(array, (means, quats, log_scales))), tuple(tensor.numpy() for tensor in made)
+        run_tickets(_forward, *ctx.network, array(weights), ctx.wide, posed, moved)
         ctx.save_for_backward(flat, weights, means, quats, log_scales, made[1])
         return made
 
@@ -254,7 +239,7 @@ def _parameter_gradients(
         grads = on_means, on_quats, on_scales
     chunks = max(1, -(-len(given[0]) // CHUNK))
     gradients, on_anchors = np.zeros((chunks, sizes.total), np.float32), np.zeros((chunks, len(ctx.wide)), np.float32)
-    weights, *moved = given
+    weights, *posed = given
     network = (CHUNK, *ctx.network, weights, ctx.wide)
-    run_tickets(_backward, rotation_call, *network, *moved, *grads, gradients, on_anchors)
+    run_tickets(_backward, rotation_call, *network, tuple(posed), grads, gradients, on_anchors)
     return gradients.sum(axis=0), on_anchors.sum(axis=0)

@@ -58,30 +58,21 @@ def _compose(
 
 
 @kernel
-def _across(given: np.ndarray, index: int, taps: np.ndarray) -> Any:
-    """Blur sixteen pixels horizontally."""
+def _blur(given: np.ndarray, index: int, step: int, taps: np.ndarray) -> Any:
+    """Blur sixteen pixels along a row (step 1) or a column (step: the row's length)."""
     total = load(given, index) * splat(taps[0])
     for k in range(1, HALF + 1):
-        total = fma(load(given, index - k) + load(given, index + k), splat(taps[k]), total)
+        total = fma(load(given, index - k * step) + load(given, index + k * step), splat(taps[k]), total)
     return total
 
 
 @kernel
-def _across_product(a: np.ndarray, b: np.ndarray, index: int, taps: np.ndarray) -> Any:
+def _blur_product(a: np.ndarray, b: np.ndarray, index: int, taps: np.ndarray) -> Any:
     """Blur a product of two images horizontally, sixteen pixels."""
     total = load(a, index) * load(b, index) * splat(taps[0])
     for k in range(1, HALF + 1):
         before, after = load(a, index - k) * load(b, index - k), load(a, index + k) * load(b, index + k)
         total = fma(before + after, splat(taps[k]), total)
-    return total
-
-
-@kernel
-def _down(given: np.ndarray, index: int, stride: int, taps: np.ndarray) -> Any:
-    """Blur sixteen pixels vertically."""
-    total = load(given, index) * splat(taps[0])
-    for k in range(1, HALF + 1):
-        total = fma(load(given, index - k * stride) + load(given, index + k * stride), splat(taps[k]), total)
     return total
 
 
@@ -108,12 +99,11 @@ def _similarity(mx: Any, my: Any, xx: Any, yy: Any, xy: Any) -> tuple:
 
 @kernel
 def _colour_forward(
-    tickets: np.ndarray, image: np.ndarray, matte: np.ndarray, truth: np.ndarray, mask: np.ndarray,
-    behind: np.ndarray, window: tuple, inner: tuple, taps: np.ndarray, lanes: np.ndarray, grads: np.ndarray,
-    sums: np.ndarray,
+    tickets: np.ndarray, given: tuple, window: tuple, inner: tuple, taps: np.ndarray, lanes: np.ndarray,
+    grads: np.ndarray, sums: np.ndarray,
 ) -> None:  # fmt: skip
     """Fill grads [9, height + 10, stride] of SSIM and sums [strips, 2]: of |x - y| and of 1 - SSIM."""
-    _, _, height, width = window
+    (image, matte, truth, mask, behind), (_, _, height, width) = given, window
     stride = _stride(width)
     xs, ys = np.empty((STRIP + 2 * HALF) * stride, np.float32), np.empty((STRIP + 2 * HALF) * stride, np.float32)
     blurred = np.zeros((5, (STRIP + 2 * HALF) * stride), np.float32)
@@ -129,20 +119,20 @@ def _colour_forward(
             _compose(image, matte, channel, behind[channel], window, first - HALF, last + HALF, xs)
             _compose(truth, mask, channel, behind[channel], window, first - HALF, last + HALF, ys)
             for index in range(LANES, (last - first + 2 * HALF) * stride - LANES, LANES):
-                store(blurred[0], index, _across(xs, index, taps))
-                store(blurred[1], index, _across(ys, index, taps))
-                store(blurred[2], index, _across_product(xs, xs, index, taps))
-                store(blurred[3], index, _across_product(ys, ys, index, taps))
-                store(blurred[4], index, _across_product(xs, ys, index, taps))
+                store(blurred[0], index, _blur(xs, index, 1, taps))
+                store(blurred[1], index, _blur(ys, index, 1, taps))
+                store(blurred[2], index, _blur_product(xs, xs, index, taps))
+                store(blurred[3], index, _blur_product(ys, ys, index, taps))
+                store(blurred[4], index, _blur_product(xs, ys, index, taps))
             for row in range(first, last):
                 for column in range(LANES, stride - LANES, LANES):
                     index = (row - first + HALF) * stride + column
                     difference = load(xs, index) - load(ys, index)
                     apart = apart + maximum(difference, splat(np.float32(0)) - difference)
                     value, by_mean, by_square, by_product = _similarity(
-                        _down(blurred[0], index, stride, taps), _down(blurred[1], index, stride, taps),
-                        _down(blurred[2], index, stride, taps), _down(blurred[3], index, stride, taps),
-                        _down(blurred[4], index, stride, taps),
+                        _blur(blurred[0], index, stride, taps), _blur(blurred[1], index, stride, taps),
+                        _blur(blurred[2], index, stride, taps), _blur(blurred[3], index, stride, taps),
+                        _blur(blurred[4], index, stride, taps),
                     )  # fmt: skip
                     here = load(lanes, 0) + splat(np.float32(column - LANES))
                     target = (row + HALF) * stride + column
@@ -158,12 +148,11 @@ def _colour_forward(
 
 @kernel
 def _colour_backward(
-    tickets: np.ndarray, image: np.ndarray, matte: np.ndarray, truth: np.ndarray, mask: np.ndarray,
-    behind: np.ndarray, window: tuple, taps: np.ndarray, grads: np.ndarray, g_apart: float, g_unlike: float,
-    on_image: np.ndarray, on_matte: np.ndarray,
+    tickets: np.ndarray, given: tuple, window: tuple, taps: np.ndarray, grads: np.ndarray, g_apart: float,
+    g_unlike: float, on_image: np.ndarray, on_matte: np.ndarray,
 ) -> None:  # fmt: skip
     """Set the gradients inside the window, given those of the two sums."""
-    top, left, height, width = window
+    (image, matte, truth, mask, behind), (top, left, height, width) = given, window
     stride = _stride(width)
     xs, ys = np.empty(STRIP * stride, np.float32), np.empty(STRIP * stride, np.float32)
     blurred = np.zeros((3, (STRIP + 2 * HALF) * stride), np.float32)
@@ -180,14 +169,14 @@ def _colour_backward(
             for k in range(3):
                 # Slopes start five rows above the window: row r of the strip's scratch is row first + r of theirs.
                 for index in range(LANES, (last - first + 2 * HALF) * stride - LANES, LANES):
-                    store(blurred[k], index, _across(grads[3 * channel + k], first * stride + index, taps))
+                    store(blurred[k], index, _blur(grads[3 * channel + k], first * stride + index, 1, taps))
             for row in range(first, last):
                 for column in range(LANES, stride - LANES, LANES):
                     index, own = (row - first + HALF) * stride + column, (row - first) * stride + column
-                    total = _down(blurred[0], index, stride, taps)
+                    total = _blur(blurred[0], index, stride, taps)
                     twice = load(xs, own) + load(xs, own)
-                    total = fma(twice, _down(blurred[1], index, stride, taps), total)
-                    total = fma(load(ys, own), _down(blurred[2], index, stride, taps), total)
+                    total = fma(twice, _blur(blurred[1], index, stride, taps), total)
+                    total = fma(load(ys, own), _blur(blurred[2], index, stride, taps), total)
                     store(grad, column, total * splat(np.float32(-g_unlike)))
                 for column in range(width):
                     own = (row - first) * stride + LANES + column
@@ -222,7 +211,7 @@ class _Colour(torch.autograd.Function):
         _, _, height, width = window
         grads = np.zeros((9, (height + 2 * HALF) * _stride(width)), np.float32)
         sums = np.zeros((-(-height // STRIP), 2))
-        run_tickets(_colour_forward, *given, window, inner, TAPS, LANE_NUMBERS, grads, sums)
+        run_tickets(_colour_forward, given, window, inner, TAPS, LANE_NUMBERS, grads, sums)
         ctx.given, ctx.window, ctx.grads, ctx.area = given, window, grads, area
         apart, unlike = (sums.sum(axis=0) / area).tolist()
         return torch.tensor(apart, dtype=torch.float32), torch.tensor(unlike, dtype=torch.float32)
@@ -232,7 +221,7 @@ class _Colour(torch.autograd.Function):
     def backward(ctx: Any, by_apart: Tensor, by_unlike: Tensor) -> tuple[Tensor | None, ...]:
         image, matte = (torch.zeros(ctx.given[i].shape) for i in (0, 1))
         g_apart, g_unlike = by_apart.item() / ctx.area, by_unlike.item() / ctx.area
-        given = (*ctx.given, ctx.window, TAPS, ctx.grads)
+        given = (ctx.given, ctx.window, TAPS, ctx.grads)
         run_tickets(_colour_backward, *given, g_apart, g_unlike, image.numpy(), matte.numpy())
         return image, matte, None, None, None, None, None, None
 

@@ -177,17 +177,34 @@ def _softmax_back(shares: np.ndarray, heads: int, parts: int, grad: np.ndarray) 
                 store(grad, index, load(shares, index) * (load(grad, index) - mean))
 
 
-@kernel
-def forward_block(
-    net: Factors, sizes: Layout, query: np.ndarray, words: np.ndarray, shares: np.ndarray, first: np.ndarray,
-    opened: np.ndarray, middle: np.ndarray, last: np.ndarray, out: np.ndarray,
-) -> None:  # fmt: skip
-    """Run the network on one block.
+class Blocks(NamedTuple):
+    """Features of one block, [rows, 96]."""
 
-    Reads query [inputs, 96]; ``words`` and ``first`` [width, 96] are scratch. Sets the attention ``shares`` [scores,
-    96]; the hidden features after relu before (``opened``), inside (``middle``) and after (``last``) the residual,
-    [width, 96]; and ``out`` [16, 96], nine rows of which count.
-    """
+    query: np.ndarray  # [inputs, 96]
+    words: np.ndarray  # scratch, as large as the largest block
+    shares: np.ndarray  # attention of each head over the parts, [scores, 96]
+    first: np.ndarray  # hidden features before the residual layers, [width, 96]
+    opened: np.ndarray  # the same after relu
+    middle: np.ndarray  # inside the residual, after relu
+    last: np.ndarray  # after the residual and relu
+    out: np.ndarray  # outputs, nine rows of which count, [16, 96]
+
+
+@kernel
+def allocate_blocks(sizes: Layout) -> Blocks:
+    """Allocate the features of one block."""
+    inputs, scores = round_up(sizes.inputs) * BLOCK, round_up(sizes.scores) * BLOCK
+    wide, out = round_up(sizes.width) * BLOCK, np.empty(LANES * BLOCK, np.float32)
+    query, shares = np.empty(inputs, np.float32), np.empty(scores, np.float32)
+    words, first = np.empty(max(wide, scores, inputs), np.float32), np.empty(wide, np.float32)
+    opened, middle, last = np.empty_like(first), np.empty_like(first), np.empty_like(first)
+    return Blocks(query, words, shares, first, opened, middle, last, out)
+
+
+@kernel
+def forward_block(net: Factors, sizes: Layout, blocks: Blocks) -> None:
+    """Run the network on the query of one block; set the other features."""
+    query, words, shares, first, opened, middle, last, out = blocks
     q, s, w = round_up(sizes.inputs), round_up(sizes.scores), round_up(sizes.width)
     _bias(net.flat, sizes.ask, s, q, shares)
     _layer(net, sizes.ask, s, q, query, words, shares)
@@ -210,15 +227,15 @@ def forward_block(
 
 @kernel
 def backward_block(
-    net: Factors, sizes: Layout, query: np.ndarray, words: np.ndarray, shares: np.ndarray, opened: np.ndarray,
-    middle: np.ndarray, last: np.ndarray, grad_out: np.ndarray, grad: np.ndarray, inner: np.ndarray,
+    net: Factors, sizes: Layout, blocks: Blocks, grad_out: np.ndarray, grad: np.ndarray, inner: np.ndarray,
     on_shares: np.ndarray, transposed: np.ndarray, gradient: np.ndarray, on_query: np.ndarray,
 ) -> None:  # fmt: skip
-    """Compute the gradient of one block from grad_out [16, 96], after `forward_block` has filled its arguments.
+    """Compute the gradient of one block from grad_out [16, 96], after `forward_block`.
 
-    Adds to ``gradient``, laid out as ``flat``, and sets ``on_query``, the gradient of the first sixteen inputs, [16,
-    96]. Scratch: words, grad, inner, on_shares, transposed.
+    Adds to ``gradient``, laid out as ``flat``, and sets ``on_query`` [16, 96], the gradient of the first inputs.
+    Scratch: grad, inner, on_shares, transposed.
     """
+    query, words, shares, _, opened, middle, last, _ = blocks
     q, s, w = round_up(sizes.inputs), round_up(sizes.scores), round_up(sizes.width)
     half = len(net.along) > 0
     _layer_gradient(half, grad_out, last, words, transposed, LANES, w, gradient, sizes.out)

@@ -84,11 +84,11 @@ def mix_back(
 
 @kernel
 def read_query(
-    begin: int, end: int, scales: Scales, weights: np.ndarray, anchors: np.ndarray, means: np.ndarray,
-    quats: np.ndarray, log_scales: np.ndarray, query: np.ndarray,
-) -> None:  # fmt: skip
+    begin: int, end: int, scales: Scales, weights: np.ndarray, anchors: np.ndarray, posed: tuple, query: np.ndarray
+) -> None:
     """Set rows of part mixture, position code, orientation (w >= 0) and log scale of Gaussians begin..end; the rest is
     zero."""
+    means, quats, log_scales = posed
     query[:] = 0
     code = scales.parts + 3
     tail = code + 6 * scales.frequencies
