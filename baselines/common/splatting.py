@@ -4,7 +4,6 @@ Where a competitor would do what `ours` does, it reads the same code (canonical 
 losses, checkpoints of rewild4d.ours), so that differences between methods are differences of the methods.
 """
 
-import logging
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -27,7 +26,6 @@ from rewild4d.priors.motion import colors_from_frames, pose_gaussians, quats_fro
 from rewild4d.rasterizer import RasterInfo, rasterize
 from rewild4d.types import Camera, Clip, Prior
 
-logger = logging.getLogger(__name__)
 LOG_EVERY = 20
 
 
@@ -210,13 +208,9 @@ class SplatTraining(ABC):
 def run_steps(training: SplatTraining, identity: str, log: Log, workdir: Path | None) -> None:
     """All steps of a fit; continues from a checkpoint of the same fit in ``workdir``."""
     start = 0
-    if workdir is not None:
-        saved, message = load_checkpoint(workdir, identity)
-        if message:
-            logger.warning(message)
-        if saved is not None:
-            start = saved["step"]
-            training.restore(saved["training"])
+    if saved := load_checkpoint(workdir, identity):
+        start = saved["step"]
+        training.restore(saved["training"])
     for index in range(start, training.total):
         figures = training.step(index)
         done = index + 1

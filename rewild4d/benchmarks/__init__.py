@@ -1,1 +1,1 @@
-"""What is timed, how, and against what: the `bench` command's inside. Runs on the CPU."""
+"""Benchmarks of the `bench` command: scenes, timing, peers and tables."""

@@ -1,7 +1,7 @@
-"""A process that does nothing but import the rasterizer and render one image with gradients.
+"""Import the rasterizer in a fresh process and render one image with gradients.
 
-`python -m rewild4d.benchmarks.first_image FILE` prints, as JSON, what `probes.py` puts into rows. It imports no more
-than a user of the rasterizer would.
+`python -m rewild4d.benchmarks.first_image FILE` prints the times as JSON for `probes.py`; it imports no more than a
+user of the rasterizer does.
 """
 
 import gc
@@ -17,7 +17,7 @@ from rewild4d.rasterizer import rasterize  # noqa: E402
 
 
 def compiled_kernels() -> int:
-    """How many of our kernels this process had to compile because numba's cache did not hold them."""
+    """Return how many of our kernels this process compiled because numba's cache lacked them."""
     from numba.core.dispatcher import Dispatcher
 
     kernels = [each for each in gc.get_objects() if issubclass(type(each), Dispatcher)]  # proxies are left asleep

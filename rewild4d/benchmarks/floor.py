@@ -1,26 +1,26 @@
-"""The arithmetic floor: the least time that this machine could take for the blends that an image needs.
+"""The arithmetic lower bound: the least time in which this machine can compute an image's blends.
 
-    floor [s] = B F / R
+    lower bound [s] = B F / R
 
-    B  useful blends: pairs (pixel, Gaussian) with alpha >= 1/255 whose pixel is still open, counted exactly
-    F  floating point operations of one: 40 forward, 110 forward and backward together
-    R  operations a second: fused multiply-adds on 16-lane vectors on all threads (on a GPU: in floor_cuda.py), median
-       over the same rounds of measurement as what is compared with the floor
+    B  useful blends: pairs (pixel, Gaussian) with alpha >= 1/255 before the pixel is opaque, counted exactly
+    F  floating point operations of a blend of three channels: 40 forward, 110 forward and backward
+    R  operations a second: fused multiply-adds on 16 lanes and all threads (on a GPU: floor_cuda.py)
 
-40 and 110 are the operations of a blend of three channels: offset, exponent, exponential, transmittance, and their
-derivatives. Projection, sorting, culling and memory count nothing, so no program can reach the floor.
+Projection, sorting, culling and memory count as zero, so no program can reach the bound.
 """
 
 import math
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from rewild4d.benchmarks.scenes import SplatScene
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.simd import LANES, fma, load, splat, store
 from rewild4d.kernels.threads import run, thread_count
 from rewild4d.rasterizer.conventions import FRUSTUM_MARGIN, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from rewild4d.transforms import quat_to_matrix
 
 FLOPS_FORWARD, FLOPS_BOTH = 40, 110
 """Operations of a useful blend: forward, and forward with backward."""
@@ -36,25 +36,25 @@ ROUNDS = 1_000_000
 
 
 def floor_ms(blends: int, flops: int, gflops: float) -> float:
-    """The formula above, in milliseconds."""
+    """Compute the lower bound in milliseconds."""
     return blends * flops / (gflops * 1e9) * 1e3
 
 
 def multiply_adds(chains: int) -> None:
-    """Do `multiply_adds_flops` operations, on all threads."""
+    """Do `multiply_adds_flops` operations on all threads."""
     start = np.linspace(0.1, 0.9, LANES, dtype=np.float32)
     kernel = _four_chains if chains == 4 else _eight_chains
     run(kernel, [(start, np.empty(LANES, np.float32), ROUNDS) for _ in range(thread_count())])
 
 
 def multiply_adds_flops(chains: int) -> int:
-    """Operations of one call of `multiply_adds`: a multiplication and an addition in every lane."""
+    """Return the operations of one call of `multiply_adds`: a multiplication and an addition in every lane."""
     return 2 * LANES * chains * ROUNDS * thread_count()
 
 
 @kernel
 def _four_chains(start: np.ndarray, end: np.ndarray, rounds: int) -> None:
-    """Multiply-adds in chains that do not wait for each other; they start as data, so that nothing folds."""
+    """Run independent chains of multiply-adds; they start as data, so that nothing is folded."""
     x, y = load(start, 0), splat(np.float32(0.5))
     a, b, c, d = x, x + y, x - y, x * y
     for _ in range(rounds):
@@ -64,7 +64,7 @@ def _four_chains(start: np.ndarray, end: np.ndarray, rounds: int) -> None:
 
 @kernel
 def _eight_chains(start: np.ndarray, end: np.ndarray, rounds: int) -> None:
-    """Twice as many."""
+    """Run twice as many."""
     x, y = load(start, 0), splat(np.float32(0.5))
     a, b, c, d = x, x + y, x - y, x * y
     e, f, g, h = a + b, b + c, c + d, d + a
@@ -75,25 +75,20 @@ def _eight_chains(start: np.ndarray, end: np.ndarray, rounds: int) -> None:
 
 
 class Blends(NamedTuple):
-    """Useful blends, pixel by pixel in the order of the image, front to back in each.
+    """Useful blends, pixel by pixel in the order of the image, front to back in each."""
 
-    Attributes:
-        pixels: row * size + column, int64, [M].
-        gaussians: index, int64, [M].
-    """
-
-    pixels: np.ndarray
-    gaussians: np.ndarray
+    pixels: np.ndarray  # row * size + column, int64, [M]
+    gaussians: np.ndarray  # index, int64, [M]
 
 
 def count_blends(scene: SplatScene) -> int:
-    """B of the formula."""
+    """Count the useful blends."""
     nothing = np.empty(0, np.int64)
     return _walk(*_projected(scene), scene.size, nothing, nothing)
 
 
 def list_blends(scene: SplatScene) -> Blends:
-    """The useful blends themselves."""
+    """List the useful blends."""
     projected = _projected(scene)
     count = _walk(*projected, scene.size, *(np.empty(0, np.int64),) * 2)
     pixels, gaussians = np.empty(count, np.int64), np.empty(count, np.int64)
@@ -103,32 +98,22 @@ def list_blends(scene: SplatScene) -> Blends:
 
 
 def _projected(scene: SplatScene) -> tuple[np.ndarray, ...]:
-    """Front to back: index [n], centre in pixels [n, 2], covariance (xx, xy, yy) [n, 3] and opacity [n], float64."""
+    """Return, front to back, index [n], centre in pixels [n, 2], covariance (xx, xy, yy) [n, 3] and opacity [n],
+    float64."""
     means, quats, scales, opacities, _ = (tensor.detach().double().numpy() for tensor in scene.gaussians)
     matrix, pinhole = scene.world_to_camera[0].double().numpy(), scene.intrinsics[0].double().numpy()
     local = means @ matrix[:3, :3].T + matrix[:3, 3]
     depth, focal, centre = local[:, 2:], pinhole[(0, 1), (0, 1)], pinhole[:2, 2]
-    slope = local[:, :2] / depth
+    tangent = local[:, :2] / depth
     margin = FRUSTUM_MARGIN * 0.5 * scene.size / focal
-    tangent = np.clip(slope, -centre / focal - margin, (scene.size - centre) / focal + margin)
-    linear = (focal / depth)[:, :, None] * (matrix[None, :2, :3] - tangent[:, :, None] * matrix[None, 2:3, :3])
-    half = linear @ _rotations(quats) * scales[:, None, :]
+    clipped = np.clip(tangent, -centre / focal - margin, (scene.size - centre) / focal + margin)
+    linear = (focal / depth)[:, :, None] * (matrix[None, :2, :3] - clipped[:, :, None] * matrix[None, 2:3, :3])
+    half = linear @ quat_to_matrix(torch.from_numpy(quats)).numpy() * scales[:, None, :]
     covariance = half @ half.transpose(0, 2, 1) + EPS2D * np.eye(2)
     order = np.argsort(local[:, 2].astype(np.float32), kind="stable")
     order = order[local[order, 2] > 0.01]
     upper = covariance[:, (0, 0, 1), (0, 1, 1)]
-    return order, (slope * focal + centre)[order], upper[order], opacities[order]
-
-
-def _rotations(quats: np.ndarray) -> np.ndarray:
-    """Matrices of wxyz quaternions of any length, [n, 3, 3]."""
-    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return order, (tangent * focal + centre)[order], upper[order], opacities[order]
 
 
 @kernel
@@ -141,14 +126,15 @@ def _walk(
     pixels: np.ndarray,
     gaussians: np.ndarray,
 ) -> int:
-    """Blend front to back, Gaussian by Gaussian over its rectangle; count, and list where there is room."""
+    """Blend front to back, Gaussian by Gaussian over its rectangle; count the blends, and list them where there is
+    room."""
     left = np.ones((size, size))
     count = 0
     for k in range(len(index)):
         xx, xy, yy = covariances[k, 0], covariances[k, 1], covariances[k, 2]
         det = xx * yy - xy * xy
-        reach = 2 * math.log(max(opacities[k] / MIN_ALPHA, 1.0))
-        wide, high = math.sqrt(reach * xx), math.sqrt(reach * yy)
+        support = 2 * math.log(max(opacities[k] / MIN_ALPHA, 1.0))
+        wide, high = math.sqrt(support * xx), math.sqrt(support * yy)
         for row in range(max(0, int(centers[k, 1] - high - 0.5)), min(size, int(centers[k, 1] + high + 1.5))):
             for column in range(max(0, int(centers[k, 0] - wide - 0.5)), min(size, int(centers[k, 0] + wide + 1.5))):
                 dx, dy = column + 0.5 - centers[k, 0], row + 0.5 - centers[k, 1]

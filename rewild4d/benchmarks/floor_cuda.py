@@ -1,4 +1,4 @@
-"""R of the arithmetic floor (floor.py) on a GPU: fused multiply-adds in single precision on all of its processors."""
+"""Operations a second of a GPU for floor.py: float32 fused multiply-adds on all of its processors."""
 
 import torch
 import triton
@@ -7,24 +7,24 @@ import triton.language as tl
 LANES = tl.constexpr(256)
 CHAINS = 8
 ROUNDS = 20_000
-"""Links of each chain in one call: a millisecond or so."""
+"""Links of each chain in one call: about a millisecond."""
 PROGRAMS = 16
-"""Of one multiprocessor: as many threads as it holds."""
+"""Programs of one multiprocessor: as many threads as it holds."""
 WARPS = 4
 
 
 @triton.jit
 def _chains(end: tl.tensor, rounds: tl.tensor) -> None:
-    """Eight chains of multiply-adds that do not wait for each other; they start as data, so that nothing folds."""
-    place = tl.program_id(0) * LANES + tl.arange(0, LANES)
-    x = 0.1 + place.to(tl.float32) / (LANES * tl.num_programs(0))
+    """Run eight independent chains of multiply-adds; they start as data, so that nothing is folded."""
+    index = tl.program_id(0) * LANES + tl.arange(0, LANES)
+    x = 0.1 + index.to(tl.float32) / (LANES * tl.num_programs(0))
     y = 0.5 * x
     a, b, c, d = x, x + y, x - y, x * y
     e, f, g, h = a + b, b + c, c + d, d + a
     for _ in range(rounds):
         a, b, c, d = tl.fma(a, x, y), tl.fma(b, x, y), tl.fma(c, x, y), tl.fma(d, x, y)
         e, f, g, h = tl.fma(e, x, y), tl.fma(f, x, y), tl.fma(g, x, y), tl.fma(h, x, y)
-    tl.store(end + place, a + b + c + d + e + f + g + h)
+    tl.store(end + index, a + b + c + d + e + f + g + h)
 
 
 def multiply_adds(device: torch.device) -> None:
@@ -35,7 +35,7 @@ def multiply_adds(device: torch.device) -> None:
 
 
 def multiply_adds_flops(device: torch.device) -> int:
-    """Operations of one call of `multiply_adds`: a multiplication and an addition in every lane."""
+    """Return the operations of one call of `multiply_adds`: a multiplication and an addition in every lane."""
     return 2 * CHAINS * ROUNDS * LANES.value * _programs(device)
 
 

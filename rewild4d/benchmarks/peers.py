@@ -1,9 +1,9 @@
-"""Rasterizers to compare with: what installs from PyPI, and our own dense definition.
+"""Rasterizers to compare with: packages of PyPI, and our own dense definition.
 
-On a GPU that is gsplat with its CUDA kernels. On a CPU only gsplat, of the splat rasterizers on PyPI, has parts that
-run: `gsplat.cuda._torch_impl`, the torch twin of its kernels. What it takes from CUDA is given here, in its favour: the
-list of useful (pixel, Gaussian) pairs is made beforehand and costs no time, and two functions of nerfacc, which blend
-along that list, are written in torch.
+On a GPU that is gsplat with its CUDA kernels. On a CPU, of the splat rasterizers on PyPI, only gsplat has parts that
+run: `gsplat.cuda._torch_impl`, the torch twin of its kernels. What it takes from CUDA is replaced in its favour: the
+list of useful (pixel, Gaussian) pairs is made beforehand and not timed, and two functions of nerfacc, which blend along
+that list, are written in torch.
 """
 
 import math
@@ -25,10 +25,10 @@ Render = Callable[[tuple[Tensor, ...]], Tensor]
 """From a scene's five tensors to its image on black, [3, size, size], differentiable."""
 
 MOST_DENSE = 20_000_000
-"""Gaussians times pixels beyond which the dense reference would fill the memory."""
+"""Gaussians times pixels beyond which the dense reference needs too much memory."""
 
 SAME_PSNR = 50.0
-"""Least PSNR (dB) against our image for a peer's time to be compared with ours."""
+"""Least PSNR (dB) against our image for a peer to be timed."""
 
 
 class NotTimed(Exception):
@@ -37,23 +37,16 @@ class NotTimed(Exception):
 
 @dataclass(frozen=True)
 class Peer:
-    """One competitor.
+    """One competitor."""
 
-    Attributes:
-        name: as the table prints it.
-        package: on PyPI; "" for what is part of rewild4d.
-        prepare: gives its renderer for a scene, or raises `NotTimed`.
-        note: what its time leaves out.
-    """
-
-    name: str
-    package: str
-    prepare: Callable[[SplatScene], Render]
-    note: str = ""
+    name: str  # as the table prints it
+    package: str  # on PyPI; "" for a part of rewild4d
+    prepare: Callable[[SplatScene], Render]  # returns the renderer of a scene, or raises `NotTimed`
+    note: str = ""  # what its time leaves out
 
 
 def installed(peers: tuple[Peer, ...]) -> dict[str, str]:
-    """Versions of the peers' packages that are here."""
+    """Return the versions of the peers' installed packages."""
     versions = {}
     for peer in peers:
         if peer.package:
@@ -65,7 +58,7 @@ def installed(peers: tuple[Peer, ...]) -> dict[str, str]:
 
 
 def psnr(image: Tensor, other: Tensor) -> float:
-    """Peak signal to noise ratio in dB of two images with values in [0, 1]; infinite where they are equal."""
+    """Compute the peak signal-to-noise ratio in dB of two images in [0, 1]; infinite where they are equal."""
     error = float((image.double() - other.double()).square().mean())
     return 10 * math.log10(1 / error) if error > 0 else math.inf
 
@@ -110,7 +103,7 @@ def _gsplat_twin(scene: SplatScene) -> Render:
 
 
 def _nerfacc() -> ModuleType:
-    """The two functions of nerfacc that gsplat's twin blends with; nerfacc's own need CUDA."""
+    """Build the two functions of nerfacc that gsplat's twin blends with; nerfacc's own need CUDA."""
     module: Any = ModuleType("nerfacc")
     module.render_weight_from_alpha = _weights
     module.accumulate_along_rays = _accumulate
@@ -118,7 +111,7 @@ def _nerfacc() -> ModuleType:
 
 
 def _weights(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
-    """Weight and transmittance of each entry; entries of one pixel follow each other, front to back, [M] each."""
+    """Compute weight and transmittance of each entry; entries of a pixel are consecutive, front to back, [M] each."""
     logs = torch.log1p(-alphas.double())  # summed over the whole image, so in double precision
     before = logs.cumsum(0) - logs
     counts = torch.bincount(ray_indices, minlength=n_rays)
@@ -128,7 +121,7 @@ def _weights(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, 
 
 
 def _accumulate(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_rays: int) -> Tensor:
-    """Weighted sums per pixel, [n_rays, C]; of the weights alone without values."""
+    """Sum per pixel, weighted, [n_rays, C]; the weights alone without values."""
     terms = weights[:, None] if values is None else weights[:, None] * values
     return terms.new_zeros(n_rays, terms.shape[1]).index_add(0, ray_indices, terms)
 
@@ -150,7 +143,7 @@ CUDA_PEERS = (
     Peer("gsplat", "gsplat", _gsplat_kernels, "called without rewild4d's checks of the input"),
     Peer("dense torch reference", "", _dense_reference),
 )
-"""Of the Triton backend, on a GPU."""
+"""Peers of the Triton backend, on a GPU."""
 
 PEERS = (
     Peer("gsplat's torch twin", "gsplat", _gsplat_twin, "its list of pairs is given and costs no time"),

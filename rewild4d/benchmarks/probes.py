@@ -1,6 +1,6 @@
-"""What only a fresh process can show: start-up times, kernels that the cache did not hold, peak memory.
+"""Measure what needs a fresh process: start-up times, kernels missing in the cache, peak memory.
 
-The memory probes' child is `python -m rewild4d.benchmarks.probes KIND ...`.
+The memory probes run `python -m rewild4d.benchmarks.probes KIND ...`.
 """
 
 import contextlib
@@ -15,23 +15,19 @@ from pathlib import Path
 
 import torch
 
-from rewild4d.benchmarks.results import OURS, Row
+from rewild4d.benchmarks.results import OURS, Row, single_row
 from rewild4d.benchmarks.scenes import SplatScene, splat_scene, training
 from rewild4d.benchmarks.timing import progress
 
 START_COUNT, START_SIZE = 1000, 64
-"""The first picture of a start-up: small, so that importing and compiling is all that counts."""
+"""Gaussians and image side of the start-up image: small, so that imports and compilation dominate."""
 
 STATUS = Path("/proc/self/status")
 
 
 def raster_rows(count: int, size: int) -> list[Row]:
-    """Cold and cached start, and the peak memory of forward and backward.
-
-    Args:
-        count: Gaussians of the memory probe.
-        size: its image side in pixels.
-    """
+    """Measure cold and cached start, and the peak memory of forward and backward for ``count`` Gaussians at ``size``
+    pixels."""
     with tempfile.TemporaryDirectory() as folder, progress("start-up and memory", 3) as bar:
         file = Path(folder, "scene.pt")
         _save(splat_scene(START_COUNT, START_SIZE), file)
@@ -47,7 +43,7 @@ def raster_rows(count: int, size: int) -> list[Row]:
 
 
 def gpu_memory_row(scene: SplatScene) -> Row:
-    """Peak memory of forward and backward on the GPU that a scene is on."""
+    """Measure the peak memory of forward and backward on the scene's GPU."""
     device = scene.intrinsics.device
     forward_backward(scene)  # kernels are loaded, and torch has its workspaces
     torch.cuda.synchronize(device)
@@ -60,7 +56,7 @@ def gpu_memory_row(scene: SplatScene) -> Row:
 
 
 def step_row(count: int, size: int, preset: str) -> Row:
-    """Peak memory of training steps of `ours`."""
+    """Measure the peak memory of training steps of `ours`."""
     with progress(f"memory of a step at {size}²", 1) as bar:
         found = _child("probes", "step", str(count), str(size), preset)
         bar.update()
@@ -68,39 +64,27 @@ def step_row(count: int, size: int, preset: str) -> Row:
 
 
 def _start_rows(title: str, found: Mapping[str, float]) -> list[Row]:
-    def row(quantity: str, key: str, unit: str, note: str = "") -> Row:
-        return Row(
-            subject=OURS, quantity=quantity, value=found[key], unit=unit, gaussians=START_COUNT, size=START_SIZE,
-            note=note,
-        )  # fmt: skip
-
-    return [
-        row(title, "seconds", "s", "interpreter, imports, first image with gradients, and the process's end"),
-        row(f"{title}: torch", "torch", "s", "its own import, whatever comes after"),
-        row(f"{title}: after torch", "after_torch", "s", "imports of the rasterizer, first image with gradients"),
-        row(f"{title}: first image", "first_image", "s"),
-        row(f"{title}: kernels compiled", "compiled", "1"),
-    ]
+    rows = (
+        ("", "seconds", "s", "interpreter, imports, first image with gradients, and the process's end"),
+        (": torch", "torch", "s", "its own import, whatever comes after"),
+        (": after torch", "after_torch", "s", "imports of the rasterizer, first image with gradients"),
+        (": first image", "first_image", "s", ""),
+        (": kernels compiled", "compiled", "1", ""),
+    )
+    scene = START_COUNT, START_SIZE
+    return [single_row(OURS, title + part, found[key], unit, *scene, note) for part, key, unit, note in rows]
 
 
 def _memory_row(found: Mapping[str, float], count: int, size: int) -> Row:
-    missing = not found
-    return Row(
-        subject=OURS,
-        quantity="peak memory",
-        value=None if missing else found["peak"] - found["before"],
-        unit="MiB",
-        gaussians=count,
-        size=size,
-        repeats=0 if missing else 1,
-        note=f"not measured: no {STATUS} here"
-        if missing
-        else f"above the {found['before']:.0f} MiB that the process held with its inputs",
-    )
+    value, note = None, f"not measured: no {STATUS} here"
+    if found:
+        value = found["peak"] - found["before"]
+        note = f"above the {found['before']:.0f} MiB that the process held with its inputs"
+    return single_row(OURS, "peak memory", value, "MiB", count, size, note)
 
 
 def _child(module: str, *words: str, environment: Mapping[str, str] | None = None) -> dict[str, float]:
-    """Run a module of this package in a process of its own; the figures it printed, and ``seconds`` in all."""
+    """Run a module of this package in its own process; return the figures that it prints, and ``seconds``."""
     command = [sys.executable, "-m", f"rewild4d.benchmarks.{module}", *words]
     settings = {"OMP_NUM_THREADS": str(torch.get_num_threads()), **(environment or {})}
     begin = time.perf_counter()
@@ -117,7 +101,7 @@ def _save(scene: SplatScene, file: Path) -> None:
 
 
 def forward_backward(scene: SplatScene) -> None:
-    """One image, and gradients of all five inputs."""
+    """Render one image, with gradients of all five inputs."""
     leaves = tuple(tensor.clone().requires_grad_() for tensor in scene.gaussians)
     image, _ = scene.render(leaves)
     torch.autograd.grad(image, leaves, torch.ones_like(image))
@@ -140,7 +124,7 @@ def _step_memory(count: str, size: str, preset: str) -> dict[str, float]:
 
 
 def _peak(work: Callable[[], None]) -> dict[str, float]:
-    """Resident memory in MiB before some work and at its peak; empty where the system does not say."""
+    """Return the resident memory in MiB before some work and at its peak; empty where the system does not say."""
     if not STATUS.is_file():
         return {}
     with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""`bench rasterizer`: forward and backward of the one rasterizer, of its peers, and the arithmetic floor."""
+"""`bench rasterizer`: forward and backward of our rasterizer, of its peers, and the arithmetic lower bound."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -17,7 +17,7 @@ from rewild4d.benchmarks.floor import (
     multiply_adds_flops,
 )
 from rewild4d.benchmarks.peers import PEERS, SAME_PSNR, NotTimed, Peer, Render, psnr
-from rewild4d.benchmarks.results import BOTH, FLOOR, FORWARD, OURS, Row, timed_row
+from rewild4d.benchmarks.results import BOTH, FLOOR, FORWARD, OURS, Row, single_row, timed_row
 from rewild4d.benchmarks.scenes import SplatScene, splat_scene
 from rewild4d.benchmarks.timing import measure, per
 
@@ -25,7 +25,7 @@ Contenders = dict[tuple[str, str], Callable[[], object]]
 """Calls to time, by subject and quantity."""
 
 TURN = 10
-"""Calls in a row on a GPU, which works while the next call is being prepared; then it is waited for."""
+"""Consecutive calls on a GPU, which works while the next call is prepared, before it is waited for."""
 
 CPU = torch.device("cpu")
 
@@ -38,20 +38,14 @@ def bench_rasterizer(
     probe: bool = True,
     device: torch.device = CPU,
 ) -> list[Row]:
-    """Time every number of Gaussians at every image side.
+    """Time every number of Gaussians at every image side in pixels, on the CPU or a CUDA GPU.
 
-    Args:
-        counts: numbers of Gaussians.
-        sizes: sides of the square images in pixels.
-        repeats: rounds of measurement for each scene.
-        peers: whom to compare with.
-        probe: measure peak memory too (of the largest scene), and on the CPU start-up, in processes of their own.
-        device: CPU, or a CUDA GPU.
+    ``probe`` adds peak memory (of the largest scene) and, on the CPU, start-up, in their own processes.
     """
     scenes = [(count, size) for count in counts for size in sizes]
     rows: list[Row] = []
-    for place, (count, size) in enumerate(scenes, 1):
-        title = f"[{place}/{len(scenes)}] {count:,} at {size}²"
+    for index, (count, size) in enumerate(scenes, 1):
+        title = f"[{index}/{len(scenes)}] {count:,} at {size}²"
         rows += scene_rows(splat_scene(count, size), repeats, peers, title, device)
     if not probe:
         return rows
@@ -63,10 +57,10 @@ def bench_rasterizer(
 def scene_rows(
     scene: SplatScene, repeats: int, peers: Sequence[Peer], title: str, device: torch.device = CPU
 ) -> list[Row]:
-    """Everything that is measured on one scene, which is on the CPU."""
+    """Measure one scene, given on the CPU."""
     count, size = len(scene), scene.size
     blends, placed = count_blends(scene), scene.to(device)
-    rows = [Row(subject="scene", quantity="useful blends", value=blends, unit="1", gaussians=count, size=size)]
+    rows = [single_row("scene", "useful blends", blends, "1", count, size)]
     admitted = {peer: _admit(peer, placed) for peer in peers}
     contenders = _calls(OURS, lambda gaussians: placed.render(gaussians)[0], placed)
     for calls, _ in admitted.values():
@@ -80,10 +74,9 @@ def scene_rows(
         return [timed_row(*key, samples[key], count, size, note) for key in contenders if key[0] == subject]
 
     gflops = max(flops[key] / samples[key].median / 1e6 for key in arithmetic)
-    rows.append(Row(subject=FLOOR, quantity="multiply-adds", value=gflops, unit="GFLOP/s", gaussians=count, size=size))
+    rows.append(single_row(FLOOR, "multiply-adds", gflops, "GFLOP/s", count, size))
     for quantity, each in ((FORWARD, FLOPS_FORWARD), (BOTH, FLOPS_BOTH)):
-        floor = floor_ms(blends, each, gflops)
-        rows.append(Row(subject=FLOOR, quantity=quantity, value=floor, unit="ms", gaussians=count, size=size))
+        rows.append(single_row(FLOOR, quantity, floor_ms(blends, each, gflops), "ms", count, size))
     rows += timed(OURS)
     for peer, (_, found) in admitted.items():
         rows += [*found, *timed(peer.name, peer.note)]
@@ -91,7 +84,7 @@ def scene_rows(
 
 
 def _arithmetic(device: torch.device) -> tuple[Contenders, dict[tuple[str, str], int]]:
-    """Multiply-adds to time, and how many operations each call does."""
+    """Return the multiply-adds to time, and the operations of each call."""
     if device.type == "cuda":
         from rewild4d.benchmarks import floor_cuda  # needs Triton
 
@@ -103,7 +96,7 @@ def _arithmetic(device: torch.device) -> tuple[Contenders, dict[tuple[str, str],
 
 
 def _turn(call: Callable[[], object], device: torch.device) -> Callable[[], object]:
-    """What is timed: a call, or on a GPU `TURN` of them and the wait for the last."""
+    """Return the timed unit: a call, or on a GPU `TURN` of them and the wait for the last."""
     if device.type != "cuda":
         return call
 
@@ -116,13 +109,10 @@ def _turn(call: Callable[[], object], device: torch.device) -> Callable[[], obje
 
 
 def _admit(peer: Peer, scene: SplatScene) -> tuple[Contenders, list[Row]]:
-    """The calls of a peer whose image is ours, and rows that say how alike it is or why it is not timed."""
+    """Return the calls of a peer that renders our image, and rows with its PSNR or the reason why it is not timed."""
 
     def row(quantity: str, value: float | None, unit: str, note: str = "") -> Row:
-        return Row(
-            subject=peer.name, quantity=quantity, value=value, unit=unit, gaussians=len(scene), size=scene.size,
-            repeats=int(value is not None), note=note,
-        )  # fmt: skip
+        return single_row(peer.name, quantity, value, unit, len(scene), scene.size, note)
 
     try:
         render = peer.prepare(scene)

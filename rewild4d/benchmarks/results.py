@@ -1,4 +1,4 @@
-"""What a benchmark found, as data: one row a number, and what decides it beside them."""
+"""Results of a benchmark as data: one row a number."""
 
 import re
 from datetime import UTC, datetime
@@ -19,69 +19,55 @@ FORWARD, BOTH = "forward", "forward+backward"
 
 
 def this_machine(device: torch.device | None = None) -> dict[str, str]:
-    """Of a benchmark that computes with the device's own backend, the CPU's where none is given."""
+    """Describe the machine of a benchmark that uses the device's own backend; by default the CPU's."""
     device = device or torch.device("cpu")
     return machine(device, pick_rasterizer("auto", device))
 
 
 class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One number.
+    """One number."""
 
-    Attributes:
-        subject: who or what was measured: "rewild4d", a peer, the floor, an operator of torch.
-        quantity: "forward", "forward+backward", "step", "peak memory", ...
-        value: the median where it was measured several times; None where there is none, ``note`` then says why.
-        unit: "ms", "MiB", "dB", "1/s", "1" for counts and shares, ...
-        gaussians: how many the scene has, where that matters.
-        size: side of the square image in pixels, where that matters.
-        repeats: how often it was measured; 0 for what was not measured here.
-        minimum: of the repeats.
-        spread: between the quartiles of the repeats.
-        note: why there is no value, or what the number leaves out.
-    """
-
-    subject: str
-    quantity: str
-    value: float | None
-    unit: str
-    gaussians: int | None = None
-    size: int | None = None
-    repeats: int = 1
-    minimum: float | None = None
-    spread: float | None = None
-    note: str = ""
+    subject: str  # what was measured: "rewild4d", a peer, the arithmetic floor, an operator of torch
+    quantity: str  # "forward", "forward+backward", "step", "peak memory", ...
+    value: float | None  # median of the repeats; None with the reason in ``note``
+    unit: str  # "ms", "MiB", "dB", "1/s", "1" for counts and shares, ...
+    gaussians: int | None = None  # of the scene, if they matter
+    size: int | None = None  # side of the square image in pixels, if it matters
+    repeats: int = 1  # number of measurements; 0 for a value that was not measured here
+    minimum: float | None = None  # of the repeats
+    spread: float | None = None  # interquartile range of the repeats
+    note: str = ""  # why there is no value, or what the number leaves out
 
 
 class Result(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One run of a benchmark.
+    """One run of a benchmark."""
 
-    Attributes:
-        schema: version of this layout.
-        benchmark: "rasterizer" or "step".
-        command: the words after `rewild4d-bench`.
-        started: UTC, ISO 8601.
-        threads: that computed.
-        settings: gaussians, sizes, repeats and what else the flags said.
-        machine: processor, system and versions of what computes.
-        peers: version of each peer that is installed.
-        code: version of rewild4d and digest of its sources.
-        rows: what was found.
-    """
-
-    benchmark: str
-    command: list[str]
-    threads: int
-    settings: dict[str, int | str | list[int]]
-    rows: list[Row]
-    peers: dict[str, str] = {}
-    schema: int = SCHEMA
+    benchmark: str  # "rasterizer" or "step"
+    command: list[str]  # the words after `rewild4d-bench`
+    threads: int  # number used
+    settings: dict[str, int | str | list[int]]  # gaussians, sizes, repeats and other flags
+    rows: list[Row]  # the numbers
+    peers: dict[str, str] = {}  # version of each installed peer
+    schema: int = SCHEMA  # version of this layout
+    # UTC, ISO 8601
     started: str = msgspec.field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
+    # processor, system and versions of what computes
     machine: dict[str, str] = msgspec.field(default_factory=this_machine)
-    code: dict[str, str] = msgspec.field(default_factory=code_version)
+    code: dict[str, str] = msgspec.field(default_factory=code_version)  # version of rewild4d and digest of its sources
+
+
+def single_row(
+    subject: str, quantity: str, value: float | None, unit: str, gaussians: int, size: int, note: str = ""
+) -> Row:
+    """Return the row of a number that was measured once, or (None) not at all."""
+    return Row(
+        subject=subject, quantity=quantity, value=value, unit=unit, gaussians=gaussians, size=size,
+        repeats=int(value is not None), note=note,
+    )  # fmt: skip
 
 
 def timed_row(subject: str, quantity: str, sample: Sample, gaussians: int, size: int, note: str = "") -> Row:
-    """The row of a measured time."""
+    """Return the row of a measured time."""
     return Row(
         subject=subject,
         quantity=quantity,
@@ -97,7 +83,7 @@ def timed_row(subject: str, quantity: str, sample: Sample, gaussians: int, size:
 
 
 def to_json(result: Result) -> str:
-    """The result as indented JSON."""
+    """Encode the result as indented JSON."""
     return msgspec.json.format(msgspec.json.encode(result), indent=1).decode()
 
 
@@ -111,7 +97,7 @@ def write_result(result: Result, path: Path) -> None:
 
 
 def default_path(benchmark: str, device: torch.device | None = None) -> Path:
-    """Where a result goes: named after benchmark, processor (or GPU) and day, so that a day's last run stays."""
+    """Return the path of a result, named after benchmark, processor (or GPU) and day: the last run of a day stays."""
     found = this_machine(device)
     processor = re.sub(r"[^a-z0-9]+", "-", found.get("gpu", found["processor"]).lower()).strip("-")
     return Path("results", "speed", f"{benchmark}-{processor}-{datetime.now(UTC):%Y-%m-%d}.json")

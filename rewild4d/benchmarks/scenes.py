@@ -1,6 +1,6 @@
-"""What is timed: an animal-like cloud of Gaussians, and a training step of `ours` on a clip of it.
+"""Scenes to time: an animal-like cloud of Gaussians, and a training step of `ours` on a clip of it.
 
-Everything is procedural and decided by the seed, so that two machines time the same work.
+All of it is procedural and seeded, so that two machines time the same work.
 """
 
 import math
@@ -17,9 +17,9 @@ from rewild4d.ours.model import build_model
 from rewild4d.ours.symmetry import Supervision
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.motion import SurfaceSample, pose_gaussians, quats_from_normals, sample_surface
-from rewild4d.priors.template import MIRROR, PARENTS, quadruped
+from rewild4d.priors.template import PARENTS, posed_prior, quadruped
 from rewild4d.rasterizer import rasterize
-from rewild4d.transforms import look_at, mirror_camera, mirror_transforms
+from rewild4d.transforms import look_at
 from rewild4d.types import Camera, Clip, Frame, Prior
 
 COVERED = 0.25
@@ -38,36 +38,29 @@ DISTANCE, AZIMUTH = 12.0, math.radians(40)
 FRAMES, FPS = 8, 10.0
 
 PROGRESS = 0.175
-"""Share of the iterations at which a step is timed: under `paper` the deformation is fully there (0.15), colour has its
+"""Share of the iterations at which a step is timed: under `paper` the deformation is complete (0.15), colour has its
 last degree (0.15), and the pull to the prior (until 0.2) and the geometric losses (until 0.5) still act."""
 
 
 @dataclass(frozen=True)
 class SplatScene:
-    """One call of the rasterizer.
+    """One call of the rasterizer."""
 
-    Attributes:
-        gaussians: means [N, 3], quats [N, 4], scales [N, 3], opacities [N] and colours in [0, 1] [N, 3], float32.
-        world_to_camera: [1, 4, 4].
-        intrinsics: [1, 3, 3].
-        size: side of the square image in pixels.
-    """
-
-    gaussians: tuple[Tensor, ...]
-    world_to_camera: Tensor
-    intrinsics: Tensor
-    size: int
+    gaussians: tuple[Tensor, ...]  # means, quats, scales, opacities, colors [N, ...], float32
+    world_to_camera: Tensor  # [1, 4, 4]
+    intrinsics: Tensor  # [1, 3, 3]
+    size: int  # side of the square image in pixels
 
     def __len__(self) -> int:
         return len(self.gaussians[0])
 
     def to(self, device: torch.device) -> "SplatScene":
-        """The same scene on a device."""
+        """Move the scene to a device."""
         moved = tuple(tensor.to(device) for tensor in self.gaussians)
         return SplatScene(moved, self.world_to_camera.to(device), self.intrinsics.to(device), self.size)
 
     def render(self, gaussians: tuple[Tensor, ...] | None = None, backend: str = "auto") -> tuple[Tensor, Tensor]:
-        """Image [3, size, size] on black and alpha [size, size], of these Gaussians or of others in their place."""
+        """Render image [3, size, size] on black and alpha [size, size], of the scene's or other Gaussians."""
         means, quats, scales, opacities, colors = gaussians or self.gaussians
         image, alpha, _ = rasterize(
             means, quats, scales, opacities, colors, self.world_to_camera, self.intrinsics, self.size, self.size,
@@ -77,20 +70,14 @@ class SplatScene:
 
 
 def coverage(scene: SplatScene) -> float:
-    """Share of pixels that are more animal than background."""
+    """Return the share of pixels with alpha above one half."""
     return float((scene.render()[1] > 0.5).float().mean())
 
 
 def splat_scene(count: int, size: int, seed: int = 0) -> SplatScene:
-    """The template at rest, seen from its front left, covering a quarter of a square image.
-
-    Args:
-        count: number of Gaussians.
-        size: side of the image in pixels.
-        seed: of the places and colours.
-    """
+    """Build the template at rest, seen from its front left, covering a quarter of a square image."""
     generator = torch.Generator().manual_seed(seed)
-    surface = sample_surface(_still_prior(), count, generator)
+    surface = sample_surface(_prior(_swing(0.0), [AZIMUTH] * FRAMES, 64), count, generator)
     scales = torch.tensor((1.0, 1.0, FLATNESS)) * TILING * surface.radius
     gaussians = (
         surface.points,
@@ -108,7 +95,7 @@ def splat_scene(count: int, size: int, seed: int = 0) -> SplatScene:
 
 
 def step_config(size: int, gaussians: int, preset: str) -> Config:
-    """A preset of `ours` with image size and number of Gaussians overridden, and that number kept (no densification).
+    """Load a preset of `ours` with another image size and a fixed number of Gaussians (no densification).
 
     Raises:
         UserError: no such preset.
@@ -123,13 +110,7 @@ def step_config(size: int, gaussians: int, preset: str) -> Config:
 
 
 def training(size: int, gaussians: int, preset: str, device: torch.device | None = None) -> tuple[Training, int]:
-    """A main stage of `ours` in its midst, and the index of its next step.
-
-    Args:
-        size: side of the square frames in pixels.
-        gaussians: how many.
-        preset: of `ours`.
-        device: the CPU where it is left out.
+    """Build a main stage of `ours` in its middle; return it and the index of its next step.
 
     Raises:
         UserError: no such preset.
@@ -146,7 +127,7 @@ def training(size: int, gaussians: int, preset: str, device: torch.device | None
 
 
 def posed_clip(size: int, gaussians: int) -> tuple[Clip, Prior]:
-    """The template swings its legs while a camera walks a quarter around it; the prior is the true motion."""
+    """Build a clip of the template swinging its legs before a moving camera; the prior is the true motion."""
     prior = _prior(_swing(0.5), [AZIMUTH + math.pi / 2 * index / FRAMES for index in range(FRAMES)], size)
     generator = torch.Generator().manual_seed(1)
     surface = sample_surface(prior, gaussians, generator)
@@ -167,7 +148,7 @@ def _frame(surface: SurfaceSample, colors: Tensor, prior: Prior, index: int) -> 
 
 
 def _camera(azimuth: float, focal: float, size: int) -> Camera:
-    """A camera that looks at the middle of the template at rest from a little above."""
+    """Build a camera that looks at the middle of the template at rest from a little above."""
     target = quadruped().vertices.aminmax(dim=0)
     middle = ((target.min + target.max) / 2).double()
     offset = DISTANCE * torch.tensor((math.sin(azimuth), 0.25, math.cos(azimuth)), dtype=torch.float64)
@@ -177,7 +158,7 @@ def _camera(azimuth: float, focal: float, size: int) -> Camera:
 
 
 def _swing(amplitude: float) -> Tensor:
-    """Transforms of legs that swing by an amplitude in radians, diagonal pairs together, [FRAMES, J, 4, 4]."""
+    """Return transforms of legs that swing by an amplitude in radians, diagonal pairs together, [FRAMES, J, 4, 4]."""
     phase = torch.arange(1, FRAMES + 1) * (2 * math.pi / FRAMES)
     angles = torch.zeros(FRAMES, len(PARENTS), 3)
     for bone, sign in ((10, 1), (16, 1), (13, -1), (19, -1)):
@@ -185,28 +166,9 @@ def _swing(amplitude: float) -> Tensor:
     return pose(angles, quadruped().bones[:, 0], PARENTS)
 
 
-def _still_prior() -> Prior:
-    return _prior(_swing(0.0), [AZIMUTH] * FRAMES, 64)
-
-
 def _prior(transforms: Tensor, azimuths: list[float], size: int) -> Prior:
-    template, mirror = quadruped(), torch.tensor(MIRROR)
-    cameras = tuple(_camera(azimuth, 2.4 * size, size) for azimuth in azimuths)
-    return Prior(
-        name="bench",
-        provenance="the template itself",
-        vertices=template.vertices,
-        faces=template.faces,
-        weights=template.weights,
-        bones=template.bones,
-        parents=torch.tensor(PARENTS),
-        mirror=mirror,
-        times=torch.arange(FRAMES, dtype=torch.float64) / FPS,
-        object_to_world=torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1),
-        cameras=cameras,
-        transforms=transforms,
-        cameras_flip=tuple(mirror_camera(camera) for camera in cameras),
-        transforms_flip=mirror_transforms(transforms, mirror),
-        quality={},
-        digest="bench",
-    )
+    cameras = [_camera(azimuth, 2.4 * size, size) for azimuth in azimuths]
+    world = torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)
+    times = torch.arange(FRAMES, dtype=torch.float64) / FPS
+    given = quadruped(), transforms, world, cameras, times
+    return posed_prior(*given, name="bench", provenance="the template itself", digest="bench")

@@ -1,7 +1,8 @@
-"""`bench step`: one training step of `ours`, what it spends its time on, and how fast its result renders."""
+"""`bench step`: time one training step of `ours`, profile it, and time the rendering of its result."""
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import msgspec
 import torch
@@ -9,11 +10,11 @@ from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 from rewild4d.benchmarks import probes
-from rewild4d.benchmarks.kernel_rows import kernel_rows
 from rewild4d.benchmarks.results import OURS, Row, timed_row
 from rewild4d.benchmarks.scenes import posed_clip, step_config, training
 from rewild4d.benchmarks.timing import measure, per, progress
 from rewild4d.harmonics import seen_colors
+from rewild4d.kernels.switch import KERNELS, without_kernels
 from rewild4d.kernels.threads import torch_on_one
 from rewild4d.ours.config import Config, WarmUp
 from rewild4d.ours.method import Ours
@@ -35,13 +36,17 @@ REPORTED = Row(
 )
 
 PROFILED = 4
-"""Most turns that the profiler looks at: reading its log takes longer than the steps."""
+"""Most turns that are profiled: reading the profiler's log takes longer than the steps."""
 
 SPAN = 10
-"""Turns after which the index goes back, so that long measurements stay at one place of the schedule."""
+"""Turns after which the index goes back, so that long measurements stay at one point of the schedule."""
 
 OPERATORS = 12
-"""Operators that are listed one by one."""
+"""Number of operators that are listed."""
+
+ALL, NONE = "all kernels", "no kernel: plain torch"
+SCENES = {"quick": (2_000, 128), "paper": (20_000, 256)}
+"""Preset -> Gaussians and image side of the timed step."""
 
 
 def bench_step(
@@ -53,16 +58,10 @@ def bench_step(
     device: torch.device = CPU,
     kernels: bool = False,
 ) -> list[Row]:
-    """Time steps at every image side, in turns; profile them; render the result.
+    """Time steps with ``count`` Gaussians at every image side, in turns; profile them; render the result.
 
-    Args:
-        count: Gaussians.
-        sizes: sides of the square frames in pixels.
-        repeats: rounds of measurement.
-        preset: of `ours`.
-        probe: measure memory too (on the CPU), in processes of their own.
-        device: CPU, or a CUDA GPU.
-        kernels: time the step with each fused kernel switched off too (on the CPU).
+    ``probe`` adds memory, in its own processes, and ``kernels`` the step with each fused kernel switched off (CPU
+    only).
 
     Raises:
         UserError: no such preset.
@@ -80,14 +79,13 @@ def bench_step(
         if probe and device.type == "cpu":
             rows.append(probes.step_row(count, size, preset))
     rows += render_rows(count, max(sizes), repeats, preset, device)
-    return rows + (kernel_rows(Stepper, repeats) if kernels and device.type == "cpu" else [])
+    return rows + (kernel_rows(repeats) if kernels and device.type == "cpu" else [])
 
 
 class Stepper:
-    """A training that goes on from turn to turn.
+    """A training that continues from turn to turn.
 
-    Attributes:
-        period: steps of one turn: some losses act in every n-th step only, so that single steps are not alike.
+    A turn has ``period`` steps: some losses act only in every n-th step, so single steps differ.
     """
 
     def __init__(self, count: int, size: int, preset: str, device: torch.device = CPU) -> None:
@@ -104,7 +102,7 @@ class Stepper:
         _wait(self.device)
 
     def operators(self, turns: int) -> list[Row]:
-        """Which of torch's operators and of our autograd functions take the time, as shares of all."""
+        """Return the operators of torch and our autograd functions that take most time, as shares of all."""
         with (
             progress(f"profile of a step at {self.size}²", turns) as bar,
             profile(activities=[ProfilerActivity.CPU]) as profiler,
@@ -131,13 +129,40 @@ class Stepper:
 
 
 def loss_period(config: Config) -> int:
-    """After how many steps the same losses act again."""
+    """Return the number of steps after which the same losses act again."""
     geometry = config.geometry
     return math.lcm(geometry.smooth_every, geometry.tv_every, geometry.compact_every)
 
 
+def kernel_rows(repeats: int) -> list[Row]:
+    """Time the step at presets `quick` and `paper`: all fused kernels, each switched off alone, and plain torch."""
+    rows = []
+    for preset, (count, size) in SCENES.items():
+        stepper = Stepper(count, size, preset)
+        before = {name: kernel.calls for name, kernel in KERNELS.items()}
+        stepper.turn()
+        used = [name for name, kernel in KERNELS.items() if kernel.calls > before[name]]
+        choices: dict[str, tuple[str, ...]] = {
+            ALL: (),
+            **{f"without {name}": (name,) for name in used},
+            NONE: tuple(used),
+        }
+
+        def turn(names: tuple[str, ...], stepper: Stepper = stepper) -> None:
+            with without_kernels(*names):
+                stepper.turn()
+
+        calls = {name: partial(turn, off) for name, off in choices.items()}
+        samples = measure(calls, repeats, f"kernels, {preset}")
+        rows += [
+            timed_row(name, f"step, preset {preset}", per(sample, stepper.period), count, size)
+            for name, sample in samples.items()
+        ]
+    return rows
+
+
 def render_rows(count: int, size: int, repeats: int, preset: str, device: torch.device = CPU) -> list[Row]:
-    """Frames a second of a fitted clip: its Gaussians made for each frame anew, or kept."""
+    """Time the frames of a fitted clip, its Gaussians computed for each frame or kept."""
     clip, prior = posed_clip(size, count)
     config = msgspec.structs.replace(
         step_config(size, count, preset), iterations=1, warmup=WarmUp(iterations=0, regress=0)
@@ -165,7 +190,7 @@ def render_rows(count: int, size: int, repeats: int, preset: str, device: torch.
 
 @torch.no_grad()
 def _render(splats: Splats, camera: Camera) -> Tensor:
-    """A frame as a viewer wants it: colours as this camera sees them, on black, [3, h, w]."""
+    """Render a frame as a viewer sees it, on black, [3, h, w]."""
     image, _, _ = rasterize(
         splats.means, splats.quats, splats.scales, splats.opacities, seen_colors(splats, camera.center),
         camera.world_to_camera[None], camera.intrinsics[None], camera.width, camera.height,
@@ -174,6 +199,6 @@ def _render(splats: Splats, camera: Camera) -> Tensor:
 
 
 def _wait(device: torch.device) -> None:
-    """Until a GPU has done what it was asked."""
+    """Wait for a GPU."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -1,4 +1,4 @@
-"""Markdown tables of a result; ratios are made here, from the rows."""
+"""Markdown tables of a result; ratios are computed from its rows."""
 
 import math
 from collections.abc import Sequence
@@ -6,18 +6,18 @@ from collections.abc import Sequence
 from rewild4d.benchmarks.results import BOTH, FLOOR, FORWARD, OURS, Result, Row
 
 KERNELS = "step, preset "
-"""How quantities begin that are timed with fused kernels switched off."""
+"""Prefix of quantities that are timed with fused kernels switched off."""
 
 
 def markdown(result: Result) -> str:
-    """What a result says: where it was measured, and its tables."""
+    """Format a result: where it was measured, and its tables."""
     tables = {"rasterizer": _raster_tables, "step": _step_tables}[result.benchmark](result.rows)
     timed = [row for row in result.rows if row.unit == "ms" and row.value is not None]
     notes = list(dict.fromkeys(f"{row.subject}: {row.note}." for row in timed if row.note))
-    return "\n\n".join([_place(result), *tables, *notes])
+    return "\n\n".join([_header(result), *tables, *notes])
 
 
-def _place(result: Result) -> str:
+def _header(result: Result) -> str:
     machine = result.machine
     names = ("python", "torch", "numpy", "numba", "triton")
     versions = {name: machine[name] for name in names if name in machine} | result.peers
@@ -35,48 +35,49 @@ def _plural(count: int, noun: str) -> str:
 
 
 def _raster_tables(rows: Sequence[Row]) -> list[str]:
-    """Scenes in lines: ours and the floor, then each peer; below them what processes of their own showed."""
-    places = dict.fromkeys(_place_of(row) for row in rows if row.quantity == FORWARD)
+    """Tabulate the scenes with ours and the floor, then each peer; below them the probes."""
+    scenes = dict.fromkeys(_scene_of(row) for row in rows if row.quantity == FORWARD)
     peers = [name for name in dict.fromkeys(row.subject for row in rows if row.quantity == FORWARD)
              if name not in (OURS, FLOOR)]  # fmt: skip
     ours = _table(
         ["Gaussians", "image", "useful blends", "forward, ms", "forward+backward, ms", "floor forward, ms",
          "floor forward+backward, ms", "GFLOP/s", "forward / floor", "forward+backward / floor"],
         [
-            [*_scene(place), *(
-                _number(_find(rows, subject, quantity, place))
+            [*_scene_cells(scene), *(
+                _number(_find(rows, subject, quantity, scene))
                 for subject, quantity in (("scene", "useful blends"), (OURS, FORWARD), (OURS, BOTH), (FLOOR, FORWARD),
                                           (FLOOR, BOTH), (FLOOR, "multiply-adds"))
-            ), *(_ratio(_find(rows, OURS, quantity, place), _find(rows, FLOOR, quantity, place))
+            ), *(_ratio(_find(rows, OURS, quantity, scene), _find(rows, FLOOR, quantity, scene))
                  for quantity in (FORWARD, BOTH))]
-            for place in places
+            for scene in scenes
         ],
     )  # fmt: skip
     against = _table(
         ["Gaussians", "image", "peer", "forward, ms", "forward+backward, ms", "forward / ours",
          "forward+backward / ours", "PSNR against ours, dB"],
-        [[*_scene(place), peer, *_against(rows, peer, place)] for place in places for peer in peers],
+        [[*_scene_cells(scene), peer, *_against(rows, peer, scene)] for scene in scenes for peer in peers],
     )  # fmt: skip
     alone = [row for row in rows if row.subject == OURS and row.quantity not in (FORWARD, BOTH)]
     return [ours, *([against] if peers else []), *([_list(alone)] if alone else [])]
 
 
-def _against(rows: Sequence[Row], peer: str, place: tuple[int | None, int | None]) -> list[str]:
-    found = [_find(rows, peer, quantity, place) for quantity in (FORWARD, BOTH)]
+def _against(rows: Sequence[Row], peer: str, scene: tuple[int | None, int | None]) -> list[str]:
+    found = [_find(rows, peer, quantity, scene) for quantity in (FORWARD, BOTH)]
     if found[0] is not None and found[0].value is None:
-        return [found[0].note, "", "", "", _number(_find(rows, peer, "PSNR against rewild4d", place))]
-    ratios = [_ratio(row, _find(rows, OURS, quantity, place)) for row, quantity in
+        return [found[0].note, "", "", "", _number(_find(rows, peer, "PSNR against rewild4d", scene))]
+    ratios = [_ratio(row, _find(rows, OURS, quantity, scene)) for row, quantity in
               zip(found, (FORWARD, BOTH), strict=True)]  # fmt: skip
-    return [*map(_number, found), *ratios, _number(_find(rows, peer, "PSNR against rewild4d", place))]
+    return [*map(_number, found), *ratios, _number(_find(rows, peer, "PSNR against rewild4d", scene))]
 
 
 def _step_tables(rows: Sequence[Row]) -> list[str]:
-    """Times of a step and of a frame, with steps or frames a second; then the operators of each image side."""
+    """Tabulate times of steps and frames, and the operators of each image side."""
     timed = [row for row in rows if row.unit == "ms" and not row.quantity.startswith(KERNELS)]
     times = _table(
         ["what", "whose", "Gaussians", "image", "ms", "least, ms", "quartiles apart, ms", "a second"],
         [
-            [row.quantity, row.subject, *_scene(_place_of(row)), _number(row), _text(row.minimum), _text(row.spread),
+            [row.quantity, row.subject, *_scene_cells(_scene_of(row)), _number(row), _text(row.minimum),
+             _text(row.spread),
              _text(1000 / row.value if row.value else None)]
             for row in timed
         ],
@@ -95,10 +96,10 @@ def _step_tables(rows: Sequence[Row]) -> list[str]:
 
 
 def _kernel_table(rows: Sequence[Row]) -> str:
-    """Whole steps of one preset with each fused kernel switched off alone, and what it saves."""
+    """Tabulate steps of one preset with each fused kernel switched off alone."""
     base = rows[0].value or math.nan
     lines = [
-        [row.subject, *_scene(_place_of(row)), _number(row), f"{(row.value or math.nan) - base:+.2f}",
+        [row.subject, *_scene_cells(_scene_of(row)), _number(row), f"{(row.value or math.nan) - base:+.2f}",
          f"{(row.value or math.nan) / base:.2f} x"]
         for row in rows
     ]  # fmt: skip
@@ -106,25 +107,25 @@ def _kernel_table(rows: Sequence[Row]) -> str:
 
 
 def _list(rows: Sequence[Row]) -> str:
-    """One number a line."""
+    """Tabulate one number a line."""
     return _table(
         ["what", "Gaussians", "image", "value", "note"],
-        [[row.quantity, *_scene(_place_of(row)), _with_unit(row), row.note] for row in rows],
+        [[row.quantity, *_scene_cells(_scene_of(row)), _with_unit(row), row.note] for row in rows],
     )
 
 
-def _place_of(row: Row) -> tuple[int | None, int | None]:
+def _scene_of(row: Row) -> tuple[int | None, int | None]:
     return row.gaussians, row.size
 
 
-def _scene(place: tuple[int | None, int | None]) -> list[str]:
-    count, size = place
+def _scene_cells(scene: tuple[int | None, int | None]) -> list[str]:
+    count, size = scene
     return ["" if count is None else f"{count:,}", "" if size is None else f"{size}²"]
 
 
-def _find(rows: Sequence[Row], subject: str, quantity: str, place: tuple[int | None, int | None]) -> Row | None:
-    wanted = (subject, quantity, place)
-    return next((row for row in rows if (row.subject, row.quantity, _place_of(row)) == wanted), None)
+def _find(rows: Sequence[Row], subject: str, quantity: str, scene: tuple[int | None, int | None]) -> Row | None:
+    wanted = (subject, quantity, scene)
+    return next((row for row in rows if (row.subject, row.quantity, _scene_of(row)) == wanted), None)
 
 
 def _ratio(row: Row | None, base: Row | None) -> str:
@@ -146,14 +147,14 @@ def _number(row: Row | None) -> str:
 
 
 def _text(value: float | None) -> str:
-    """Three digits; all of a larger number's."""
+    """Format three digits, or all integer digits."""
     if value is None:
         return "-"
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:#.3g}".rstrip(".") if value else "0"
 
 
 def _table(head: list[str], lines: list[list[str]]) -> str:
-    """Columns that hold a number lean to the right."""
+    """Format a table; columns that hold a number are right-aligned."""
     columns = zip(*lines, strict=True) if lines else [()] * len(head)
     rule = ["---:" if any(cell[:1].isdigit() for cell in column) else "---" for column in columns]
     return "\n".join("| " + " | ".join(row) + " |" for row in [head, rule, *lines])

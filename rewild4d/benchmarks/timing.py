@@ -1,4 +1,4 @@
-"""Measuring several contenders at once: they take turns, so that a machine that slows down slows all of them."""
+"""Time several contenders in turns, so that a slowdown of the machine hits all of them."""
 
 import statistics
 import sys
@@ -14,34 +14,27 @@ from tqdm import tqdm
 Name = TypeVar("Name", bound=Hashable)
 
 BUDGET = 10.0
-"""Seconds after which a contender takes no further turn; it always has the first two."""
+"""Seconds after which a contender takes no further turn after its first two."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What a contender took, in milliseconds.
+    """A contender's times in milliseconds."""
 
-    Attributes:
-        median: of all turns.
-        minimum: of all turns.
-        spread: from the lower to the upper quartile.
-        repeats: number of turns.
-    """
-
-    median: float
-    minimum: float
-    spread: float
-    repeats: int
+    median: float  # of all turns
+    minimum: float  # of all turns
+    spread: float  # interquartile range
+    repeats: int  # number of turns
 
 
 def summary(times: list[float]) -> Sample:
-    """Sum up one contender's times (milliseconds, at least one)."""
+    """Summarise one contender's times (milliseconds, at least one)."""
     quartiles = statistics.quantiles(times, n=4, method="inclusive") if len(times) > 1 else [times[0]] * 3
     return Sample(statistics.median(times), min(times), quartiles[2] - quartiles[0], len(times))
 
 
 def per(sample: Sample, parts: int) -> Sample:
-    """The time of one of several equal parts."""
+    """Divide a sample by a number of equal parts."""
     return Sample(sample.median / parts, sample.minimum / parts, sample.spread / parts, sample.repeats)
 
 
@@ -53,19 +46,9 @@ def measure(
     budget: float = BUDGET,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[Name, Sample]:
-    """Time all contenders in rounds; in each round every one has a turn.
+    """Time all contenders in rounds, each one once a round, within a ``budget`` in seconds.
 
-    A turn is a call that is not timed, because the last contender left its own data in the caches, and one that is.
-
-    Args:
-        contenders: what to call, by name.
-        repeats: rounds.
-        title: of the progress bar.
-        budget: see `BUDGET`.
-        clock: gives seconds.
-
-    Returns:
-        A sample for each contender.
+    Each turn is an untimed call, since the last contender left its own data in the caches, and a timed one.
     """
     times: dict[Name, list[float]] = {name: [] for name in contenders}
     spent = dict.fromkeys(contenders, 0.0)
@@ -87,7 +70,7 @@ def measure(
 
 @contextmanager
 def progress(title: str, total: int) -> Iterator[tqdm]:
-    """A bar on standard error, which leaves one line where that is a file."""
+    """Show a bar on standard error, which leaves one line where that is a file."""
     pause = 0.5 if sys.stderr.isatty() else 10.0
     with tqdm(desc=title, total=total, file=sys.stderr, mininterval=pause) as bar:
         yield bar
@@ -95,7 +78,7 @@ def progress(title: str, total: int) -> Iterator[tqdm]:
 
 @contextmanager
 def threads(count: int | None) -> Iterator[int]:
-    """Compute with so many threads, torch's own number where None; gives the number."""
+    """Compute with a number of threads (None: torch's own); yield the number."""
     before = torch.get_num_threads()
     torch.set_num_threads(count or before)
     try:

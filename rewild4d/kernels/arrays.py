@@ -1,4 +1,4 @@
-"""Tensors as the arrays that kernels take."""
+"""Convert tensors to the arrays that kernels take."""
 
 import numpy as np
 import torch
@@ -6,12 +6,12 @@ from torch import Tensor
 
 
 def fits(tensor: Tensor) -> bool:
-    """Whether the kernels take it: single precision on the CPU. All else goes to the twins in plain torch."""
+    """Tell whether the kernels take a tensor (float32 on the CPU); others go to the torch twins."""
     return tensor.is_cpu and tensor.dtype == torch.float32
 
 
 def array(tensor: Tensor) -> np.ndarray:
-    """Its values without a gradient, C-contiguous; the same memory where that is possible."""
+    """Return a tensor's values without a gradient, C-contiguous, in the same memory where possible."""
     # Each of the two calls is an operation of torch, even where it changes nothing.
     if tensor.requires_grad:
         tensor = tensor.detach()

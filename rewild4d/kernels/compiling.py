@@ -1,4 +1,4 @@
-"""How the CPU kernels are compiled and cached."""
+"""Compile and cache the CPU kernels."""
 
 import hashlib
 from collections.abc import Callable
@@ -36,15 +36,15 @@ def compiled_for(feature: str) -> bool:
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A part of a kernel that is copied into each of its callers: calls that pass arrays cost a hundred cycles."""
+    """Compile a function that is copied into each caller: a call that passes arrays costs a hundred cycles."""
     return _compiled(function, {"inline": "always"})
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function on its first call, without the GIL, and keep the machine code in the cache folder.
 
-    It may call kernels of its own folder and of this one, whose sources decide the cache; a constant from elsewhere
-    must never change. Where no cache folder can be written it is compiled anew in every process.
+    It may call kernels of its own folder and of this one, whose sources decide the cache; constants from elsewhere must
+    never change. Without a writable cache folder it is compiled in every process.
     """
     return _compiled(function, {})
 

@@ -1,8 +1,7 @@
-"""A vector of 8 float64 lanes for numba kernels, `Doubles`, for what float32 is too coarse for.
+"""A vector of 8 float64 lanes for numba kernels, `Doubles`, where float32 is too coarse.
 
 Inside kernels ``+``, ``-``, ``*`` and ``/`` work on two `Doubles` or on one and a number; a product that is added may
-be rounded together with the sum. Everything else is a function below. Arrays of rows are flat: eight rows are read as
-columns, one `Doubles` each.
+be rounded together with the sum. Arrays of rows are flat: eight rows are read as columns, one `Doubles` each.
 """
 
 # numba fixes the shape of an intrinsic, see simd.py.
@@ -14,13 +13,10 @@ from llvmlite import ir
 from numba.core import types
 from numba.core.typing import signature
 from numba.core.typing.templates import AbstractTemplate, infer_global
-from numba.extending import intrinsic as numba_intrinsic
 from numba.extending import lower_builtin, models, register_model
 
 from rewild4d.kernels.compiling import inlined
-from rewild4d.kernels.simd import llvm_call
-
-intrinsic: Any = numba_intrinsic  # to a type checker its results are still functions of the typing context
+from rewild4d.kernels.simd import array_data, elementwise, intrinsic, llvm_call
 
 WIDTH = 8
 _DOUBLE, _LONG, _INT = ir.DoubleType(), ir.IntType(64), ir.IntType(32)
@@ -29,7 +25,7 @@ _OPERATORS = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", 
 
 
 class DoublesType(types.Type):
-    """numba's name for `<8 x double>`."""
+    """The numba type of `<8 x double>`."""
 
     def __init__(self) -> None:
         super().__init__(name="float64x8")
@@ -49,10 +45,8 @@ class _Arithmetic(AbstractTemplate):
         if len(args) != 2 or doubles_type not in args:
             return None
         known = [arg if arg == doubles_type else types.float64 for arg in args]
-        numbers = (types.Float, types.Integer)
-        return (
-            signature(doubles_type, *known) if all(a == doubles_type or isinstance(a, numbers) for a in args) else None
-        )
+        fits = all(arg == doubles_type or isinstance(arg, types.Float | types.Integer) for arg in args)
+        return signature(doubles_type, *known) if fits else None
 
 
 def _spread(builder: Any, number: Any) -> Any:
@@ -77,47 +71,37 @@ for _operation, _name in _OPERATORS.items():
 
 @intrinsic
 def spread(typing: Any, number: Any) -> Any:
-    """One number in all lanes."""
+    """Put one number in all lanes."""
     return signature(doubles_type, types.float64), lambda context, builder, sig, args: _spread(builder, args[0])
 
 
-@intrinsic
-def lane_numbers(typing: Any) -> Any:
-    """0 to 7."""
-    return signature(doubles_type), lambda context, builder, sig, args: ir.Constant(
-        _VECTOR, [*map(float, range(WIDTH))]
-    )
+@elementwise(doubles_type)
+def lane_numbers(builder: Any) -> Any:
+    """Return 0 to 7."""
+    return ir.Constant(_VECTOR, [*map(float, range(WIDTH))])
 
 
-@intrinsic
-def root(typing: Any, a: Any) -> Any:
-    """Square root, lane by lane."""
-    return signature(doubles_type, a), lambda context, builder, sig, args: llvm_call(
-        builder, "llvm.sqrt.v8f64", args, _VECTOR
-    )
+@elementwise(doubles_type)
+def root(builder: Any, a: Any) -> Any:
+    """Compute the square root."""
+    return llvm_call(builder, "llvm.sqrt.v8f64", [a], _VECTOR)
 
 
-@intrinsic
-def floor(typing: Any, a: Any) -> Any:
-    """The next whole number below, lane by lane."""
-    return signature(doubles_type, a), lambda context, builder, sig, args: llvm_call(
-        builder, "llvm.floor.v8f64", args, _VECTOR
-    )
+@elementwise(doubles_type)
+def floor(builder: Any, a: Any) -> Any:
+    """Round down to a whole number."""
+    return llvm_call(builder, "llvm.floor.v8f64", [a], _VECTOR)
 
 
-@intrinsic
-def where_gt(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
-    """``yes`` where a > b, ``no`` elsewhere; a NaN is not greater."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.select(builder.fcmp_ordered(">", args[0], args[1]), args[2], args[3])
-
-    return signature(doubles_type, *[doubles_type] * 4), generate
+@elementwise(doubles_type)
+def where_gt(builder: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
+    """Return ``yes`` where a > b, ``no`` elsewhere; a NaN is not greater."""
+    return builder.select(builder.fcmp_ordered(">", a, b), yes, no)
 
 
 @intrinsic
 def any_gt(typing: Any, a: Any, b: Any) -> Any:
-    """Whether a > b in any lane."""
+    """Tell whether a > b in any lane."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         bits = builder.bitcast(builder.fcmp_ordered(">", *args), ir.IntType(WIDTH))
@@ -128,7 +112,7 @@ def any_gt(typing: Any, a: Any, b: Any) -> Any:
 
 @intrinsic
 def _split(typing: Any, a: Any) -> Any:
-    """Exponent and mantissa in [1, 2) of a positive normal number."""
+    """Return exponent and mantissa in [1, 2) of a positive normal number."""
     pair = types.UniTuple(doubles_type, 2)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -146,7 +130,7 @@ def _split(typing: Any, a: Any) -> Any:
 
 @inlined
 def log2(x: Any) -> Any:
-    """Base 2 logarithm of positive normal numbers, to 1e-11; meaningless but harmless for others."""
+    """Compute the base 2 logarithm of positive normal numbers, to 1e-11; undefined for others."""
     exponent, mantissa = _split(x)
     high = spread(math.sqrt(2.0))
     exponent = where_gt(mantissa, high, exponent + 1.0, exponent)
@@ -161,8 +145,8 @@ def log2(x: Any) -> Any:
 
 
 def _first(context: Any, builder: Any, sig: Any, args: Any, kind: Any) -> Any:
-    array = context.make_array(sig.args[0])(context, builder, args[0])
-    return builder.bitcast(builder.gep(array.data, [args[1]]), kind.as_pointer())
+    data = array_data(context, builder, sig.args[0], args[0])
+    return builder.bitcast(builder.gep(data, [args[1]]), kind.as_pointer())
 
 
 def _pick(builder: Any, vector: Any, lanes: list[int]) -> Any:
@@ -171,7 +155,7 @@ def _pick(builder: Any, vector: Any, lanes: list[int]) -> Any:
 
 @intrinsic(prefer_literal=True)
 def load_columns(typing: Any, array: Any, index: Any, count: Any) -> Any:
-    """The columns of eight rows of ``count`` numbers each, from ``index`` on in a flat array."""
+    """Load the columns of eight rows of ``count`` numbers each, from ``index`` on in a flat array."""
     columns = count.literal_value
     result = types.UniTuple(doubles_type, columns)
 
@@ -187,7 +171,7 @@ def load_columns(typing: Any, array: Any, index: Any, count: Any) -> Any:
 
 
 def _join(builder: Any, vectors: list[Any]) -> Any:
-    """All lanes of vectors in one, the last padded to a power of two of them."""
+    """Join all lanes of vectors, padded to a power of two of them."""
     if len(vectors) == 1:
         return vectors[0]
     size = 1 << (len(vectors) - 1).bit_length()
@@ -199,7 +183,7 @@ def _join(builder: Any, vectors: list[Any]) -> Any:
 
 @intrinsic
 def store_columns(typing: Any, array: Any, index: Any, columns: Any) -> Any:
-    """Write eight rows, given as a tuple of their columns, from ``index`` on in a flat array."""
+    """Store eight rows, given as a tuple of columns, from ``index`` on in a flat array."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         element, count = context.get_value_type(sig.args[0].dtype), sig.args[2].count

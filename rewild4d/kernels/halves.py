@@ -1,6 +1,6 @@
-"""Products of bfloat16 pairs: sixteen lanes of single precision, each the sum of two products, as AVX512_BF16 has it.
+"""Products of bfloat16 pairs: sixteen float32 lanes, each the sum of two products (AVX512_BF16).
 
-A word is two bfloat16 numbers in the bits of a float32, the first in the lower half. Sums stay in single precision.
+A word is two bfloat16 numbers in the bits of a float32, the first in the lower half. Sums stay in float32.
 """
 
 import contextlib
@@ -30,10 +30,10 @@ IN_PROBE = "REWILD4D_IN_PROBE"
 
 @cache
 def available() -> bool:
-    """Tell whether this machine multiplies pairs and this numba compiles that; elsewhere single precision is used.
+    """Tell whether this machine multiplies pairs and this numba compiles that; float32 is used elsewhere.
 
-    Some versions of LLVM end the process when they meet the instruction (numba 0.61), so it is tried once a version in
-    a process of its own, and the answer is kept in the cache folder.
+    Some versions of LLVM end the process on the instruction (numba 0.61), so it is tried once a version in its own
+    process; the answer is kept in the cache folder.
     """
     if not compiled_for("avx512bf16"):
         return False
@@ -63,7 +63,7 @@ def probe() -> None:
 
 
 class _BFloat(ir.Type):
-    """LLVM's own name for the format, which llvmlite does not know."""
+    """LLVM's name for the format, which llvmlite lacks."""
 
     def _to_string(self) -> str:
         return "bfloat"
@@ -73,7 +73,7 @@ _PAIRS = ir.VectorType(_BFloat(), 2 * LANES)
 
 
 def _multiply_add(builder: Any, left: Any, right: Any, total: Any) -> Any:
-    """Total plus, lane by lane, the sum of the two products of a pair; only compiled where the machine has it."""
+    """Add, lane by lane, the two products of a pair to the total; compiled only where available."""
     if not available():
         return total
     pairs = [builder.bitcast(word, _PAIRS) for word in (left, right)]
@@ -91,33 +91,27 @@ def add_pair_product(
     a: np.ndarray, a_first: int, a_row: int, b: np.ndarray, b_first: int, b_row: int, depth: int, c: np.ndarray,
     c_first: int, c_row: int, rows: int, columns: int,
 ) -> None:  # fmt: skip
-    """C += A B.
+    """Compute C += A B of words, as `matrix.add_product`.
 
-    Args:
-        a: holds words of A [rows, depth], pairs along a row, at a_first, its rows a_row words apart.
-        b: holds words of B [depth, columns], pairs along a column, at b_first, its rows b_row words apart.
-        depth: in words: half the length of a sum.
-        c: float32, holds C [rows, columns] at c_first, its rows c_row apart.
-        rows: a multiple of 8.
-        columns: a multiple of 16.
+    A [rows, depth] has pairs along a row, B [depth, columns] along a column; ``depth`` counts words.
     """
     column = 0
     while column < columns:
         width = tile_width((columns - column) // LANES)
         for row in range(0, rows, ROWS):
-            place = c_first + row * c_row + column
+            index = c_first + row * c_row + column
             if width == 3:
-                _tile3(a, a_first + row * a_row, a_row, 1, b, b_first + column, b_row, depth, c, place, c_row)
+                _tile3(a, a_first + row * a_row, a_row, 1, b, b_first + column, b_row, depth, c, index, c_row)
             elif width == 2:
-                _tile2(a, a_first + row * a_row, a_row, 1, b, b_first + column, b_row, depth, c, place, c_row)
+                _tile2(a, a_first + row * a_row, a_row, 1, b, b_first + column, b_row, depth, c, index, c_row)
             else:
-                _tile1(a, a_first + row * a_row, a_row, 1, b, b_first + column, b_row, depth, c, place, c_row)
+                _tile1(a, a_first + row * a_row, a_row, 1, b, b_first + column, b_row, depth, c, index, c_row)
         column += width * LANES
 
 
 @intrinsic
 def pair(typing: Any, low: Any, high: Any) -> Any:
-    """Words of two vectors, lane by lane, each number rounded to the nearest."""
+    """Round two vectors to words, lane by lane, each number to the nearest."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         half, upper, shift = (ir.Constant(INTEGERS, [bits] * LANES) for bits in (0x8000, -0x10000, 16))
@@ -129,21 +123,21 @@ def pair(typing: Any, low: Any, high: Any) -> Any:
 
 @kernel
 def pair_rows(given: np.ndarray, rows: int, columns: int, words: np.ndarray) -> None:
-    """Words of neighbouring rows: [rows, columns] -> [rows / 2, columns], the right factor of a product."""
+    """Set words of neighbouring rows: [rows, columns] -> [rows / 2, columns], the right factor of a product."""
     for row in range(0, rows, 2):
         for lane in range(0, columns, LANES):
-            place = row * columns + lane
-            store(words, place - row // 2 * columns, pair(load(given, place), load(given, place + columns)))
+            index = row * columns + lane
+            store(words, index - row // 2 * columns, pair(load(given, index), load(given, index + columns)))
 
 
 @kernel
 def pair_vectors(given: np.ndarray, rows: int, columns: int, words: np.ndarray) -> None:
-    """Words of neighbouring vectors of a row: [rows, columns] -> [rows, columns / 2], columns a multiple of 32.
+    """Set words of neighbouring vectors of a row: [rows, columns] -> [rows, columns / 2], columns a multiple of 32.
 
     Which numbers of a row make a pair does not matter to a sum over the row, if both factors agree.
     """
-    for place in range(0, rows * columns, 2 * LANES):
-        store(words, place // 2, pair(load(given, place), load(given, place + LANES)))
+    for index in range(0, rows * columns, 2 * LANES):
+        store(words, index // 2, pair(load(given, index), load(given, index + LANES)))
 
 
 @kernel
@@ -153,26 +147,20 @@ def _rounded(bits: int) -> int:
 
 @kernel
 def pair_matrix(
-    bits: np.ndarray, first: int, rows: int, columns: int, along: np.ndarray, across: np.ndarray, place: int
+    bits: np.ndarray, first: int, rows: int, columns: int, along: np.ndarray, across: np.ndarray, index: int
 ) -> None:
-    """Words of a matrix as a left factor, and of its transpose.
+    """Set words of a matrix and of its transpose, both from ``index`` on.
 
-    Args:
-        bits: of float32 numbers as int32; holds the matrix [rows, columns] at ``first``.
-        first: its start.
-        rows: even.
-        columns: even.
-        along: int32, words of the matrix, [rows, columns / 2] from ``place``, set.
-        across: int32, words of its transpose, [columns, rows / 2] from ``place``, set.
-        place: start in both.
+    ``bits`` are float32 numbers as int32; the matrix [rows, columns], both even, begins at ``first``. ``along`` gets
+    [rows, columns / 2] words, ``across`` [columns, rows / 2].
     """
     for row in range(rows):
         for column in range(0, columns, 2):
             low, high = bits[first + row * columns + column], bits[first + row * columns + column + 1]
             word = _rounded(low) | _rounded(high) << 16
-            along[place + (row * columns + column) // 2] = np.int32(np.uint32(word))
+            along[index + (row * columns + column) // 2] = np.int32(np.uint32(word))
     for column in range(columns):
         for row in range(0, rows, 2):
             low, high = bits[first + row * columns + column], bits[first + (row + 1) * columns + column]
             word = _rounded(low) | _rounded(high) << 16
-            across[place + (column * rows + row) // 2] = np.int32(np.uint32(word))
+            across[index + (column * rows + row) // 2] = np.int32(np.uint32(word))

@@ -1,6 +1,6 @@
-"""Real spherical harmonics up to degree 3 for kernels: colours of many Gaussians from one point, and turned ones.
+"""Real spherical harmonics up to degree 3 for kernels: colours of many Gaussians from one point, and rotations.
 
-The twin in plain torch is `rewild4d.harmonics`, which also checks the shapes: kernels do not look where an array ends.
+The torch twin is `rewild4d.harmonics`, which also checks the shapes: kernels do not check bounds.
 """
 
 import math
@@ -14,7 +14,7 @@ from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
 from rewild4d.kernels.switch import Kernel
-from rewild4d.kernels.threads import run, thread_count
+from rewild4d.kernels.threads import run_tickets
 
 HARMONICS = Kernel(
     "harmonics of splats",
@@ -35,12 +35,11 @@ C3 = (
 )  # fmt: skip
 
 CHUNK = 1024
-"""Gaussians a unit of work holds."""
 
 
 @inlined
 def _set_basis(direction: tuple, degree: int, values: np.ndarray) -> None:
-    """Values of the basis functions above degree 0, for a unit direction."""
+    """Set the basis functions above degree 0 for a unit direction."""
     x, y, z = direction
     values[0], values[1], values[2] = -C1 * y, C1 * z, -C1 * x
     if degree > 1:
@@ -79,26 +78,16 @@ def _shade(
 
 
 def shade(colors: Tensor, means: Tensor, eye: Tensor) -> Tensor:
-    """Colours from a point; float32, CPU, without gradients.
-
-    Args:
-        colors: coefficients of degree 1 to 3, 0.5 standing for their zero, [n, 4 or 9 or 16, 3].
-        means: of the Gaussians, [n, 3].
-        eye: [3].
-
-    Returns:
-        Not below 0, [n, 3].
-    """
+    """Compute colours [n, 3], at least 0, from a point; coefficients offset by 0.5, float32 on the CPU."""
     seen = torch.empty(len(means), 3)
     degree = math.isqrt(colors.shape[1]) - 1
-    call = np.zeros(1, np.int64), array(colors), array(means), array(eye), degree, seen.numpy()
-    run(_shade, [call] * thread_count())
+    run_tickets(_shade, array(colors), array(means), array(eye), degree, seen.numpy())
     return seen
 
 
 @kernel
 def set_band(x: Any, y: Any, z: Any, level: int, values: np.ndarray, wide: int) -> None:
-    """Rows of values, ``wide`` apart, of the functions of one degree, 1 to 3, for sixteen directions."""
+    """Set rows, ``wide`` apart, of the functions of one degree, 1 to 3, for sixteen directions."""
     if level == 1:
         store(values, 0, y * splat(np.float32(-C1)))
         store(values, wide, z * splat(np.float32(C1)))
@@ -124,11 +113,11 @@ def set_band(x: Any, y: Any, z: Any, level: int, values: np.ndarray, wide: int) 
 
 
 @kernel
-def _turn_band(
+def _rotate_band(
     level: int, directions: np.ndarray, inverses: np.ndarray, rotation: np.ndarray, rows: np.ndarray,
     values: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Add the turned coefficients of one degree: colours along turned directions, matched by those along the others."""
+    """Add the rotated coefficients of one degree, from colours along rotated directions."""
     size, begin = 2 * level + 1, 3 * level * level
     for d in range(len(directions)):
         a, b, c = splat(directions[d, 0]), splat(directions[d, 1]), splat(directions[d, 2])
@@ -141,12 +130,12 @@ def _turn_band(
             for k in range(size):
                 seen = fma(load(values, k * LANES), load(rows, (channel + 3 * k) * LANES), seen)
             for k in range(size):
-                place = (channel + 3 * k) * LANES
-                store(out, place, fma(splat(inverses[d, k]), seen, load(out, place)))
+                index = (channel + 3 * k) * LANES
+                store(out, index, fma(splat(inverses[d, k]), seen, load(out, index)))
 
 
 @kernel
-def _turn(
+def _rotate(
     tickets: np.ndarray, coefficients: np.ndarray, rotations: np.ndarray, tables: tuple, made: np.ndarray
 ) -> None:
     count, wide = coefficients.shape
@@ -167,29 +156,20 @@ def _turn(
             out[3 * LANES :] = 0
             for level in range(1, len(tables) // 2 + 1):
                 if 3 * level * level < wide:
-                    _turn_band(level, tables[2 * level - 2], tables[2 * level - 1], rotation, rows, values, out)
+                    _rotate_band(level, tables[2 * level - 2], tables[2 * level - 1], rotation, rows, values, out)
             for lane in range(lanes):
                 for i in range(wide):
                     made[first + lane, i] = out[i * LANES + lane]
 
 
 def turn(coefficients: Tensor, rotations: Tensor, tables: tuple[np.ndarray, ...]) -> Tensor:
-    """Coefficients of the same colours on spheres that turn; float32, CPU, without gradients.
+    """Rotate the coefficients [n, 4 or 9 or 16, 3] of colours by rotations [n, 3, 3]; float32 on the CPU, no gradients.
 
-    Args:
-        coefficients: [n, 4 or 9 or 16, 3].
-        rotations: [n, 3, 3].
-        tables: for the degrees 1, 2 and 3 directions [D, 3], enough to tell the functions apart, and the transposed
-            pseudoinverse of the functions' values there, [D, 2 degree + 1].
-
-    Returns:
-        Like ``coefficients``.
+    ``tables`` holds for the degrees 1, 2 and 3 directions [D, 3] that tell the functions apart, and the transposed
+    pseudoinverse of the functions' values there, [D, 2 degree + 1].
     """
     made = torch.empty(coefficients.shape)
     flat = len(made), 3 * coefficients.shape[1]
-    call = (
-        np.zeros(1, np.int64), array(coefficients).reshape(flat), array(rotations).reshape(-1, 9), tables,
-        made.numpy().reshape(flat),
-    )  # fmt: skip
-    run(_turn, [call] * thread_count())
+    given = array(coefficients).reshape(flat), array(rotations).reshape(-1, 9)
+    run_tickets(_rotate, *given, tables, made.numpy().reshape(flat))
     return made

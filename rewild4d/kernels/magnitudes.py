@@ -1,4 +1,4 @@
-"""Whether all numbers of several tensors are finite and not too large, in one call."""
+"""Check in one call that all numbers of several tensors are finite and below a bound."""
 
 from collections.abc import Iterable
 
@@ -15,7 +15,7 @@ _ALL = (1 << LANES) - 1
 
 @kernel
 def _all_below(addresses: np.ndarray, counts: np.ndarray, bound: float) -> bool:
-    """Whether every float32 number at these addresses is below the bound in magnitude; NaN is not."""
+    """Tell whether every float32 number at these addresses is below the bound in magnitude; NaN is not."""
     limit, inside = splat(np.float32(bound)), _ALL
     for run in range(len(addresses)):
         values = floats_at(addresses[run], counts[run])
@@ -34,13 +34,9 @@ def _all_below(addresses: np.ndarray, counts: np.ndarray, bound: float) -> bool:
 
 
 def all_below(tensors: Iterable[Tensor], bound: float) -> bool:
-    """Whether every number is below the bound in magnitude, NaN is not; wakes no thread of torch's.
-
-    Args:
-        tensors: float32 on the CPU, of any shape.
-        bound: positive.
-    """
+    """Tell whether every number of float32 CPU tensors is below a positive bound in magnitude (NaN is not), in one
+    thread."""
     kept = [tensor.contiguous() for tensor in tensors]  # alive until the kernel has read them
     assert all(map(packed, kept))
-    places = np.array([(tensor.data_ptr(), tensor.numel()) for tensor in kept], np.int64).reshape(-1, 2)
-    return _all_below(places[:, 0], places[:, 1], bound)
+    spans = np.array([(tensor.data_ptr(), tensor.numel()) for tensor in kept], np.int64).reshape(-1, 2)
+    return _all_below(spans[:, 0], spans[:, 1], bound)

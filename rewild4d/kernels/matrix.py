@@ -1,6 +1,6 @@
-"""Small dense products inside kernels, in tiles whose sums never leave the registers.
+"""Small dense products inside kernels, in tiles whose sums stay in registers.
 
-A matrix is a 1D float32 array, the index of its first element and the distances between rows and columns, so one
+A matrix is a 1D float32 array, the index of its first element and the distances between rows and columns, so that one
 routine serves a matrix and its transpose. Rows of the result and of the right factor are multiples of sixteen floats.
 """
 
@@ -13,34 +13,21 @@ from numba.core import types
 from numba.core.typing import signature
 
 from rewild4d.kernels.compiling import compiled_for, kernel
-from rewild4d.kernels.simd import INTEGERS, LANES, VECTOR, intrinsic, llvm_call
+from rewild4d.kernels.simd import INTEGERS, LANES, VECTOR, array_data, broadcast_number, intrinsic, llvm_call, vector_at
 
 ROWS, VECTORS = (8, 3) if compiled_for("avx512f") else (4, 1)
 """Rows of a tile and vectors in one of them; rows of the left factor and of the result are a multiple of 8.
 
 AVX-512 has 32 registers: 24 sums, 3 loads and 8 broadcasts a step leave the multiplier as the limit. AVX2 has 16 of
-half the length, and 4 x 1 needs eight for its sums; the sums of an 8 x 3 tile would go to memory and back at every step
-(three times slower). Every sum runs over the depth in order, so the result does not depend on the tile.
+half the length: an 8 x 3 tile would spill to memory (three times slower). Sums run over the depth in order, so the
+result does not depend on the tile.
 """
 
-_FLOAT, _WORD = ir.FloatType(), ir.IntType(64)
-
-
-def _data(context: Any, builder: Any, kind: Any, value: Any) -> Any:
-    return context.make_array(kind)(context, builder, value).data
-
-
-def _vector_at(builder: Any, data: Any, place: Any) -> Any:
-    return builder.bitcast(builder.gep(data, [place]), VECTOR.as_pointer())
-
-
-def _broadcast(builder: Any, number: Any) -> Any:
-    one = builder.insert_element(ir.Constant(VECTOR, ir.Undefined), number, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
+_WORD = ir.IntType(64)
 
 
 def matrix_tile(rows: int, vectors: int, multiply_add: Callable[[Any, Any, Any, Any], Any]) -> Any:
-    """An intrinsic that adds A B to a tile of C.
+    """Make an intrinsic that adds A B to a tile of C.
 
     Args:
         rows: of the tile.
@@ -54,37 +41,35 @@ def matrix_tile(rows: int, vectors: int, multiply_add: Callable[[Any, Any, Any, 
         c: Any, c_first: Any, c_row: Any,
     ) -> Any:  # fmt: skip
         def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            left, right, out = (_data(context, builder, sig.args[i], args[i]) for i in (0, 4, 8))
+            left, right, out = (array_data(context, builder, sig.args[i], args[i]) for i in (0, 4, 8))
             a_first, a_row, a_step, b_first, b_row, depth, c_first, c_row = (args[i] for i in (1, 2, 3, 5, 6, 7, 9, 10))
             row_starts = [builder.add(a_first, builder.mul(a_row, ir.Constant(_WORD, r))) for r in range(rows)]
-            places = [
-                _vector_at(
-                    builder,
-                    out,
-                    builder.add(c_first, builder.add(builder.mul(c_row, _word(r)), _word(v * LANES))),
+            pointers = [
+                vector_at(
+                    builder, out, builder.add(c_first, builder.add(builder.mul(c_row, _word(r)), _word(v * LANES)))
                 )
                 for r in range(rows)
                 for v in range(vectors)
             ]
-            start = [builder.load(place, align=4) for place in places]
+            start = [builder.load(index, align=4) for index in pointers]
             before = builder.block
             loop, after = builder.append_basic_block("step"), builder.append_basic_block("done")
             builder.cbranch(builder.icmp_signed(">", depth, _word(0)), loop, after)
             builder.position_at_end(loop)
             step = builder.phi(_WORD)
             step.add_incoming(_word(0), before)
-            sums = [builder.phi(VECTOR) for _ in places]
+            sums = [builder.phi(VECTOR) for _ in pointers]
             for total, first in zip(sums, start, strict=True):
                 total.add_incoming(first, before)
             line = builder.add(b_first, builder.mul(step, b_row))
             columns = [
-                builder.load(_vector_at(builder, right, builder.add(line, _word(v * LANES))), align=4)
+                builder.load(vector_at(builder, right, builder.add(line, _word(v * LANES))), align=4)
                 for v in range(vectors)
             ]
             along = builder.mul(step, a_step)
             new = []
             for r in range(rows):
-                factor = _broadcast(builder, builder.load(builder.gep(left, [builder.add(row_starts[r], along)])))
+                factor = broadcast_number(builder, builder.load(builder.gep(left, [builder.add(row_starts[r], along)])))
                 new += [multiply_add(builder, factor, columns[v], sums[r * vectors + v]) for v in range(vectors)]
             following = builder.add(step, _word(1))
             step.add_incoming(following, loop)
@@ -92,12 +77,12 @@ def matrix_tile(rows: int, vectors: int, multiply_add: Callable[[Any, Any, Any, 
                 total.add_incoming(value, loop)
             builder.cbranch(builder.icmp_signed("<", following, depth), loop, after)
             builder.position_at_end(after)
-            results = [builder.phi(VECTOR) for _ in places]
+            results = [builder.phi(VECTOR) for _ in pointers]
             for result, value, first in zip(results, new, start, strict=True):
                 result.add_incoming(value, loop)
                 result.add_incoming(first, before)
-            for place, result in zip(places, results, strict=True):
-                builder.store(result, place, align=4)
+            for index, result in zip(pointers, results, strict=True):
+                builder.store(result, index, align=4)
             return context.get_dummy_value()
 
         integer = types.intp
@@ -113,7 +98,7 @@ def _word(value: int) -> Any:
 
 
 def multiply_add(builder: Any, left: Any, right: Any, total: Any) -> Any:
-    """Total + left * right, rounded once, while code is generated."""
+    """Generate total + left * right, rounded once."""
     return llvm_call(builder, "llvm.fma.v16f32", [left, right, total])
 
 
@@ -122,7 +107,8 @@ _tile1, _tile2, _tile3 = (matrix_tile(ROWS, vectors, multiply_add) for vectors i
 
 @kernel
 def tile_width(left: int) -> int:
-    """Vectors of the next tile's rows where so many are left; two and two for four: eight sums wait for each other."""
+    """Return the vectors of the next tile's rows; four are cut into two and two, since eight sums alone wait for each
+    other."""
     return 2 if left == VECTORS + 1 == 4 else min(left, VECTORS)
 
 
@@ -131,12 +117,12 @@ def add_product(
     a: np.ndarray, a_first: int, a_row: int, a_step: int, b: np.ndarray, b_first: int, b_row: int, depth: int,
     c: np.ndarray, c_first: int, c_row: int, rows: int, columns: int,
 ) -> None:  # fmt: skip
-    """C += A B.
+    """Compute C += A B.
 
     Args:
-        a: holds A [rows, depth] at a_first, its rows a_row apart and its columns a_step.
-        b: holds B [depth, columns] at b_first, its rows b_row apart.
-        c: holds C [rows, columns] at c_first, its rows c_row apart.
+        a: A [rows, depth] from a_first, rows a_row apart and columns a_step.
+        b: B [depth, columns] from b_first, rows b_row apart.
+        c: C [rows, columns] from c_first, rows c_row apart.
         rows: a multiple of 8.
         columns: a multiple of 16.
     """
@@ -144,26 +130,29 @@ def add_product(
     while column < columns:
         width = tile_width((columns - column) // LANES)
         for row in range(0, rows, ROWS):
-            place = c_first + row * c_row + column
+            index = c_first + row * c_row + column
             if width == 3:
-                _tile3(a, a_first + row * a_row, a_row, a_step, b, b_first + column, b_row, depth, c, place, c_row)
+                _tile3(a, a_first + row * a_row, a_row, a_step, b, b_first + column, b_row, depth, c, index, c_row)
             elif width == 2:
-                _tile2(a, a_first + row * a_row, a_row, a_step, b, b_first + column, b_row, depth, c, place, c_row)
+                _tile2(a, a_first + row * a_row, a_row, a_step, b, b_first + column, b_row, depth, c, index, c_row)
             else:
-                _tile1(a, a_first + row * a_row, a_row, a_step, b, b_first + column, b_row, depth, c, place, c_row)
+                _tile1(a, a_first + row * a_row, a_row, a_step, b, b_first + column, b_row, depth, c, index, c_row)
         column += width * LANES
 
 
 @intrinsic
-def transpose_tile(typing: Any, source: Any, first: Any, row: Any, target: Any, place: Any, step: Any) -> Any:
+def transpose_tile(typing: Any, source: Any, first: Any, row: Any, target: Any, index: Any, step: Any) -> Any:
     """Write the transpose of the 16 x 16 tile of a float32 ``source`` at ``first``, rows ``row`` apart."""
     if not source.dtype == target.dtype == types.float32:
         return None
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        given, made = _data(context, builder, sig.args[0], args[0]), _data(context, builder, sig.args[3], args[3])
+        given, made = (
+            array_data(context, builder, sig.args[0], args[0]),
+            array_data(context, builder, sig.args[3], args[3]),
+        )
         lines = [
-            builder.load(_vector_at(builder, given, builder.add(args[1], builder.mul(args[2], _word(i)))), align=4)
+            builder.load(vector_at(builder, given, builder.add(args[1], builder.mul(args[2], _word(i)))), align=4)
             for i in range(LANES)
         ]
         # Stage s exchanges bit s of the row number with bit s of the lane number.
@@ -178,9 +167,7 @@ def transpose_tile(typing: Any, source: Any, first: Any, row: Any, target: Any, 
                     swapped[i | bit] = builder.shuffle_vector(*pair, ir.Constant(INTEGERS, high))
             lines = swapped
         for i, line in enumerate(lines):
-            builder.store(
-                line, _vector_at(builder, made, builder.add(args[4], builder.mul(args[5], _word(i)))), align=4
-            )
+            builder.store(line, vector_at(builder, made, builder.add(args[4], builder.mul(args[5], _word(i)))), align=4)
         return context.get_dummy_value()
 
     integer = types.intp
@@ -188,8 +175,8 @@ def transpose_tile(typing: Any, source: Any, first: Any, row: Any, target: Any, 
 
 
 @kernel
-def transpose(given: np.ndarray, rows: int, wide: int, turned: np.ndarray) -> None:
+def transpose(given: np.ndarray, rows: int, wide: int, transposed: np.ndarray) -> None:
     """Write [rows, wide] as [wide, rows]; multiples of sixteen."""
     for row in range(0, rows, LANES):
         for lane in range(0, wide, LANES):
-            transpose_tile(given, row * wide + lane, wide, turned, lane * rows + row, rows)
+            transpose_tile(given, row * wide + lane, wide, transposed, lane * rows + row, rows)

@@ -1,4 +1,4 @@
-"""Keeping freed memory in the process: a fresh page costs more than the arithmetic on it."""
+"""Keep freed memory in the process: a fresh page costs more than the arithmetic on it."""
 
 import ctypes
 import platform
@@ -9,10 +9,10 @@ M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
 
 @cache
 def keep_freed_memory() -> bool:
-    """Ask the C library not to return blocks of up to 32 MiB to the system; gives whether it took that.
+    """Ask glibc not to return blocks of up to 32 MiB to the system; return whether it agreed.
 
-    By default glibc gives large blocks back when they are freed, and every step of a training faults them in again:
-    with 20k Gaussians that was a third of its time. Other C libraries are left as they are.
+    By default they are returned when freed, and every training step faults them in again (a third of its time with 20k
+    Gaussians). Other C libraries are left as they are.
     """
     if platform.libc_ver()[0] != "glibc":
         return False

@@ -1,4 +1,4 @@
-"""torch's OpenMP threads: they wait for their next work by spinning, and take the cores from our kernels meanwhile."""
+"""End torch's idle OpenMP threads: they wait by spinning, and so take cores from our kernels."""
 
 import ctypes
 import os
@@ -8,7 +8,7 @@ from functools import cache
 import torch
 
 _SOFT = 1
-"""omp_pause_soft: threads end, settings stay, and the next parallel operation starts threads anew."""
+"""omp_pause_soft: end the threads, keep the settings, start threads anew when needed."""
 _FORK_WITHOUT_EXEC = 0x40
 """Linux's PF_FORKNOEXEC."""
 
@@ -20,7 +20,7 @@ def after_fork(call: Callable[[], None]) -> None:
 
 
 def _was_forked() -> bool:
-    """Whether this process began as a fork, as far as that can be seen: `fork` may come before this module's import."""
+    """Tell whether this process began as a fork, possibly before this module was imported."""
     try:
         with open("/proc/self/stat", encoding="utf-8", errors="replace") as stat:
             flags = int(stat.read().rpartition(")")[2].split()[6])
@@ -43,7 +43,7 @@ after_fork(_mark_fork)
 
 @cache
 def _pause() -> Callable[[int], int] | None:
-    """OpenMP 5.0's `omp_pause_resource_all` of the runtime that torch uses, where it has one."""
+    """Return `omp_pause_resource_all` (OpenMP 5.0) of torch's runtime, if it has one."""
     try:
         return ctypes.CDLL(torch._C.__file__).omp_pause_resource_all
     except (AttributeError, OSError):
@@ -51,11 +51,10 @@ def _pause() -> Callable[[int], int] | None:
 
 
 def let_idle_threads_go() -> None:
-    """End the threads that torch keeps for the caller's parallel operations; the next of them starts new ones.
+    """End the threads that torch keeps for the caller's parallel operations; the next operation starts new ones.
 
-    After an operation GNU's runtime spins for milliseconds, and a kernel that starts then shares its cores. Nothing
-    happens where they do not spin (OMP_WAIT_POLICY=PASSIVE, see `rewild4d/__init__.py`), where torch computes on one
-    thread, as in `threads.torch_on_one`, nor in a forked process.
+    GNU's runtime spins for milliseconds after an operation. Nothing is done where threads do not spin
+    (OMP_WAIT_POLICY=PASSIVE, see `rewild4d/__init__.py`), where torch uses one thread, or in a forked process.
     """
     passive = os.environ.get("OMP_WAIT_POLICY", "").upper() == "PASSIVE"
     if passive or _forked or torch.get_num_threads() == 1:

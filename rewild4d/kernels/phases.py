@@ -1,7 +1,7 @@
-"""Kernels of several phases in one call: waking a second thread costs as much as a small phase, so it is done once.
+"""Run kernels of several phases in one call: waking a second thread costs as much as a small phase.
 
-Whoever comes takes tickets; a thread that finds none left waits for those that still work on theirs. Nobody waits for a
-thread that has not begun, so one thread alone gets through as well.
+Threads take tickets; one that finds none left waits for those that still work. Nobody waits for a thread that has not
+begun, so one thread alone also finishes.
 """
 
 import os
@@ -13,27 +13,27 @@ from numba.core import cgutils, types
 from numba.core.typing import signature
 
 from rewild4d.kernels.compiling import kernel
-from rewild4d.kernels.simd import intrinsic
+from rewild4d.kernels.simd import array_data, intrinsic
 
 _LINE = 8
-"""Counters, of eight bytes, that share a cache line."""
+"""Counters (8 bytes) of a cache line."""
 _PHASE = 3 * _LINE
 PATIENCE = 1000
-"""Looks before the core is offered to others: on a busy machine the one that is waited for may need it."""
+"""Checks before a waiting thread yields its core."""
 _WORD = ir.IntType(64)
 
 
 def phase_counters(phases: int) -> np.ndarray:
-    """What the threads of one call share, int64."""
+    """Allocate what the threads of one call share, int64."""
     return np.zeros(phases * _PHASE, np.int64)
 
 
 @intrinsic
 def _count_up(typing: Any, counters: Any, index: Any) -> Any:
-    """Atomically add one to a counter and give its old value; what was written before is seen by who reads it after."""
+    """Add one to a counter atomically, with acquire and release, and return its old value."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        data = array_data(context, builder, sig.args[0], args[0])
         return builder.atomic_rmw("add", builder.gep(data, [args[1]]), ir.Constant(_WORD, 1), "acq_rel")
 
     return signature(types.int64, counters, types.intp), generate
@@ -41,10 +41,10 @@ def _count_up(typing: Any, counters: Any, index: Any) -> Any:
 
 @intrinsic
 def _read(typing: Any, counters: Any, index: Any) -> Any:
-    """A counter as it stands now."""
+    """Read a counter, with acquire."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        data = array_data(context, builder, sig.args[0], args[0])
         return builder.load_atomic(builder.gep(data, [args[1]]), "acquire", 8)
 
     return signature(types.int64, counters, types.intp), generate
@@ -65,19 +65,19 @@ def _yield_core(typing: Any) -> Any:
 
 @kernel
 def enter_phase(counters: np.ndarray, phase: int) -> None:
-    """Say that this thread may take tickets of a phase."""
+    """Announce that this thread may take tickets of a phase."""
     _count_up(counters, phase * _PHASE + _LINE)
 
 
 @kernel
 def phase_ticket(counters: np.ndarray, phase: int) -> int:
-    """The next ticket of a phase, from 0."""
+    """Take the next ticket of a phase, from 0."""
     return _count_up(counters, phase * _PHASE)
 
 
 @kernel
 def end_phase(counters: np.ndarray, phase: int) -> None:
-    """Wait for all who may hold a ticket of a phase; to be called by a thread that found none left."""
+    """Wait for all that may hold a ticket of a phase; for a thread that found none left."""
     first, looks = phase * _PHASE, 0
     _count_up(counters, first + 2 * _LINE)
     while _read(counters, first + 2 * _LINE) < _read(counters, first + _LINE):

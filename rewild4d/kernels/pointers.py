@@ -1,4 +1,4 @@
-"""Many tensors in one call: kernels that take addresses, since an array for each tensor would cost a microsecond."""
+"""Kernels on many tensors in one call: they take addresses, since an array for each tensor costs a microsecond."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from rewild4d.kernels.simd import intrinsic
 
 @intrinsic
 def _pointer(typing: Any, address: Any) -> Any:
-    """An address as a pointer to float32."""
+    """Convert an address to a pointer to float32."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.inttoptr(args[0], ir.FloatType().as_pointer())
@@ -26,10 +26,10 @@ def _pointer(typing: Any, address: Any) -> Any:
 
 @inlined
 def floats_at(address: int, count: int) -> np.ndarray:
-    """The float32 numbers at an address, as an array of the same memory."""
+    """Return the float32 numbers at an address as an array of the same memory."""
     return numba.carray(_pointer(address), count)
 
 
 def packed(tensor: Tensor) -> bool:
-    """Whether a kernel may read it at its address: single precision on the CPU without gaps."""
+    """Tell whether a kernel may read a tensor at its address: contiguous float32 on the CPU."""
     return tensor.is_cpu and tensor.dtype == torch.float32 and tensor.is_contiguous()

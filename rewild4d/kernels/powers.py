@@ -10,22 +10,22 @@ from rewild4d.kernels.compiling import inlined
 from rewild4d.kernels.simd import INTEGERS, LANES, VECTOR, broadcast, constant, fma, intrinsic, lanes_type, llvm_call
 
 LOG2_E = np.float32(1.4426950408889634)
-"""For exp(x) = exp2(x LOG2_E)."""
+"""exp(x) = exp2(x LOG2_E)."""
 
 
 def _power_of_two_fit() -> list[float]:
-    """Coefficients of 2**x on [-1/2, 1/2], degree 5 at Chebyshev nodes, relative error 2e-7 in float32."""
+    """Fit 2**x on [-1/2, 1/2]: degree 5 at Chebyshev nodes, relative error 2e-7 in float32."""
     nodes = 0.5 * np.cos((np.arange(6) + 0.5) * np.pi / 6)
     return [float(value) for value in np.polyfit(nodes, np.exp2(nodes), 5)]
 
 
 POWER_TERMS = np.array([1.5 * 2.0**23, *_power_of_two_fit()], np.float32)
-"""What `exp2_with` needs: a number whose addition rounds to an integer, left in the low bits, then the polynomial."""
+"""Constants of `exp2_with`: one whose addition rounds to an integer in the low bits, then the polynomial."""
 
 
 @intrinsic
 def _times_power(typing: Any, value: Any, shifted: Any) -> Any:
-    """The value times two to the power that the low bits of ``shifted`` hold."""
+    """Multiply by two to the power in the low bits of ``shifted``."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         exponent = builder.shl(builder.bitcast(args[1], INTEGERS), ir.Constant(INTEGERS, [23] * LANES))
@@ -35,18 +35,18 @@ def _times_power(typing: Any, value: Any, shifted: Any) -> Any:
 
 
 @inlined
-def load_terms(constants: np.ndarray, place: int) -> tuple:
-    """`POWER_TERMS` from an array that holds them at ``place``."""
+def load_terms(constants: np.ndarray, index: int) -> tuple:
+    """Load `POWER_TERMS` from an array that holds them at ``index``."""
     return (
-        broadcast(constants, place), broadcast(constants, place + 1), broadcast(constants, place + 2),
-        broadcast(constants, place + 3), broadcast(constants, place + 4), broadcast(constants, place + 5),
-        broadcast(constants, place + 6),
+        broadcast(constants, index), broadcast(constants, index + 1), broadcast(constants, index + 2),
+        broadcast(constants, index + 3), broadcast(constants, index + 4), broadcast(constants, index + 5),
+        broadcast(constants, index + 6),
     )  # fmt: skip
 
 
 @inlined
 def exp2_with(terms: tuple, x: Any) -> Any:
-    """`exp2` with its constants in registers: as literals each costs an instruction of ten bytes at every use."""
+    """Compute `exp2` with constants in registers: as literals each costs an instruction of ten bytes at every use."""
     shifted = x + terms[0]
     fraction = x - (shifted - terms[0])
     value = fma(terms[1], fraction, terms[2])
@@ -59,7 +59,7 @@ def exp2_with(terms: tuple, x: Any) -> Any:
 
 @intrinsic
 def exp2(typing: Any, x: Any) -> Any:
-    """2**x for -126 <= x <= 126; meaningless but harmless outside."""
+    """Compute 2**x for -126 <= x <= 126; undefined outside."""
     coefficients = _power_of_two_fit()
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Sums over vectors and rows of any length, for kernels on the sixteen lanes of simd.py."""
+"""Sums over vectors and rows of any length on the sixteen lanes of simd.py."""
 
 from typing import Any
 
@@ -22,25 +22,25 @@ def _four_rows(rows: np.ndarray, first: int, count: int) -> Any:
 
 
 @inlined
-def sum_rows(rows: np.ndarray, count: int, sums: np.ndarray, place: int) -> None:
-    """Write the sum of each of ``count`` vectors in ``rows`` to sums[place:], sixteen at a time."""
+def sum_rows(rows: np.ndarray, count: int, sums: np.ndarray, index: int) -> None:
+    """Write the sum of each of ``count`` vectors in ``rows`` to sums[index:], sixteen at a time."""
     for first in range(0, count, LANES):
         near = fold4(_four_rows(rows, first, count), _four_rows(rows, first + 4, count))
         far = fold4(_four_rows(rows, first + 8, count), _four_rows(rows, first + 12, count))
-        store(sums, place + first, fold8(near, far))
+        store(sums, index + first, fold8(near, far))
 
 
 @inlined
-def add_scaled(share: float, source: np.ndarray, start: int, target: np.ndarray, place: int, count: int) -> None:
-    """Add ``share`` times source[start : start + count] to target[place:], both 1D."""
+def add_scaled(share: float, source: np.ndarray, start: int, target: np.ndarray, index: int, count: int) -> None:
+    """Add ``share`` times source[start : start + count] to target[index:], both 1D."""
     whole = count // LANES * LANES
     factor = splat(share)
     for i in range(0, whole, LANES):
-        store(target, place + i, fma(factor, load(source, start + i), load(target, place + i)))
+        store(target, index + i, fma(factor, load(source, start + i), load(target, index + i)))
     if whole < count:
-        own = load_first(target, place + whole, count - whole, factor)
+        own = load_first(target, index + whole, count - whole, factor)
         own = fma(factor, load_first(source, start + whole, count - whole, factor), own)
-        store_first(target, place + whole, count - whole, own)
+        store_first(target, index + whole, count - whole, own)
 
 
 @kernel
@@ -48,8 +48,8 @@ def add_row_sums(rows: np.ndarray, count: int, wide: int, scratch: np.ndarray, s
     """Add the sum of each of ``count`` rows to ``sums``; both lengths are multiples of sixteen."""
     for row in range(count):
         total = splat(np.float32(0))
-        for place in range(row * wide, (row + 1) * wide, LANES):
-            total = total + load(rows, place)
+        for index in range(row * wide, (row + 1) * wide, LANES):
+            total = total + load(rows, index)
         store(scratch, row * LANES, total)
     sum_rows(scratch, count, scratch, 0)
     for row in range(0, count, LANES):

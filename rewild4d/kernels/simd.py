@@ -1,11 +1,13 @@
 """A vector of 16 float32 lanes for numba kernels: `Lanes`, lowered by LLVM to AVX-512, AVX2 or NEON.
 
-Inside kernels ``+``, ``-`` and ``*`` work on two `Lanes`; everything else is a function below. Loads and stores take a
-1D float32 array and the index of the first lane.
+Inside kernels ``+``, ``-`` and ``*`` work on two `Lanes`; all else is a function below, lane by lane. Loads and stores
+take a 1D float32 array and the index of the first lane.
 """
 
-# numba fixes the shape of an intrinsic: it takes the typing context and gives a signature and a code generator.
+# numba fixes the shape of an intrinsic: it takes the typing context and returns a signature and a code generator.
 import operator
+from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -24,7 +26,7 @@ VECTOR, INTEGERS = ir.VectorType(_FLOAT, LANES), ir.VectorType(_INT, LANES)
 
 
 class LanesType(types.Type):
-    """numba's name for `<16 x float>`."""
+    """The numba type of `<16 x float>`."""
 
     def __init__(self) -> None:
         super().__init__(name="float32x16")
@@ -40,195 +42,184 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def constant(values: Any) -> ir.Constant:
+    """Return a vector of one number, or of sixteen, while code is generated."""
     return ir.Constant(VECTOR, [float(np.float32(value)) for value in np.broadcast_to(values, LANES)])
 
 
-@infer_global(operator.add)
-@infer_global(operator.sub)
-@infer_global(operator.mul)
+def broadcast_number(builder: Any, number: Any) -> Any:
+    """Put a number in all lanes, while code is generated."""
+    one = builder.insert_element(ir.Constant(ir.VectorType(number.type, LANES), ir.Undefined), number, _INT(0))
+    return builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
+
+
+def array_data(context: Any, builder: Any, kind: Any, array: Any) -> Any:
+    """Return the pointer to an array's first element, while code is generated."""
+    return context.make_array(kind)(context, builder, array).data
+
+
+def vector_at(builder: Any, data: Any, index: Any) -> Any:
+    """Return the pointer to sixteen numbers from an index on, while code is generated."""
+    return builder.bitcast(builder.gep(data, [index]), VECTOR.as_pointer())
+
+
+def llvm_call(builder: Any, name: str, args: Any, result: Any = VECTOR) -> Any:
+    """Call one of LLVM's own functions, while code is generated."""
+    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(result, [arg.type for arg in args]), name)
+    return builder.call(function, args)
+
+
+def elementwise(kind: types.Type) -> Callable[[Callable[..., Any]], Any]:
+    """Make an intrinsic on vectors of a type from a function that generates its code: (builder, *vectors) -> vector."""
+
+    def decorate(emit: Callable[..., Any]) -> Any:
+        @wraps(emit)  # numba reads the number of vectors from its signature
+        def definition(typing: Any, *given: Any) -> Any:
+            def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+                return emit(builder, *args)
+
+            return signature(kind, *[kind] * len(given)), generate
+
+        return intrinsic(definition)
+
+    return decorate
+
+
 class _Arithmetic(AbstractTemplate):
     def generic(self, args: Any, kws: Any) -> Any:
         return signature(lanes_type, *args) if args == (lanes_type, lanes_type) else None
 
 
-@lower_builtin(operator.add, lanes_type, lanes_type)
-def _lower_add(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    return builder.fadd(*args)
+def _define(operation: Any, name: str) -> None:
+    infer_global(operation)(_Arithmetic)
+
+    @lower_builtin(operation, lanes_type, lanes_type)
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return getattr(builder, name)(*args)
 
 
-@lower_builtin(operator.sub, lanes_type, lanes_type)
-def _lower_sub(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    return builder.fsub(*args)
-
-
-@lower_builtin(operator.mul, lanes_type, lanes_type)
-def _lower_mul(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    return builder.fmul(*args)
-
-
-@intrinsic
-def divide(typing: Any, a: Any, b: Any) -> Any:
-    """Divide a / b."""
-    return signature(lanes_type, a, b), lambda context, builder, sig, args: builder.fdiv(*args)
+for _operation, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
+    _define(_operation, _name)
 
 
 @intrinsic
 def splat(typing: Any, value: Any) -> Any:
-    """One number in all lanes."""
+    """Put one number in all lanes."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        one = builder.insert_element(ir.Constant(VECTOR, ir.Undefined), args[0], ir.Constant(_INT, 0))
-        return builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
+        return broadcast_number(builder, args[0])
 
     return signature(lanes_type, types.float32), generate
 
 
-@intrinsic
-def columns_of_block(typing: Any) -> Any:
-    """Column 0..3 of each lane in a 4 x 4 block."""
-    values = [lane % 4 for lane in range(LANES)]
-    return signature(lanes_type), lambda context, builder, sig, args: constant(values)
+@elementwise(lanes_type)
+def columns_of_block(builder: Any) -> Any:
+    """Return the column 0..3 of each lane in a 4 x 4 block."""
+    return constant([lane % 4 for lane in range(LANES)])
 
 
-@intrinsic
-def rows_of_block(typing: Any) -> Any:
-    """Row 0..3 of each lane in a 4 x 4 block."""
-    values = [lane // 4 for lane in range(LANES)]
-    return signature(lanes_type), lambda context, builder, sig, args: constant(values)
-
-
-def _pointer(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    array = context.make_array(sig.args[0])(context, builder, args[0])
-    first = builder.gep(array.data, [args[1]])
-    return builder.bitcast(first, VECTOR.as_pointer())
+@elementwise(lanes_type)
+def rows_of_block(builder: Any) -> Any:
+    """Return the row 0..3 of each lane in a 4 x 4 block."""
+    return constant([lane // 4 for lane in range(LANES)])
 
 
 @intrinsic
 def load(typing: Any, array: Any, index: Any) -> Any:
-    """Sixteen consecutive numbers of an array."""
+    """Load sixteen consecutive numbers of an array."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.load(_pointer(context, builder, sig, args), align=4)
+        return builder.load(vector_at(builder, array_data(context, builder, sig.args[0], args[0]), args[1]), align=4)
 
     return signature(lanes_type, array, types.intp), generate
 
 
 @intrinsic
 def broadcast(typing: Any, array: Any, index: Any) -> Any:
-    """One number of an array in all lanes; the index is not checked and not counted from the end."""
+    """Put one number of an array in all lanes; the index is not checked and not counted from the end."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        one = ir.Constant(VECTOR, ir.Undefined)
-        one = builder.insert_element(one, builder.load(builder.gep(data, [args[1]])), ir.Constant(_INT, 0))
-        return builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
+        data = array_data(context, builder, sig.args[0], args[0])
+        return broadcast_number(builder, builder.load(builder.gep(data, [args[1]])))
 
     return signature(lanes_type, array, types.intp), generate
 
 
 @intrinsic
 def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
-    """Write sixteen consecutive numbers of an array."""
+    """Store sixteen consecutive numbers of an array."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        builder.store(args[2], _pointer(context, builder, sig, args), align=4)
+        data = array_data(context, builder, sig.args[0], args[0])
+        builder.store(args[2], vector_at(builder, data, args[1]), align=4)
         return context.get_dummy_value()
 
     return signature(types.void, array, types.intp, lanes_type), generate
 
 
-def llvm_call(builder: Any, name: str, args: Any, result: Any = VECTOR) -> Any:
-    """A call of one of LLVM's own functions, while code is generated."""
-    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(result, [arg.type for arg in args]), name)
-    return builder.call(function, args)
+@elementwise(lanes_type)
+def divide(builder: Any, a: Any, b: Any) -> Any:
+    """Compute a / b."""
+    return builder.fdiv(a, b)
 
 
-@intrinsic
-def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
+@elementwise(lanes_type)
+def fma(builder: Any, a: Any, b: Any, c: Any) -> Any:
     """Compute a * b + c, rounded once."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return llvm_call(builder, "llvm.fma.v16f32", args)
-
-    return signature(lanes_type, lanes_type, lanes_type, lanes_type), generate
+    return llvm_call(builder, "llvm.fma.v16f32", [a, b, c])
 
 
-@intrinsic
-def fnma(typing: Any, a: Any, b: Any, c: Any) -> Any:
+@elementwise(lanes_type)
+def fnma(builder: Any, a: Any, b: Any, c: Any) -> Any:
     """Compute c - a * b, rounded once."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return llvm_call(builder, "llvm.fma.v16f32", [builder.fneg(args[0]), args[1], args[2]])
-
-    return signature(lanes_type, lanes_type, lanes_type, lanes_type), generate
+    return llvm_call(builder, "llvm.fma.v16f32", [builder.fneg(a), b, c])
 
 
-@intrinsic
-def absolute(typing: Any, a: Any) -> Any:
-    """Lane by lane absolute value."""
-    return signature(lanes_type, a), lambda context, builder, sig, args: llvm_call(builder, "llvm.fabs.v16f32", args)
+@elementwise(lanes_type)
+def absolute(builder: Any, a: Any) -> Any:
+    """Compute the absolute value."""
+    return llvm_call(builder, "llvm.fabs.v16f32", [a])
 
 
-@intrinsic
-def square_root(typing: Any, a: Any) -> Any:
-    """Lane by lane square root."""
-    return signature(lanes_type, a), lambda context, builder, sig, args: llvm_call(builder, "llvm.sqrt.v16f32", args)
+@elementwise(lanes_type)
+def square_root(builder: Any, a: Any) -> Any:
+    """Compute the square root."""
+    return llvm_call(builder, "llvm.sqrt.v16f32", [a])
 
 
-@intrinsic
-def negated_absolute(typing: Any, a: Any) -> Any:
-    """Lane by lane, minus the absolute value."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        bits = builder.or_(builder.bitcast(args[0], INTEGERS), ir.Constant(INTEGERS, [-(2**31)] * LANES))
-        return builder.bitcast(bits, VECTOR)
-
-    return signature(lanes_type, a), generate
+@elementwise(lanes_type)
+def negated_absolute(builder: Any, a: Any) -> Any:
+    """Compute minus the absolute value."""
+    bits = builder.or_(builder.bitcast(a, INTEGERS), ir.Constant(INTEGERS, [-(2**31)] * LANES))
+    return builder.bitcast(bits, VECTOR)
 
 
-@intrinsic
-def minimum(typing: Any, a: Any, b: Any) -> Any:
-    """Lane by lane minimum."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.select(builder.fcmp_ordered("<", *args), *args)
-
-    return signature(lanes_type, lanes_type, lanes_type), generate
+@elementwise(lanes_type)
+def minimum(builder: Any, a: Any, b: Any) -> Any:
+    """Compute the smaller of two; the second where one is a NaN."""
+    return builder.select(builder.fcmp_ordered("<", a, b), a, b)
 
 
-@intrinsic
-def maximum(typing: Any, a: Any, b: Any) -> Any:
-    """Lane by lane maximum."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.select(builder.fcmp_ordered(">", *args), *args)
-
-    return signature(lanes_type, lanes_type, lanes_type), generate
+@elementwise(lanes_type)
+def maximum(builder: Any, a: Any, b: Any) -> Any:
+    """Compute the larger of two; the second where one is a NaN."""
+    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
 
 
-@intrinsic
-def keep_where_ge(typing: Any, value: Any, a: Any, b: Any) -> Any:
-    """The value where a >= b, zero elsewhere."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.select(builder.fcmp_ordered(">=", args[1], args[2]), args[0], constant(0.0))
-
-    return signature(lanes_type, lanes_type, lanes_type, lanes_type), generate
+@elementwise(lanes_type)
+def keep_where_ge(builder: Any, value: Any, a: Any, b: Any) -> Any:
+    """Return the value where a >= b, zero elsewhere."""
+    return builder.select(builder.fcmp_ordered(">=", a, b), value, constant(0.0))
 
 
-@intrinsic
-def select_gt(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
-    """``yes`` where a > b, ``no`` elsewhere."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.select(builder.fcmp_ordered(">", args[0], args[1]), args[2], args[3])
-
-    return signature(lanes_type, *[lanes_type] * 4), generate
+@elementwise(lanes_type)
+def select_gt(builder: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
+    """Return ``yes`` where a > b, ``no`` elsewhere."""
+    return builder.select(builder.fcmp_ordered(">", a, b), yes, no)
 
 
 @intrinsic
 def bits_gt(typing: Any, a: Any, b: Any) -> Any:
-    """An integer whose bit i says a > b in lane i."""
+    """Return an integer whose bit i says a > b in lane i."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         bits = builder.bitcast(builder.fcmp_ordered(">", *args), ir.IntType(LANES))
@@ -238,16 +229,12 @@ def bits_gt(typing: Any, a: Any, b: Any) -> Any:
 
 
 def _fold(take_low: list[int], take_high: list[int]) -> Any:
-    """An intrinsic that adds two shuffles of (a, b): one level of a transposing sum."""
+    """Make an intrinsic that adds two shuffles of (a, b): one level of a transposing sum."""
 
-    @intrinsic
-    def fold(typing: Any, a: Any, b: Any) -> Any:
-        def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            low = builder.shuffle_vector(*args, ir.Constant(INTEGERS, take_low))
-            high = builder.shuffle_vector(*args, ir.Constant(INTEGERS, take_high))
-            return builder.fadd(low, high)
-
-        return signature(lanes_type, lanes_type, lanes_type), generate
+    @elementwise(lanes_type)
+    def fold(builder: Any, a: Any, b: Any) -> Any:
+        low = builder.shuffle_vector(a, b, ir.Constant(INTEGERS, take_low))
+        return builder.fadd(low, builder.shuffle_vector(a, b, ir.Constant(INTEGERS, take_high)))
 
     return fold
 
@@ -269,7 +256,7 @@ fold8 = _fold(
 
 @intrinsic
 def lowest_bit(typing: Any, bits: Any) -> Any:
-    """Index of the lowest set bit of a nonzero integer."""
+    """Return the index of the lowest set bit of a nonzero integer."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
@@ -279,10 +266,10 @@ def lowest_bit(typing: Any, bits: Any) -> Any:
 
 @intrinsic
 def take_ticket(typing: Any, counter: Any) -> Any:
-    """Atomically add one to the first number of an int64 array and give its old value."""
+    """Atomically add one to the first number of an int64 array and return its old value."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        array = context.make_array(sig.args[0])(context, builder, args[0])
-        return builder.atomic_rmw("add", array.data, ir.Constant(ir.IntType(64), 1), "monotonic")
+        data = array_data(context, builder, sig.args[0], args[0])
+        return builder.atomic_rmw("add", data, ir.Constant(ir.IntType(64), 1), "monotonic")
 
     return signature(types.int64, counter), generate

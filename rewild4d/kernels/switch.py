@@ -1,9 +1,8 @@
 """Switch between the fused CPU kernels and their torch twins.
 
-A fused kernel repeats in numba what a function of the package says in torch: its twin. `--kernels torch` (or the
-environment variable `REWILD4D_KERNELS=torch`) runs the twins everywhere. A kernel whose twin was edited, replaced or
-overridden since the kernel was written steps aside by itself, and one line says so: a changed method is never measured
-with the old kernel.
+A fused kernel repeats in numba a torch function of the package: its twin. `--kernels torch` (or the environment
+variable `REWILD4D_KERNELS=torch`) runs the twins everywhere. A kernel whose twin was edited, replaced or overridden
+since it was written is not used, and one warning says so: a changed method is never computed by the old kernel.
 """
 
 import ast
@@ -30,7 +29,7 @@ logger = logging.getLogger(__name__)
 MODES = ("auto", "torch")
 VARIABLE = "REWILD4D_KERNELS"
 KERNELS: dict[str, "Kernel"] = {}
-"""Every fused kernel that was imported so far, by name."""
+"""All imported fused kernels by name."""
 _without: set[str] = set()
 
 
@@ -61,12 +60,12 @@ def kernel_mode() -> str:
 
 
 def chosen_kernels() -> dict[str, str]:
-    """Return the mode as a part of a run's id; the default one adds nothing."""
+    """Return the mode as part of a run's id; empty for the default."""
     return {} if kernel_mode() == "auto" else {"kernels": kernel_mode()}
 
 
 def describe_kernels() -> str:
-    """Say what a run computes with, for its record: the mode, and the kernels whose twins were edited."""
+    """Describe the kernels of a run for its record: the mode, and the kernels whose twins were edited."""
     edited = sorted(name for name, kernel in KERNELS.items() if not kernel.is_current())
     return kernel_mode() + (f", torch for {', '.join(edited)} (edited)" if edited else "")
 
@@ -84,11 +83,11 @@ def without_kernels(*names: str) -> Iterator[None]:
 
 
 class Kernel:
-    """One fused kernel and the torch code it stands for.
+    """One fused kernel and its torch twins.
 
     Args:
-        name: as records and `bench step` print it.
-        digest: `source_digest` of the twins when the kernel was written.
+        name: in records and in `bench step`.
+        digest: `source_digest` of the twins that the kernel was written for.
         twins: "module:function" or "module:Class.method" of all torch code that the kernel repeats.
     """
 
@@ -97,11 +96,11 @@ class Kernel:
         KERNELS[name] = self
 
     def takes(self, *tensors: Tensor, owner: object = None) -> bool:
-        """Tell whether the kernel computes this call: float32 tensors on the CPU, switched on, and its twin unchanged.
+        """Tell whether the kernel computes this call: float32 CPU tensors, switched on, twins unchanged.
 
         Args:
             tensors: all that the kernel reads.
-            owner: the object whose method asks; a subclass that overrides a twin gets its own code run.
+            owner: object whose method calls; a subclass that overrides a twin runs its own code.
         """
         self.calls += 1
         if not all(tensor.is_cpu and tensor.dtype == torch.float32 for tensor in tensors):
@@ -109,13 +108,13 @@ class Kernel:
         return self.name not in _without and kernel_mode() == "auto" and self.is_current(type(owner))
 
     def is_current(self, owner: type = type(None)) -> bool:
-        """Tell whether the twins are the ones that the kernel was written for."""
+        """Tell whether the twins are those that the kernel was written for."""
         return not self.twins or _verdict(self, tuple(_code(twin, owner) for twin in self.twins))
 
 
 @cache
 def _verdict(kernel: Kernel, codes: tuple[CodeType | None, ...]) -> bool:
-    """Compare the twins' digest once for each set of functions, and say where it differs."""
+    """Compare the digest once for each set of functions, and warn where it differs."""
     found = source_digest(codes)
     if found in (kernel.digest, ""):
         return True
@@ -127,7 +126,7 @@ def _verdict(kernel: Kernel, codes: tuple[CodeType | None, ...]) -> bool:
 
 
 def _code(twin: str, owner: type) -> CodeType | None:
-    """The code that runs where a twin is called now; None where its module is not loaded."""
+    """Return the code that runs where a twin is called now; None where its module is not loaded."""
     module, _, path = twin.partition(":")
     found: Any = sys.modules.get(module)
     if found is None:
@@ -138,7 +137,7 @@ def _code(twin: str, owner: type) -> CodeType | None:
 
 
 def source_digest(codes: tuple[CodeType | None, ...]) -> str:
-    """Digest the code of functions without docstrings, comments, annotations and layout; "" where no source is here."""
+    """Digest functions without docstrings, comments, annotations and layout; "" where there is no source."""
     parts = []
     for code in codes:
         if code is None:
@@ -151,7 +150,7 @@ def source_digest(codes: tuple[CodeType | None, ...]) -> str:
 
 
 class _Bare(ast.NodeTransformer):
-    """Strips what does not change a result."""
+    """Strip what does not change a result."""
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
         if ast.get_docstring(node) is not None:
@@ -163,7 +162,7 @@ class _Bare(ast.NodeTransformer):
 
 
 def twin_digest(kernel: Kernel) -> str:
-    """Digest a kernel's twins as they are now: what to write beside a kernel that was brought up to date."""
+    """Digest a kernel's twins as they are now, to write beside an updated kernel."""
     for twin in kernel.twins:
         importlib.import_module(twin.partition(":")[0])
     return source_digest(tuple(_code(twin, type(None)) for twin in kernel.twins))

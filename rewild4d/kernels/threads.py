@@ -1,4 +1,4 @@
-"""A small thread pool for kernels that release the GIL: survives fork, nests in any thread, follows torch's setting."""
+"""Thread pool for kernels that release the GIL: survives fork, nests in any thread, follows torch's setting."""
 
 import atexit
 import threading
@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from queue import SimpleQueue
 from typing import Any
 
+import numpy as np
 import torch
 
 from rewild4d.kernels.openmp import after_fork, let_idle_threads_go
@@ -66,18 +67,14 @@ _own_count: int | None = None
 
 
 def thread_count() -> int:
-    """How many threads to use: torch's own number, unless `set_kernel_threads` was given another."""
+    """Return the number of threads to use: torch's own, or that of `set_kernel_threads`."""
     return _own_count or torch.get_num_threads()
 
 
 def set_kernel_threads(count: int | None) -> int | None:
-    """Give the kernels a number of threads apart from torch's: their results are the same bits on any, torch's are not.
+    """Set the kernels' number of threads apart from torch's (None: torch's); return the former.
 
-    Args:
-        count: of this process from now on; None: torch's own number.
-
-    Returns:
-        What it was.
+    Kernels give the same bits on any number, torch does not.
     """
     global _own_count
     before, _own_count = _own_count, count
@@ -86,10 +83,9 @@ def set_kernel_threads(count: int | None) -> int | None:
 
 @contextmanager
 def torch_on_one() -> Iterator[None]:
-    """Leave the threads to the kernels: torch itself computes on one meanwhile.
+    """Let torch compute on one thread, and leave the others to the kernels.
 
-    After a parallel operation torch's OpenMP threads spin for some milliseconds, and a kernel that starts then has to
-    share its cores with them: on two cores it gained nothing from the second.
+    After a parallel operation torch's OpenMP threads spin for milliseconds and take cores from the next kernel.
     """
     threads = torch.get_num_threads()
     before = set_kernel_threads(thread_count())
@@ -104,8 +100,8 @@ def torch_on_one() -> Iterator[None]:
 def run(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> None:
     """Call a function once per argument tuple, all at the same time; raise the first error.
 
-    The caller's thread takes the first call, then those that no worker has begun: on a busy machine nobody waits for a
-    thread to wake. Pass at most `thread_count` calls: each further one takes a thread.
+    The caller's thread takes the first call, then those that no worker has begun. Pass at most `thread_count` calls:
+    each further one takes a thread.
     """
     if len(calls) > 1 and len(_workers) < len(calls) - 1:
         with _growing:
@@ -131,6 +127,11 @@ def run(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> None:
         _wait(begun)
 
 
+def run_tickets(kernel: Callable[..., Any], *args: Any, threads: int | None = None) -> None:
+    """Run a kernel on all threads at once; its first argument, a shared counter, hands out the units of work."""
+    run(kernel, [(np.zeros(1, np.int64), *args)] * (threads or thread_count()))
+
+
 def _wait(outcomes: list[_Outcome]) -> None:
     for outcome in outcomes:
         outcome.done.acquire()
@@ -140,6 +141,6 @@ def _wait(outcomes: list[_Outcome]) -> None:
 
 
 def spans(total: int, parts: int) -> list[tuple[int, int]]:
-    """Cut range(total) into at most ``parts`` pieces of nearly equal length, none empty."""
+    """Cut range(total) into at most ``parts`` non-empty pieces of nearly equal length."""
     parts = min(parts, total)
     return [(total * i // parts, total * (i + 1) // parts) for i in range(parts)]

@@ -1,4 +1,4 @@
-"""The canonical Gaussians: how they start from a surface, and their activated values."""
+"""Canonical Gaussians: their start from a surface, and their activated values."""
 
 import math
 
@@ -14,9 +14,9 @@ from rewild4d.transforms import quat_multiply, quat_to_matrix
 from rewild4d.types import OBJECT_DIAGONAL, Prior, Splats
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "colors")
-"""The learnable attributes, in the order of the optimizer's groups."""
+"""Learnable attributes, in the order of the optimizer's groups."""
 REST_GAIN = 20.0
-"""Under Adam a twentieth of the value is a twentieth of the learning rate (3DGS's for degrees above 0)."""
+"""Factor on the stored coefficients above degree 0: under Adam it divides their learning rate, as in 3DGS."""
 
 
 class Gaussians(nn.Module):
@@ -27,9 +27,9 @@ class Gaussians(nn.Module):
         quats: wxyz, not normalised, [n, 4].
         log_scales: [n, 3].
         logit_opacities: [n].
-        colors: RGB, then `REST_GAIN` times the harmonics' coefficients above degree 0 in the canonical frame,
-            [n, (degree + 1)^2, 3].
-        blur: standard deviation added to every Gaussian: none in training, then `Supervision.missing_blur`, scalar.
+        colors: RGB, then `REST_GAIN` times the coefficients above degree 0 in the canonical frame, [n, (degree + 1)^2,
+            3].
+        blur: standard deviation added to every Gaussian: 0 in training, then `Supervision.missing_blur`, scalar.
     """
 
     means: nn.Parameter
@@ -50,27 +50,27 @@ class Gaussians(nn.Module):
         return self.means.shape[0]
 
     def scales_log(self) -> Tensor:
-        """Log scales under the cap, without the blur, [n, 3]."""
+        """Return the log scales under the cap, without the blur, [n, 3]."""
         return self.log_scales.clamp(max=self.max_log_scale)
 
     def scales(self, log_scales: Tensor) -> Tensor:
-        """Standard deviations with the blur, [n, 3] -> [n, 3]."""
+        """Return standard deviations with the blur, [n, 3] -> [n, 3]."""
         return ((2 * log_scales).exp() + self.blur.square()).sqrt()
 
     def opacities(self) -> Tensor:
-        """In (0, 1), [n]."""
+        """Return opacities in (0, 1), [n]."""
         return self.logit_opacities.sigmoid()
 
     def rgb(self) -> Tensor:
-        """Colour without the harmonics, in [0, 1], [n, 3]."""
+        """Return the colour without harmonics, in [0, 1], [n, 3]."""
         return self.colors[:, 0].clamp(0.0, 1.0)
 
     def seen_rgb(self, means: Tensor, quats: Tensor, eye: Tensor, degree: int) -> Tensor:
-        """Colour from a viewpoint: its direction is turned back into the canonical frame first.
+        """Compute the colour from a viewpoint, whose direction is rotated into the canonical frame.
 
         Args:
-            means: posed, no gradient flows to them, [n, 3].
-            quats: posed, unit, no gradient flows to them, [n, 4].
+            means: posed, no gradient, [n, 3].
+            quats: posed, unit, no gradient, [n, 4].
             eye: camera centre in the same frame, [3].
             degree: of the harmonics in use.
 
@@ -82,32 +82,26 @@ class Gaussians(nn.Module):
         if COLORS.takes(means, owner=self):
             return seen_rgb(self.colors, means, quats, self.quats, eye, degree, REST_GAIN)
         directions = normalize(means.detach() - eye.to(means), dim=-1)
-        canonical = torch.einsum("na,nab->nb", directions, self.turns(quats.detach()))
+        canonical = torch.einsum("na,nab->nb", directions, self.rotations_to(quats.detach()))
         values = basis(canonical, degree)[:, 1:] / REST_GAIN
         rest = torch.einsum("nk,nkc->nc", values, self.colors[:, 1 : (degree + 1) ** 2])
         return (self.colors[:, 0] + rest).clamp_min(0)
 
-    def turns(self, quats: Tensor) -> Tensor:
-        """Rotation of each Gaussian from rest to an orientation, [n, 4] -> [n, 3, 3]."""
+    def rotations_to(self, quats: Tensor) -> Tensor:
+        """Return each Gaussian's rotation from rest to an orientation, [n, 4] -> [n, 3, 3]."""
         rest = normalize(self.quats.detach(), dim=-1)
         return quat_to_matrix(quat_multiply(quats, rest * rest.new_tensor((1.0, -1.0, -1.0, -1.0))))
 
     def splat_colors(self, quats: Tensor) -> Tensor:
-        """Colours as `Splats` has them, for Gaussians turned to ``quats``: RGB, or coefficients in their frame.
-
-        Args:
-            quats: unit, [n, 4].
-
-        Returns:
-            [n, (degree + 1)^2, 3].
-        """
+        """Return colours for `Splats` with unit ``quats`` [n, 4]: RGB or coefficients in their frame, [n, (degree +
+        1)^2, 3]."""
         if self.colors.shape[1] == 1:
             return self.rgb()[:, None]
         constant = (self.colors[:, :1] - 0.5) / C0
-        return rotated(torch.cat((constant, self.colors[:, 1:] / REST_GAIN), dim=1), self.turns(quats))
+        return rotated(torch.cat((constant, self.colors[:, 1:] / REST_GAIN), dim=1), self.rotations_to(quats))
 
     def splats(self) -> Splats:
-        """The canonical Gaussians, activated, detached."""
+        """Return the canonical Gaussians, activated, detached."""
         with torch.no_grad():
             quats = normalize(self.quats, dim=-1)
             return Splats(self.means, quats, self.scales(self.scales_log()), self.opacities(), self.splat_colors(quats))
@@ -116,21 +110,30 @@ class Gaussians(nn.Module):
 def initial_gaussians(
     prior: Prior, count: int, config: Canonical, generator: torch.Generator, shape: bool = True
 ) -> dict[str, Tensor]:
-    """Flat Gaussians on the rest surface (METHOD section 3): radius sqrt(area / pi n), normal along the third axis.
+    """Place flat Gaussians on the rest surface (METHOD section 3): radius sqrt(area / pi n), normal along the third
+    axis.
 
-    Without the shape: round ones anywhere in its bounding box, of half the side of the share of it that each one has.
+    Without the shape: round ones anywhere in its bounding box, whose size is half the side of each one's share of it.
 
     Args:
         prior: its rest surface is sampled.
         count: number of Gaussians.
         config: thickness and opacity at the start.
-        generator: the only source of chance.
-        shape: False takes nothing of the prior but its size.
+        generator: the only source of randomness.
+        shape: False uses only the prior's bounding box.
 
     Returns:
         The five attributes by name; colours are mid-grey.
     """
-    means, quats, scales = (_on_surface if shape else _in_box)(prior, count, config.thickness, generator)
+    if shape:
+        surface = sample_surface(prior, count, generator)
+        means, quats = surface.points, quats_from_normals(surface.normals)
+        scales = surface.radius * torch.tensor((1.0, 1.0, config.thickness))
+    else:
+        low, high = prior.vertices.float().aminmax(dim=0)
+        means = low + (high - low) * torch.rand(count, 3, generator=generator)
+        quats = normalize(torch.randn(count, 4, generator=generator), dim=-1)
+        scales = 0.5 * ((high - low).prod() / count) ** (1 / 3) * torch.ones(3)
     colors = torch.zeros(count, (config.sh_degree + 1) ** 2, 3)
     colors[:, 0] = 0.5
     return {
@@ -140,19 +143,3 @@ def initial_gaussians(
         "logit_opacities": torch.full((count,), math.log(config.opacity / (1 - config.opacity))),
         "colors": colors,
     }
-
-
-def _on_surface(
-    prior: Prior, count: int, thickness: float, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor]:
-    surface = sample_surface(prior, count, generator)
-    scales = surface.radius * torch.tensor((1.0, 1.0, thickness))
-    return surface.points, quats_from_normals(surface.normals), scales
-
-
-def _in_box(prior: Prior, count: int, thickness: float, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-    """Points as `_on_surface` gives them; round ones have no thickness of their own."""
-    low, high = prior.vertices.float().aminmax(dim=0)
-    means = low + (high - low) * torch.rand(count, 3, generator=generator)
-    quats = normalize(torch.randn(count, 4, generator=generator), dim=-1)
-    return means, quats, 0.5 * ((high - low).prod() / count) ** (1 / 3) * torch.ones(3)

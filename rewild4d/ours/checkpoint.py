@@ -1,5 +1,6 @@
-"""Checkpoints: the full state of a fit, written atomically, tied to what it was made from."""
+"""Checkpoints: the full state of a fit, written atomically, tied to its inputs."""
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,12 @@ import torch
 from rewild4d.files import digest, load_tensors, save_tensors
 from rewild4d.types import Clip, Prior
 
+logger = logging.getLogger(__name__)
 NAME = "checkpoint.pt"
 
 
 def fit_digest(config: msgspec.Struct, clip: Clip, prior: Prior, seed: int) -> str:
-    """Identifies a fit: two fits of one digest on one machine give one result."""
+    """Identify a fit: equal digests give equal results on one machine."""
     return digest(msgspec.json.encode(config), clip.digest, prior.digest, str(seed), torch.__version__)
 
 
@@ -22,17 +24,12 @@ def save_checkpoint(folder: Path, identity: str, state: dict[str, Any]) -> None:
     save_tensors({"digest": identity, "state": state}, folder / NAME)
 
 
-def load_checkpoint(folder: Path, identity: str) -> tuple[dict[str, Any] | None, str | None]:
-    """The state of an interrupted fit, or None, and a message where a checkpoint was found but cannot be used.
-
-    Args:
-        folder: where it may be.
-        identity: from `fit_digest`; a checkpoint of another fit is ignored.
-    """
-    path = folder / NAME
-    if not path.exists():
-        return None, None
+def load_checkpoint(folder: Path | None, identity: str) -> dict[str, Any] | None:
+    """Return the state of the interrupted fit ``identity`` (from `fit_digest`), or None; warn of another fit's."""
+    if folder is None or not (path := folder / NAME).exists():
+        return None
     content = load_tensors(path, "checkpoint (remove it to start anew)")
     if content.get("digest") != identity:
-        return None, f"{path}: is of another configuration, clip, prior or seed; starting anew."
-    return content["state"], None
+        logger.warning("%s: is of another configuration, clip, prior or seed; starting anew.", path)
+        return None
+    return content["state"]

@@ -1,4 +1,4 @@
-"""First colours of the canonical Gaussians: what the input images show where each one projects."""
+"""Initial colours of the canonical Gaussians, from the input images where they project."""
 
 import torch
 from scipy.spatial import cKDTree
@@ -12,17 +12,10 @@ from rewild4d.transforms import mirror_points, quat_to_matrix
 
 @torch.no_grad()
 def initial_colors(model: Model, supervision: Supervision) -> Tensor:
-    """Mean colour over the frames that see a Gaussian; for one that none sees, of the nearest mirrored Gaussian.
+    """Average the colour over the frames that see a Gaussian, [n, 3]; take the nearest mirrored one's where none does.
 
-    A Gaussian counts as seen where its normal faces the camera and its pixel lies well inside the mask; other parts in
-    front of it are ignored, training sorts that out.
-
-    Args:
-        model: with the poses after the warm-up.
-        supervision: the clip's views.
-
-    Returns:
-        RGB, [n, 3].
+    A Gaussian counts as seen where its normal faces the camera and its pixel lies well inside the mask; occlusion is
+    ignored.
     """
     own = model.gaussians
     weights = model.field.sample(model.field.probabilities(), own.means)
@@ -44,16 +37,7 @@ def initial_colors(model: Model, supervision: Supervision) -> Tensor:
 
 
 def project_colors(points: Tensor, normals: Tensor, target: Target) -> tuple[Tensor, Tensor]:
-    """Colour of each point in one image, and whether it may be trusted.
-
-    Args:
-        points: posed, in the object frame, [n, 3].
-        normals: their outward normals, [n, 3].
-        target: the image and its camera.
-
-    Returns:
-        RGB, [n, 3], and seen, boolean, [n].
-    """
+    """Read the colour of posed points [n, 3] in one image, and whether they are seen, by outward normals [n, 3]."""
     camera = target.camera
     pixels, depth = camera.project(points)
     grid = (pixels / points.new_tensor((camera.width, camera.height)) * 2 - 1)[None, None]

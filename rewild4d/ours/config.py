@@ -1,7 +1,8 @@
-"""The whole configuration of `ours`: one tree of frozen structs.
+"""Settings of `ours`: one tree of frozen structs.
 
-Section numbers are the design's method notes. "fraction" means a share of `Config.iterations`, so that presets of every
-length follow one schedule. Lengths without a unit are in the object frame, whose rest diagonal is 5.
+"Fraction" means a share of `Config.iterations`, so that presets of every length follow one schedule. Lengths without a
+unit are in the object frame, whose rest diagonal is 5. "Paper" marks values of the paper; section numbers are those of
+the method notes. Experiments: see docs/experiments/.
 """
 
 from typing import Annotated, Literal
@@ -26,35 +27,35 @@ def _require_heads(width: int, heads: int) -> None:
 
 
 class Canonical(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The canonical Gaussians (section 3)."""
+    """Canonical Gaussians (section 3)."""
 
     samples: Count = 15_000
     """Gaussians at the start: area-uniform samples of the prior's rest surface."""
     thickness: Positive = 0.5
-    """Scale along the normal over the scale in the surface: flat enough for a normal, thick enough edge-on."""
+    """Initial scale along the normal over the scale in the surface."""
     opacity: Opacity = 0.9
-    """At the start; 0.1 leaves the silhouette too weak when the pose loss begins."""
+    """Initial opacity, in (0, 1)."""
     sh_degree: Degree = 0
-    """Spherical harmonics of colour, 0 to 3; lighting is not mirror-symmetric and views are few (paper: 3)."""
+    """Degree of the spherical harmonics of colour, 0 to 3 (paper: 3)."""
     sh_every: Positive = 0.05
     """Fraction after which one more degree joins (1k of 20k)."""
     max_scale: Positive = 0.05
-    """Largest standard deviation, times the rest diagonal: one huge Gaussian hides a wrong pose."""
+    """Largest standard deviation, times the rest diagonal."""
 
 
 class Skinning(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The learnable skinning field (section 3)."""
+    """Learnable skinning field (section 3)."""
 
     resolution: Annotated[int, Meta(ge=2)] = 32
     """Voxels along each axis of the cubic field (paper)."""
     margin: Positive = 1.2
-    """Half-size of the cube over half the longest side of the rest shape, so that points can leave the surface."""
+    """Half-size of the cube over half the longest side of the rest shape."""
     neighbours: Count = 8
-    """Vertices averaged by inverse distance to fill a voxel; 30 mix both legs of a pair."""
+    """Vertices averaged by inverse distance to fill a voxel."""
     sweeps: Whole = 2
-    """Neighbour averages; 30 (SelfRecon) moved the posed prior by 5 times as much."""
+    """Rounds of neighbour averaging."""
     keep: Share = 0.7
-    """Share of itself that a voxel keeps in a sweep."""
+    """Share of itself that a voxel keeps in a round."""
     floor: Positive = 1e-3
     """Added before the logarithm, so that every part can still gain any voxel."""
     tied: bool = False
@@ -64,23 +65,23 @@ class Skinning(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Part anchors and the pose network (section 4)."""
+    """Part anchors and pose network (section 4)."""
 
     anchor_size: Count = 8
     """Length of a part anchor (paper)."""
     anchor_std: Weight = 1.0
-    """At 0.1 all joints turn alike for ever; 1 tells them apart."""
+    """Standard deviation of the initial anchors; small ones keep the joints alike."""
     frequencies: Count = 4
-    """Octaves of the time code; 4 fitted better than 6 in the measured prototype (24 frames)."""
+    """Octaves of the time code."""
     octave_frames: Whole = 24
-    """Frames of a clip that `frequencies` octaves are for; one octave more for each doubling; 0 leaves it at them. Six
-    for four: camel (72 training frames) 24.98 for 24.90 dB, cows (83) 23.45 for 23.26 (8: 23.36), one seed each."""
+    """Frames that `frequencies` octaves suffice for; each doubling of the clip adds an octave; 0 adds none."""
     encoding: Literal["group", "view"] = "group"
-    """Sign that turns time in the code: the group's m, or the image's v ("w/o Symm. Enc."); of no use where `tied`."""
+    """Sign that multiplies time in the code: the group's m, or the image's v ("w/o Symm. Enc."); unused where `tied`.
+    """
     explicit_group: bool = False
     """Append the group sign m to the code."""
     width: Count = 128
-    """Width of a token: a per-video network needs less than an animal-general one (256)."""
+    """Width of a token."""
     blocks: Count = 2
     """Pre-norm self-attention blocks."""
     heads: Count = 4
@@ -92,7 +93,7 @@ class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     time_noise_until: Weight = 0.5
     """Fraction at which the jitter ends."""
     tied: bool = False
-    """Pose of a flipped image = mirror image of that of the image, not its own (see baselines/presets/ours.toml)."""
+    """Derive the pose of a flipped image by mirroring that of the image (see baselines/presets/ours.toml)."""
 
     def __post_init__(self) -> None:
         _require_heads(self.width, self.heads)
@@ -104,9 +105,9 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     enabled: bool = True
     """False is the paper's "w/o Deform" ablation."""
     anchors: bool = True
-    """The query holds skinning weights times part anchors; False: the weights themselves ("w/o Part Anchors")."""
+    """Query with skinning weights times part anchors; False: with the weights themselves ("w/o Part Anchors")."""
     width: Count = 64
-    """Hidden width. 128 for 64: +0.03 dB on one horse, +0.3 on one cow (one seed), 0 on the cows of DAVIS."""
+    """Hidden width."""
     heads: Count = 4
     """Attention heads over the parts."""
     frequencies: Whole = 6
@@ -114,13 +115,14 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     reach: Positive = 0.1
     """Displacement per unit of output."""
     max_log_scale: Positive = 1.0
-    """Bound on the change of log scale (tanh): unbounded offsets make points fly off."""
+    """Bound on the change of log scale (tanh)."""
     half: bool = True
-    """Factors of the network's products in bfloat16 where a CPU multiplies such pairs (sums keep single precision)."""
+    """Round the factors of the network's products to bfloat16 where a CPU multiplies such pairs; sums stay in float32.
+    """
     sampled: Whole = 2000
-    """Gaussians that stand for all in the network's own gradients (ours/fused/sampled_rows.py); 0: all."""
+    """Gaussians sampled for the gradients of the network's parameters (ours/fused/sampled_rows.py); 0 uses all."""
     ramp_start: Weight = 0.05
-    """Fraction at which the deformation starts to fade in: the pose explains the motion first."""
+    """Fraction at which the deformation starts to fade in."""
     ramp_end: Weight = 0.15
     """Fraction at which it acts in full."""
     detach_features: bool = False
@@ -131,39 +133,37 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the prior's shape gives to the start, and its poses to what follows (sections 3 and 4)."""
+    """Use of the prior's shape at the start, and of its poses later (sections 3 and 4)."""
 
     shape: bool = True
     """Start on the prior's rest surface; False: anywhere in its box ("w/o Shape Prior"; skinning and poses keep it)."""
     blend: bool = False
-    """Blend the prior's poses into the network's (paper; off on Artemis: after a warm-up it only undoes that)."""
+    """Blend the prior's poses into the network's (paper)."""
     blend_until: Share = 0.35
     """Fraction at which the blend reaches zero (7k of 20k)."""
     pull: Weight = 0.3
-    """Weight of the squared distance to the prior's poses, falling linearly to zero at `pull_until` (paper: open). 50
-    for 5 in 1,500 steps, one seed each: horse +0.1, wolf +0.2, cow -0.5, fox -0.2 dB."""
+    """Weight of the squared distance to the prior's poses, falling linearly to zero (paper: open)."""
     pull_until: Weight = 1.0
     """Fraction at which the pull ends (paper: 4k of 20k); above 1 it is still on at the end."""
 
 
 class WarmUp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The pose warm-up: poses from blurred silhouettes, Gaussians frozen (section 11.3)."""
+    """Pose warm-up: poses from blurred silhouettes, Gaussians frozen (section 11.3)."""
 
     iterations: Whole = 0
-    """Steps on silhouettes. 600 of them after a fitted prior changed the held-out mask IoU by -.04 (horse, Walk) and
-    +.01 (wolf, Gallop), one seed each: off. A prior without poses needs it (section 11)."""
+    """Steps on silhouettes; needed only by a prior without poses (section 11)."""
     regress: Whole = 300
-    """Steps before those that only copy the prior's poses into the network (zero for both leaves the stage out)."""
+    """Steps before those that only copy the prior's poses into the network; zero for both skips the stage."""
     copies: Count = 48
-    """Poses a step of those; a handful has not reached the prior by the end."""
+    """Poses a step while copying."""
     views: Count = 4
-    """Images a step."""
+    """Images a step on silhouettes."""
     samples: Count = 2500
-    """Gaussians that stand for the body: silhouettes need few."""
+    """Gaussians that represent the body."""
     size: Size = 160
-    """Longest image side."""
+    """Longest image side, pixels."""
     blur: Weight = 0.06
-    """Blur at the start, times the side of the animal's box, falling linearly to zero: reaches limbs apart."""
+    """Initial blur, times the side of the animal's box, falling linearly to zero."""
     regress_rate: Positive = 2e-3
     """Learning rate of the pose network while it copies."""
     rate: Positive = 5e-4
@@ -176,66 +176,69 @@ class Loss(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """Image losses of the two branches (section 6)."""
 
     isolated: bool = True
-    """No gradient of the appearance reaches the joints (paper). Off: +.18 dB over eight animals of known cameras."""
+    """Keep gradients of the appearance from the joints (paper)."""
     pose_silhouette: Weight = 0.2
-    """BCE + Dice of the pose branch (paper)."""
+    """Weight of BCE + Dice of the pose branch (paper)."""
     l1: Weight = 0.8
-    """Colour of the deformed branch (paper)."""
+    """Weight of the L1 colour loss of the deformed branch (paper)."""
     ssim: Weight = 0.2
-    """One minus SSIM, deformed branch (paper)."""
+    """Weight of one minus SSIM, deformed branch (paper)."""
     silhouette: Weight = 0.1
-    """BCE + Dice of the deformed branch (paper)."""
+    """Weight of BCE + Dice of the deformed branch (paper)."""
     random_background: bool = True
-    """One random colour a step behind render and target: floaters cannot hide in a known background."""
+    """Compose render and target over one random colour a step, so that floaters cannot hide."""
 
 
 class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Regularisers: the paper's three, and a skeleton's (sections 6, 9, 11.6)."""
+    """Regularizers: the paper's three, and a skeleton's (sections 6, 9, 11.6)."""
 
     until: Weight = 0.5
     """Fraction at which the paper's three end (10k of 20k)."""
     tv: Weight = 10.0
-    """Total variation of the skinning probabilities (paper)."""
+    """Weight of the total variation of the skinning probabilities (paper)."""
     tv_delta: Positive = 0.05
-    """Where the Huber function turns linear (paper)."""
+    """Huber threshold of the total variation (paper)."""
     tv_every: Count = 1
     """Steps between evaluations, weight multiplied accordingly (the next two likewise)."""
     compact: Weight = 0.1
-    """Compactness of the parts (paper)."""
+    """Weight of the compactness of the parts (paper)."""
     compact_power: Positive = 2.0
-    """Exponent on the weights: a squared weight leaves less torso in every part."""
+    """Exponent on the skinning weights."""
     compact_every: Count = 4
-    """Steps between evaluations; +.02 dB in the mean of 24 pairs with `deform.sampled` (results)."""
+    """Steps between evaluations."""
     smooth: Weight = 0.1
-    """Smoothness of rendered normals (paper)."""
+    """Weight of the smoothness of rendered normals (paper)."""
     smooth_every: Count = 2
     """Steps between evaluations."""
     smooth_size: Size = 256
-    """Side of the square image of normals."""
+    """Side of the square image of normals, pixels."""
     limit: Weight = 1.0
-    """Pose: penalty on turning more than `limit_degrees` against the parent."""
+    """Pose: weight of rotations of more than `limit_degrees` against the parent."""
     limit_degrees: Positive = 70.0
-    """Wider than any joint of a quadruped needs between two bones of the template."""
+    """Joint limit, degrees."""
     attach: Weight = 20.0
-    """Pose: squared gap between a joint and its parent there, over the squared diagonal; not measured alone."""
+    """Pose: weight of the squared gap between a joint and its parent's copy, over the squared diagonal."""
     limb_plane: Weight = 0.0
-    """Pose: squared turn of a limb's bone against its parent out of the plane along the body (half radians)."""
+    """Pose: weight of a limb bone's squared rotation against its parent out of the plane along the body (half
+    radians)."""
     body_plane: Weight = 0.0
-    """Pose: the same of the other bones."""
+    """Pose: weight of the same of the other bones."""
     sideways: Weight = 0.0
-    """Pose: squared gap of a limb's joint and its parent across the body (diagonals), beside `attach`."""
+    """Pose: weight of a limb joint's squared gap across the body (diagonals), added to `attach`."""
     temporal: Weight = 10.0
-    """Pose: squared second difference over neighbouring frames; not measured alone."""
+    """Pose: weight of the squared second difference over neighbouring frames."""
     still: Weight = 0.0
-    """Pose: steps between neighbouring frames as Geman and McClure weigh them: what drifts slowly is held still."""
+    """Pose: weight of the steps between neighbouring frames under Geman and McClure's function: slow drift is held
+    still."""
     still_step: Positive = 1e-3
-    """Step of a rotation (half radians) or joint (diagonals) between drift and motion; tried: results."""
+    """Step of a rotation (half radians) or joint (diagonals) that separates drift from motion."""
     rigid: Weight = 1.0
-    """Deformed branch: change of distance between canonical neighbours; +0.3 dB on one horse (and fewer Gaussians)."""
+    """Deformed branch: weight of changed distances between canonical neighbours."""
     rigid_neighbours: Count = 5
-    """Neighbours a Gaussian is compared with."""
+    """Neighbours that a Gaussian is compared with."""
     steady: Weight = 0.1
-    """Deformed branch: squared change of log scale. Unchecked, scales grow while the deformation shrinks them again."""
+    """Deformed branch: weight of the squared change of log scale, against growing scales that the deformation shrinks.
+    """
 
 
 class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -248,17 +251,17 @@ class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     log_scales: Weight = 5e-3
     """Scales."""
     logit_opacities: Weight = 1e-2
-    """5e-2 makes moving legs transparent within 200 iterations, before the pose has moved."""
+    """Logits of the opacities."""
     colors: Weight = 2.5e-3
     """Colours."""
     skinning: Rate = (1e-3, 1e-4)
     """Logits of the field."""
     pose: Rate = (6e-4, 1e-5)
-    """Anchors and pose network; 2e-4 was 0.6 dB worse on one horse in 1,500 steps (with more Gaussians)."""
+    """Anchors and pose network."""
     rise: Weight = 0.02
-    """Fraction over which the networks' rates rise from zero: Adam's first steps would undo the warm-up."""
+    """Fraction over which the networks' rates rise from zero, since Adam's first steps would undo the warm-up."""
     deform: Rate = (8e-4, 1.6e-6)
-    """Deformation network. At (2e-3, 2e-5) animals differ by .1 dB at most (one seed); of films see `Footage`."""
+    """Deformation network; for footage see `Footage`."""
     clip: Positive = 1.0
     """Bound on the gradient norm of the networks."""
 
@@ -269,7 +272,7 @@ class Density(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     start: Weight = 0.025
     """Fraction of the first round (500 of 20k)."""
     end: Weight = 0.5
-    """Fraction of the last: unregularised points appear once the geometric losses stop."""
+    """Fraction of the last round."""
     every: Positive = 0.005
     """Fraction between rounds (100 of 20k)."""
     gradient: Weight = 4e-4
@@ -277,22 +280,19 @@ class Density(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     split_scale: Positive = 0.01
     """Split above this scale (times the rest diagonal), clone below."""
     prune_opacity: Share = 0.01
-    """Gaussians below this opacity are removed."""
+    """Remove Gaussians below this opacity."""
     prune_radius: Positive = 0.2
-    """Gaussians that cover more than this share of the image's longest side are removed."""
+    """Remove Gaussians that cover more than this share of the image's longest side."""
     cap: Count = 40_000
-    """Most Gaussians: memory, and the speed of every later step."""
+    """Most Gaussians."""
 
 
 class Footage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Other values for a film of which nobody knows the cameras. One camera follows the animal and sees the same side
-    from frame to frame, so that poses need less smoothing than between cameras that stand apart; and the prior has to
-    guess the camera too, so that its poses are held for a shorter time. Held-out PSNR of DAVIS cows, standard, seed 0,
-    every run made with `cameras` "both": 23.45 without; 23.52 with `deform` (its end 2e-5); 23.65 and `rigid`; 23.78
-    and `temporal`; 23.85 and `pull_until` and 10,000 Gaussians for 6,000; 24.16 with all that stands here and 200
-    steps a frame; 23.29 with rates that end at 1e-4 (`deform`, `pose`), `temporal` 3, 8,000 Gaussians and 125 steps a
-    frame. The camel, which had no part in the choice: 25.92 for 24.98. With `cameras` "own": cows 24.85, camel 26.29;
-    with 250 steps a frame too 24.85 and 26.41, LPIPS .135 for .143 and .119 for .123."""
+    """Values that replace others for footage of unknown cameras.
+
+    One camera follows the animal, so poses need less smoothing than between cameras that stand apart; and the prior's
+    cameras are guesses, so its poses are held for a shorter time. Measurements: docs/experiments/.
+    """
 
     use: bool = True
     """False: the values below are not used (the paper has none of them)."""
@@ -309,32 +309,28 @@ class Footage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     deform: Rate = (2e-3, 1e-5)
     """Instead of `rates.deform`."""
     cameras: Literal["both", "own"] = "own"
-    """Instead of `cameras`: fits of a film and of its mirror image disagree by some pixels (cows: 3 of 512 in the mean,
-    10 at worst), and poses cannot follow both. Cows, 60 steps a frame, one seed: 23.78 for 23.23 dB; the first group
-    alone 23.70; with poses of its own for each group (`pose.encoding` group) 23.11."""
+    """Instead of `cameras`: fits of a film and of its mirror image disagree by some pixels."""
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """`ours`; the defaults are the paper's profile, presets change them."""
+    """Settings of `ours`; the defaults are the paper's profile, presets change them."""
 
     image_size: Size = 512
-    """Longest image side it trains at; larger clips are reduced."""
+    """Longest training image side, pixels; larger clips are reduced."""
     iterations: Count = 20_000
     """Steps of the main stage (paper)."""
     steps_per_frame: Whole = 0
-    """At least so many steps for every frame of the clip; 0 leaves it at `iterations`."""
+    """Least steps for every frame of the clip; 0 leaves it at `iterations`."""
     short_frames: Whole = 0
-    """Clips of so many frames or fewer take `short_iterations` steps (paper: APTv2's 15, less its test frames)."""
+    """Most frames of a clip that takes `short_iterations` steps (paper: APTv2's 15, less its test frames)."""
     short_iterations: Count = 10_000
     """Most steps on a short clip (paper)."""
     mirrored: Share = 0.5
-    """Share of the steps that see a mirror image (paper: half). Mirror images teach the side that no camera saw; what
-    cameras did see they pull towards its mirror image. .125 for .5 (standard, poses tied, one seed each, sweep, held-
-    out PSNR): pinto horse 25.6 for 24.4, tiger 22.6 for 22.2; symmetric coats: cow 27.4 for 27.3, fox 20.5 for 20.7."""
+    """Share of the steps that see a mirror image (paper: half). Mirror images teach the side that no camera saw, and
+    pull what cameras did see towards its mirror image."""
     cameras: Literal["both", "own"] = "both"
-    """Cameras that an image is seen from: those of both groups (paper), or those alone that were fitted to it: frames
-    from the first group's, mirror images from the second's (m = v). Where cameras are known both show the same views,
-    and only `pose.encoding` "group" tells them apart."""
+    """Cameras of an image: those of both groups (paper), or only those fitted to it ("own", m = v): frames from the
+    first group's, mirror images from the second's. Equal views where cameras are known."""
     checkpoint_every: Count = 500
     """Steps between checkpoints, where a work folder is given."""
     canonical: Canonical = Canonical()

@@ -1,4 +1,4 @@
-"""The part-conditioned deformation: every Gaussian asks the parts, by cross-attention, how to move beyond skinning."""
+"""Part-conditioned deformation: cross-attention from every Gaussian to the parts, beyond skinning."""
 
 from typing import NamedTuple
 
@@ -9,14 +9,14 @@ from rewild4d.kernels.simd import LANES
 from rewild4d.ours.config import Deform as DeformConfig
 from rewild4d.ours.fused.deformation import DEFORMATION, deform
 from rewild4d.ours.fused.folding import Layers, fold
-from rewild4d.ours.fused.queries import Reach
+from rewild4d.ours.fused.queries import Scales
 from rewild4d.ours.pose import seed_linears
 from rewild4d.transforms import quat_multiply
 from rewild4d.types import OBJECT_DIAGONAL
 
 
 class Posed(NamedTuple):
-    """Geometry of Gaussians after skinning or deformation: [n, 3], [n, 4] (unit), log scales [n, 3]."""
+    """Gaussians after skinning or deformation: means [n, 3], unit quats [n, 4], log scales [n, 3]."""
 
     means: Tensor
     quats: Tensor
@@ -24,10 +24,10 @@ class Posed(NamedTuple):
 
 
 class DeformNetwork(nn.Module):
-    """Query: part mixture, place, orientation and size of a Gaussian; keys and values: the parts' features.
+    """Query: part mixture, position, orientation and size of a Gaussian; keys and values: the parts' features.
 
-    The output layer starts at zero, so the deformed Gaussians start as the skinned ones. Query and output projections
-    of the attention are folded into the few keys and values, so a Gaussian costs two small matrix products.
+    The output layer starts at zero, so deformed Gaussians start as the skinned ones. Query and output projections of
+    the attention are folded into the few keys and values, so a Gaussian costs two small matrix products.
     """
 
     def __init__(self, parts: int, features: int, config: DeformConfig, generator: torch.Generator) -> None:
@@ -55,49 +55,46 @@ class DeformNetwork(nn.Module):
 
         Args:
             features: part features F_J, [J, K].
-            weights: skinning weights, taken as given, [n, J].
-            anchors: of the parts; their mixture tells a Gaussian's place on the body. None: the weights do, [J, D].
+            weights: skinning weights, no gradient, [n, J].
+            anchors: of the parts, [J, D]; their mixture, or the weights where None, locates a Gaussian on the body.
             posed: skinned Gaussians; gradients pass through to them, but not through the query.
             strength: the ramp, in [0, 1].
-            offset: decides which Gaussians stand for all in the gradients of the parameters (`config.sampled`; the
-                plain path sums over all), in [0, 1).
-
-        Returns:
-            Deformed Gaussians.
+            offset: of the draw of `config.sampled` Gaussians in the parameters' gradients, in [0, 1); torch sums over
+                all.
         """
         weights = weights.detach()
         if DEFORMATION.takes(posed.means, owner=self) and (anchors is None or anchors.shape[1] <= LANES):
             return Posed(*self._fused(features, weights, anchors, posed, strength, offset))
         parts = weights if anchors is None else weights @ anchors
-        query = torch.cat((parts, self._place(posed)), dim=-1)
+        query = torch.cat((parts, self._position_code(posed)), dim=-1)
         hidden = self._attend(query, features) + self.skip(query)
         hidden = hidden + self.down(torch.relu(self.up(torch.relu(hidden))))
         out = strength * self.out(torch.relu(hidden))
-        turn = torch.cat((torch.ones_like(out[:, :1]), out[:, 3:6]), dim=-1)
+        rotation = torch.cat((torch.ones_like(out[:, :1]), out[:, 3:6]), dim=-1)
         return Posed(
             posed.means + self.config.reach * out[:, :3],
-            quat_multiply(posed.quats, nn.functional.normalize(turn, dim=-1)),
+            quat_multiply(posed.quats, nn.functional.normalize(rotation, dim=-1)),
             posed.log_scales + self.config.max_log_scale * out[:, 6:].tanh(),
         )
 
-    def _place(self, posed: Posed) -> Tensor:
-        """Position code, orientation (w >= 0) and log scale, detached, [n, 46]."""
+    def _position_code(self, posed: Posed) -> Tensor:
+        """Return position code, orientation (w >= 0) and log scale, detached, [n, 46]."""
         means, quats, log_scales = (tensor.detach() for tensor in posed)
-        place = means * (2 / OBJECT_DIAGONAL)
-        octaves = 2.0 ** torch.arange(self.config.frequencies, dtype=place.dtype, device=place.device)
-        angles = (place[:, None] * octaves[:, None]).flatten(1)
+        position = means * (2 / OBJECT_DIAGONAL)
+        octaves = 2.0 ** torch.arange(self.config.frequencies, dtype=position.dtype, device=position.device)
+        angles = (position[:, None] * octaves[:, None]).flatten(1)
         upright = torch.where(quats[:, :1] < 0, -quats, quats)
-        return torch.cat((place, angles.sin(), angles.cos(), upright, log_scales), dim=-1)
+        return torch.cat((position, angles.sin(), angles.cos(), upright, log_scales), dim=-1)
 
     def _attend(self, query: Tensor, features: Tensor) -> Tensor:
-        """Multi-head cross-attention over the parts, [n, inputs] and [J, K] -> [n, width]."""
+        """Apply multi-head cross-attention over the parts, [n, inputs] and [J, K] -> [n, width]."""
         asked, asked_bias, mixed = self._attention(features)
         scores = torch.addmm(asked_bias, query, asked.T).view(len(query), self.config.heads, len(features))
         return torch.addmm(self.project.bias, scores.softmax(dim=-1).flatten(1), mixed.T)
 
     def _attention(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The attention over the parts as matrices: scores from a query [H J, inputs], their bias [H J], and the hidden
-        features from the shares [width, H J]; from [J, K]."""
+        """Return the attention over parts [J, K] as matrices: scores from a query [H J, inputs], their bias [H J], and
+        hidden features from the shares [width, H J]."""
         heads, width = self.config.heads, self.config.width
         size = width // heads
         key = self.key(features).view(-1, heads, size)
@@ -115,7 +112,7 @@ class DeformNetwork(nn.Module):
         numbers = Layers(*(number for layer in layers for number in (layer.weight, layer.bias)))
         flat, sizes = fold(features, numbers, config.heads)
         parts = weights.shape[1] if anchors is None else anchors.shape[1]
-        reach = Reach(
+        scales = Scales(
             2 / OBJECT_DIAGONAL, config.frequencies, parts, float(strength), config.reach, config.max_log_scale
         )
-        return deform(flat, sizes, reach, config.half, weights, anchors, *posed, config.sampled, offset)
+        return deform(flat, sizes, scales, config.half, weights, anchors, *posed, config.sampled, offset)

@@ -35,7 +35,7 @@ class DensityControl:
 
     @torch.no_grad()
     def round(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer, generator: torch.Generator) -> None:
-        """Refine where the mean gradient is large, as many as the cap allows, then prune; statistics start anew."""
+        """Refine where the mean gradient is large, as many as the cap allows, then prune; reset the statistics."""
         config = self.config
         mean = self.gradient / self.seen.clamp_min(1)
         opacities, scales = gaussians.opacities(), gaussians.scales_log().exp()
@@ -52,8 +52,8 @@ class DensityControl:
         values = {name: getattr(gaussians, name).detach()[source].clone() for name in NAMES}
         fresh = slice(len(stay) + len(clone), None)
         offset = torch.randn(2 * len(split), 3, generator=generator).to(scales) * scales[source[fresh]]
-        turn = quat_to_matrix(gaussians.quats.detach()[source[fresh]])
-        values["means"][fresh] += (turn @ offset[..., None])[..., 0]
+        rotation = quat_to_matrix(gaussians.quats.detach()[source[fresh]])
+        values["means"][fresh] += (rotation @ offset[..., None])[..., 0]
         # Two halves of 1 / 1.6 of the size cover the parent (3DGS).
         values["log_scales"][fresh] = scales[source[fresh]].log() - torch.log(torch.tensor(1.6))
         replace_gaussians(gaussians, optimizer, values, source, len(stay))
@@ -63,14 +63,9 @@ class DensityControl:
 def replace_gaussians(
     gaussians: Gaussians, optimizer: torch.optim.Optimizer, values: dict[str, Tensor], source: Tensor, kept: int
 ) -> None:
-    """Exchange the learnable tensors; the first ``kept`` rows keep their Adam moments, the others start from zero.
+    """Replace the learnable tensors by ``values``, whose rows come from the old rows ``source``.
 
-    Args:
-        gaussians: changed in place.
-        optimizer: Adam whose groups follow `NAMES`.
-        values: new tensors by name, [n', ...].
-        source: old row of each new row, [n'].
-        kept: rows that only moved.
+    The first ``kept`` rows keep their Adam moments, the others start from zero.
     """
     for group, name in zip(optimizer.param_groups, NAMES, strict=True):
         old = group["params"][0]

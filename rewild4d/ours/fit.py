@@ -1,6 +1,5 @@
-"""The training loop: warm-up, then the stage-aware losses of METHOD section 6; one object holds all state."""
+"""Training loop: warm-up, then the stage-aware losses of METHOD section 6."""
 
-import logging
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,13 +13,13 @@ from rewild4d.kernels.threads import torch_on_one
 from rewild4d.ours.canonical import NAMES
 from rewild4d.ours.checkpoint import fit_digest, load_checkpoint, save_checkpoint
 from rewild4d.ours.coloring import initial_colors
-from rewild4d.ours.config import Config, Rates
+from rewild4d.ours.config import Config
 from rewild4d.ours.deform import Posed
 from rewild4d.ours.density import DensityControl
 from rewild4d.ours.gradients import all_finite, clip_gradients
 from rewild4d.ours.losses.images import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.losses.regularizers import compact_loss, neighbours, rigid_loss, smooth_loss
-from rewild4d.ours.losses.skeleton import neighbour_keys, stance
+from rewild4d.ours.losses.skeleton import neighbour_keys, posture
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.pose import blend_poses, pose_distance
 from rewild4d.ours.schedule import exponential, fade, ramp
@@ -29,7 +28,6 @@ from rewild4d.ours.warmup import WarmUp
 from rewild4d.rasterizer import RasterInfo, rasterize
 from rewild4d.types import Clip, Prior
 
-logger = logging.getLogger(__name__)
 LOG_EVERY = 20
 
 
@@ -37,7 +35,7 @@ class Training:
     """The main stage.
 
     Attributes:
-        model: everything that learns.
+        model: all that learns.
         gaussian_optimizer: one group per attribute, in the order of `canonical.NAMES`.
         network_optimizer: groups skinning, pose, deform.
     """
@@ -45,8 +43,10 @@ class Training:
     def __init__(self, model: Model, supervision: Supervision, config: Config, generator: torch.Generator) -> None:
         self.model, self.supervision, self.config, self.generator = model, supervision, config, generator
         own, rates = model.gaussians, config.rates
+        # The rate of the means is set at every step.
+        fixed = {name: 0.0 if name == "means" else getattr(rates, name) for name in NAMES}
         self.gaussian_optimizer = torch.optim.Adam(
-            [{"params": [getattr(own, name)], "lr": _fixed_rate(rates, name)} for name in NAMES], eps=1e-15, fused=True
+            [{"params": [getattr(own, name)], "lr": fixed[name]} for name in NAMES], eps=1e-15, fused=True
         )
         self.groups = {
             "skinning": list(model.field.parameters()),
@@ -61,7 +61,7 @@ class Training:
         self.near: Tensor | None = None
 
     def step(self, index: int) -> dict[str, float]:
-        """One iteration; returns the figures for the log."""
+        """Take one step; return the figures for the log."""
         progress = index / self.config.iterations
         self._set_rates(progress)
         key = self.supervision.draw(self.generator, self.config.mirrored, self.config.cameras)
@@ -84,16 +84,7 @@ class Training:
         return {"loss": sum(figures.values()), "gaussians": len(self.model.gaussians)} | figures
 
     def losses(self, key: Key, target: Target, index: int) -> tuple[dict[str, Tensor], RasterInfo | None]:
-        """All weighted losses of one view.
-
-        Args:
-            key: the view.
-            target: its image.
-            index: the iteration.
-
-        Returns:
-            Scalars by name, and the render info of the deformed branch.
-        """
+        """Compute all weighted losses of a view at an iteration, and the render info of the deformed branch."""
         config, model = self.config, self.model
         progress = index / config.iterations
         keys, own = neighbour_keys([key], self.supervision.frames, config.geometry)
@@ -102,7 +93,7 @@ class Training:
         if config.prior.blend:
             prior_pose = self.supervision.prior_pose(keys)
             poses = blend_poses(poses, *prior_pose, fade(progress, config.prior.blend_until))
-        pose, transforms, skeleton = stance(model, poses, own, config.geometry)
+        pose, transforms, skeleton = posture(model, poses, own, config.geometry)
         probabilities = model.field.probabilities()
         delta = config.geometry.tv_delta if self._varies(index) else None
         weights, variation = model.field.sample_and_vary(probabilities, model.gaussians.means, delta)
@@ -130,7 +121,7 @@ class Training:
         return losses, info
 
     def _times(self, keys: list[Key], progress: float) -> Tensor:
-        """(i + 1) / T, jittered by a share of a frame early on; neighbours share the jitter."""
+        """Return (i + 1) / T, jittered early on by a share of a frame that neighbours share."""
         frames, pose = self.supervision.frames, self.config.pose
         noise = float(torch.randn((), generator=self.generator)) * pose.time_noise
         noise *= fade(progress, pose.time_noise_until)
@@ -148,7 +139,7 @@ class Training:
         return image[0], alpha[0], info
 
     def _image_losses(self, pose_alpha: Tensor, rgb: Tensor, alpha: Tensor, target: Target) -> dict[str, Tensor]:
-        """L_pose and L_deform of one view."""
+        """Compute L_pose and L_deform of one view."""
         weights = self.config.loss
         window = union_window([pose_alpha, alpha, target.mask], WINDOW - 1)
         background = torch.rand(3, generator=self.generator).to(rgb) if weights.random_background else rgb.new_ones(3)
@@ -161,7 +152,7 @@ class Training:
         }
 
     def _varies(self, index: int) -> bool:
-        """Whether the total variation of the skinning field counts in this step."""
+        """Tell whether the total variation of the skinning field counts in this step."""
         config = self.config.geometry
         lasts = index < config.until * self.config.iterations and self.config.skinning.learn
         return lasts and config.tv > 0 and index % config.tv_every == 0
@@ -169,7 +160,7 @@ class Training:
     def _geometry_losses(
         self, index: int, weights: Tensor, opacities: Tensor, posed: Posed, deformed: Posed
     ) -> dict[str, Tensor]:
-        """Compactness and smoothness while they last, and neighbour rigidity."""
+        """Compute compactness and smoothness while they last, and neighbour rigidity."""
         config, own = self.config.geometry, self.model.gaussians
         losses: dict[str, Tensor] = {}
         if index < config.until * self.config.iterations:
@@ -190,13 +181,12 @@ class Training:
     def _set_rates(self, progress: float) -> None:
         rates = self.config.rates
         self.gaussian_optimizer.param_groups[NAMES.index("means")]["lr"] = exponential(*rates.means, progress)
-        for group, pair in zip(
-            self.network_optimizer.param_groups, (rates.skinning, rates.pose, rates.deform), strict=True
-        ):
+        pairs = rates.skinning, rates.pose, rates.deform
+        for group, pair in zip(self.network_optimizer.param_groups, pairs, strict=True):
             group["lr"] = exponential(*pair, progress) * ramp(progress, 0.0, rates.rise)
 
     def _check_gradients(self, index: int) -> None:
-        """Bound the networks' gradients; a value that is not finite stops the fit with its name."""
+        """Clip the networks' gradients; raise where a gradient is not finite."""
         norms = [clip_gradients(self.groups[name], self.config.rates.clip) for name in ("pose", "deform")]
         if all(map(math.isfinite, norms)) and all_finite(list(self.model.gaussians.parameters())):
             return
@@ -214,7 +204,7 @@ class Training:
             self.near = None
 
     def state(self) -> dict[str, Any]:
-        """Everything that a resumed run needs beside the generator."""
+        """Return all that a resumed run needs beside the generator."""
         return {
             "model": self.model.state_dict(),
             "gaussian_optimizer": self.gaussian_optimizer.state_dict(),
@@ -234,28 +224,15 @@ class Training:
         self.gaussian_optimizer.load_state_dict(state["gaussian_optimizer"])
         self.network_optimizer.load_state_dict(state["network_optimizer"])
         device = self.model.pivots.device
-        self.density.gradient, self.density.seen, self.density.radius = (
-            part.to(device).clone() for part in state["density"]
-        )
+        density = (part.to(device).clone() for part in state["density"])
+        self.density.gradient, self.density.seen, self.density.radius = density
         self.near = state["near"]
 
 
 def train(
     clip: Clip, prior: Prior, config: Config, seed: int, device: torch.device, log: Log, workdir: Path | None
 ) -> Model:
-    """Fit the model to a clip.
-
-    Args:
-        clip: the frames.
-        prior: a start.
-        config: every choice.
-        seed: of the one generator.
-        device: where to compute.
-        log: progress over both stages.
-        workdir: where checkpoints go; a checkpoint of the same fit there is continued.
-
-    Returns:
-        The trained model.
+    """Fit the model to a clip; a checkpoint of the same fit in ``workdir`` is continued.
 
     Raises:
         UserError: the clip or the prior cannot be used.
@@ -267,52 +244,22 @@ def train(
     warmup = WarmUp(model, small, prior, config, generator)
     main = Training(model, supervision, config, generator)
     identity = fit_digest(config, clip, prior, seed)
-    saved = _resume(workdir, identity)
-    start = 0
-    if saved is not None:
+    start, total = 0, warmup.total + config.iterations
+    if saved := load_checkpoint(workdir, identity):
         start = saved["step"]
         main.restore(saved["main"])
         warmup.optimizer.load_state_dict(saved["warmup"])
         generator.set_state(saved["generator"])
     with torch_on_one():
-        for index in range(start, warmup.total + config.iterations):
-            _iterate(index, warmup, main, log)
-            if workdir is not None and (index + 1) % config.checkpoint_every == 0:
-                _save(workdir, identity, index + 1, warmup, main)
+        for index in range(start, total):
+            if index == warmup.total:
+                model.gaussians.colors.data[:, 0] = initial_colors(model, supervision)
+            figures = warmup.step(index) if index < warmup.total else main.step(index - warmup.total)
+            done = index + 1
+            if index % LOG_EVERY == 0 or done == total:
+                log(done, total, figures)
+            if workdir is not None and done % config.checkpoint_every == 0 and done < total:
+                state = {"step": done, "main": main.state(), "warmup": warmup.optimizer.state_dict()}
+                save_checkpoint(workdir, identity, state | {"generator": generator.get_state()})
     model.gaussians.blur.fill_(supervision.missing_blur())
     return model
-
-
-def _iterate(index: int, warmup: WarmUp, main: Training, log: Log) -> None:
-    total = warmup.total + main.config.iterations
-    if index == warmup.total:
-        main.model.gaussians.colors.data[:, 0] = initial_colors(main.model, main.supervision)
-    figures = warmup.step(index) if index < warmup.total else main.step(index - warmup.total)
-    if index % LOG_EVERY == 0 or index + 1 == total:
-        log(index + 1, total, figures)
-
-
-def _save(workdir: Path, identity: str, step: int, warmup: WarmUp, main: Training) -> None:
-    if step == warmup.total + main.config.iterations:
-        return
-    state = {
-        "step": step,
-        "main": main.state(),
-        "warmup": warmup.optimizer.state_dict(),
-        "generator": main.generator.get_state(),
-    }
-    save_checkpoint(workdir, identity, state)
-
-
-def _fixed_rate(rates: Rates, name: str) -> float:
-    """Learning rate of a Gaussian attribute; that of the means is set at every step."""
-    return 0.0 if name == "means" else getattr(rates, name)
-
-
-def _resume(workdir: Path | None, identity: str) -> dict[str, Any] | None:
-    if workdir is None:
-        return None
-    saved, message = load_checkpoint(workdir, identity)
-    if message:
-        logger.warning(message)
-    return saved

@@ -1,4 +1,4 @@
-"""Clipping of gradients."""
+"""Clip gradients."""
 
 import torch
 from torch import Tensor, nn
@@ -8,7 +8,7 @@ from rewild4d.ours.fused.gradients import GRADIENTS, measure, scale
 
 
 def clip_gradients(parameters: list[nn.Parameter], limit: float) -> float:
-    """Scale gradients down to a norm of at most ``limit``; gives the norm before, not finite where a gradient is not.
+    """Scale gradients down to a norm of at most ``limit``; return the norm before, not finite where a gradient is not.
 
     As `torch.nn.utils.clip_grad_norm_`, whose norms of many small tensors are slow on a CPU.
     """
@@ -25,7 +25,7 @@ def clip_gradients(parameters: list[nn.Parameter], limit: float) -> float:
 
 
 def all_finite(parameters: list[nn.Parameter]) -> bool:
-    """Whether no gradient holds an infinity or a NaN."""
+    """Tell whether all gradients are finite."""
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     if GRADIENTS.takes(*gradients) and all(map(packed, gradients)):
         return measure(gradients)[1]

@@ -1,4 +1,4 @@
-"""`ours` as a competitor: the contract around the fit."""
+"""`ours` as a method of the benchmark."""
 
 from pathlib import Path
 from typing import ClassVar
@@ -39,5 +39,5 @@ class Ours:
         return from_fit(model, config, clip, prior, rows)
 
     def load(self, folder: Path, device: torch.device) -> OursReconstruction:
-        """Read back a saved reconstruction."""
+        """Read a saved reconstruction."""
         return load_reconstruction(folder, device)

@@ -1,4 +1,4 @@
-"""Everything that learns, in one module, and the two branches that use it."""
+"""The learnable model, and its two branches."""
 
 import torch
 from torch import Tensor, nn
@@ -48,7 +48,8 @@ class Model(nn.Module):
         self.register_buffer("parents", parents)
 
     def pose(self, times: Tensor, keys: list[Key]) -> Pose:
-        """Poses of views at (possibly jittered) times (i + 1) / T, [B]; mirror images of one pose where tied."""
+        """Compute poses of views at (possibly jittered) times (i + 1) / T, [B]; where tied, mirror images share a
+        pose."""
         config = self.config.pose
         if config.tied:
             ones = torch.ones(len(keys))
@@ -60,41 +61,28 @@ class Model(nn.Module):
         return self.network(time_code(times, sign, view, config.frequencies, config.explicit_group).to(self.pivots))
 
     def transforms(self, pose: Pose) -> Tensor:
-        """Rest -> posed transforms of a batch of poses, [B, J, 4, 4]."""
+        """Return rest -> posed transforms of a batch of poses, [B, J, 4, 4]."""
         return joint_transforms(pose.quats, pose.shifts, self.pivots)
 
     def skin(self, weights: Tensor, quats: Tensor, transforms: Tensor) -> tuple[Posed, Posed]:
-        """Blended skinning of the canonical Gaussians, for the pose branch and for the appearance branch.
+        """Skin the canonical Gaussians by weights [n, J] for the pose branch and for the appearance branch.
 
         Both have the same values; gradients of the second do not reach the joints, unless `loss.isolated` is off.
-
-        Args:
-            weights: of each Gaussian, [n, J].
-            quats: rotation of each joint, [J, 4].
-            transforms: rest -> posed, [J, 4, 4].
         """
         own, log_scales = self.gaussians, self.gaussians.scales_log()
         if SKINNING.takes(own.means, owner=self):
-            live_means, live_quats, means, turned = skin_both(own.means, own.quats, weights, transforms, quats)
+            live_means, live_quats, means, quats = skin_both(own.means, own.quats, weights, transforms, quats)
             live = Posed(live_means, live_quats, log_scales)
-            return live, Posed(means, turned, log_scales) if self.config.loss.isolated else live
+            return live, Posed(means, quats, log_scales) if self.config.loss.isolated else live
         rest = nn.functional.normalize(own.quats, dim=-1)
         live, still = (
-            Posed(skin_points(own.means, weights, matrices), skin_quats(rest, weights, turns), log_scales)
-            for matrices, turns in ((transforms, quats), (transforms.detach(), quats.detach()))
+            Posed(skin_points(own.means, weights, matrices), skin_quats(rest, weights, rotations), log_scales)
+            for matrices, rotations in ((transforms, quats), (transforms.detach(), quats.detach()))
         )
         return live, still if self.config.loss.isolated else live
 
     def deformed(self, pose: Pose, weights: Tensor, posed: Posed, strength: float, offset: float = 0.0) -> Posed:
-        """Skinned Gaussians after the deformation network.
-
-        Args:
-            pose: of one code; its features steer the network.
-            weights: of each Gaussian, [n, J].
-            posed: skinned Gaussians of the appearance branch.
-            strength: of the deformation, in [0, 1].
-            offset: see `DeformNetwork.forward`.
-        """
+        """Apply the deformation network to skinned Gaussians at a pose of one code; see `DeformNetwork.forward`."""
         if strength == 0 or not self.config.deform.enabled:
             return posed
         features = pose.features[0].detach() if self.config.deform.detach_features else pose.features[0]
@@ -102,13 +90,13 @@ class Model(nn.Module):
         return self.deform(features, weights, anchors, posed, strength, offset)
 
     def moved(self, pose: Pose, weights: Tensor, strength: float) -> tuple[Posed, Posed]:
-        """Skinned Gaussians, and the same deformed, of the appearance branch at a pose of one code."""
+        """Return skinned Gaussians of the appearance branch at a pose of one code, and the same deformed."""
         posed = self.skin(weights, pose.quats[0], self.transforms(pose)[0])[1]
         return posed, self.deformed(pose, weights, posed, strength)
 
 
 def build_model(config: Config, prior: Prior, generator: torch.Generator) -> Model:
-    """The model at its start: Gaussians on the prior's rest surface, the field filled from its weights."""
+    """Build the initial model: Gaussians on the prior's rest surface, the field filled from its weights."""
     values = initial_gaussians(prior, config.canonical.samples, config.canonical, generator, config.prior.shape)
     field = build_field(prior.vertices.float(), prior.weights.float(), prior.mirror.long(), config.skinning)
     skeleton = (prior.bones[:, 0].float(), prior.parents.long(), prior.mirror.long())

@@ -1,4 +1,4 @@
-"""The animal's root motion and the input cameras between the frames of a clip."""
+"""Root motion and input cameras between the frames of a clip."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,12 +12,8 @@ from rewild4d.types import Camera
 
 
 def frame_position(times: Tensor, time: float) -> float:
-    """Where a time lies among the frames: 1.5 is half-way between the second and the third; clamped to the clip.
-
-    Args:
-        times: of the frames, ascending, [T].
-        time: seconds.
-    """
+    """Return the frame position of a time in seconds, clamped to the ascending ``times`` [T]: 1.5 is between frames 1
+    and 2."""
     if len(times) == 1 or time <= float(times[0]):
         return 0.0
     if time >= float(times[-1]):
@@ -28,15 +24,7 @@ def frame_position(times: Tensor, time: float) -> float:
 
 
 def interpolate_similarity(matrices: Tensor, position: float) -> Tensor:
-    """A similarity between those of the frames: exact at a frame.
-
-    Args:
-        matrices: [T, 4, 4].
-        position: from `frame_position`.
-
-    Returns:
-        [4, 4].
-    """
+    """Interpolate similarities [T, 4, 4] at a position from `frame_position`, [4, 4]; exact at a frame."""
     low = int(position)
     part = position - low
     if part == 0:
@@ -45,12 +33,7 @@ def interpolate_similarity(matrices: Tensor, position: float) -> Tensor:
 
 
 def camera_between(cameras: Sequence[Camera | None], position: float) -> Camera | None:
-    """The camera between those of the frames: exact at a frame, None where a neighbour is unknown.
-
-    Args:
-        cameras: of the frames.
-        position: from `frame_position`.
-    """
+    """Interpolate the frames' cameras at a position from `frame_position`; None where a neighbour is unknown."""
     low = int(position)
     part = position - low
     first = cameras[low]

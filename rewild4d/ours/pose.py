@@ -18,7 +18,7 @@ class Pose(NamedTuple):
     """Poses of a batch of codes.
 
     Attributes:
-        quats: unit rotation of each joint about its pivot, w >= 0 is not guaranteed, [B, J, 4].
+        quats: unit rotation of each joint about its pivot, w may be negative, [B, J, 4].
         shifts: translation of each joint in the object frame, [B, J, 3].
         features: part features F_J for the deformation network, [B, J, K].
     """
@@ -28,17 +28,18 @@ class Pose(NamedTuple):
     features: Tensor
 
     def mirrored(self, mirror: Tensor) -> "Pose":
-        """The same poses with left and right exchanged."""
+        """Exchange left and right."""
         return Pose(
             mirror_quats(self.quats[:, mirror]), mirror_points(self.shifts[:, mirror]), self.features[:, mirror]
         )
 
 
 def time_code(time: Tensor, group: Tensor, view: Tensor, frequencies: int, explicit_group: bool = False) -> Tensor:
-    """The symmetry-aware code emb(t m) + v (METHOD section 4): [tau, sin 2^k tau, cos 2^k tau] of tau = t m, then v.
+    """Compute the symmetry-aware code emb(t m) + v (METHOD section 4): [tau, sin 2^k tau, cos 2^k tau] of tau = t m,
+    then v.
 
     Args:
-        time: (i + 1) / T for frame i, never zero, because both groups would get one code there, [B].
+        time: (i + 1) / T for frame i, never zero, where both groups would get one code, [B].
         group: m, +1 for the sequence and -1 for its flip, [B].
         view: v, +1 for an image and -1 for its mirror image, [B].
         frequencies: octaves; no factor pi, which would give both groups one code at time 1.
@@ -79,13 +80,8 @@ class PoseNetwork(nn.Module):
         nn.init.zeros_(self.head.bias)
 
     def forward(self, code: Tensor, flipped: Sequence[bool] | None = None, mirror: Tensor | None = None) -> Pose:
-        """Poses of a batch of codes.
-
-        Args:
-            code: [B, E].
-            flipped: which of them are wanted with left and right exchanged, [B]; none by default.
-            mirror: joint on the other side, [J]; needed with ``flipped``.
-        """
+        """Compute poses of a batch of codes [B, E]; those ``flipped`` [B] with left and right exchanged by ``mirror``
+        [J]."""
         if (
             POSE_NETWORK.takes(self.anchors, owner=self)
             and fits_sizes(self.config.width, self.config.heads)
@@ -103,10 +99,8 @@ class PoseNetwork(nn.Module):
         # The modules' own generator of parameters takes longer than a layer.
         layers = (each for layer in self._layers for each in layer._parameters.values() if each is not None)
         parameters = [self.anchors, *layers]
-        reach = config.reach * OBJECT_DIAGONAL
-        sizes = sizes_of(
-            joints, anchor, anchor + code.shape[1], config.width, config.heads, config.blocks, reach, len(code)
-        )
+        network = (config.width, config.heads, config.blocks, config.reach * OBJECT_DIAGONAL)
+        sizes = sizes_of(joints, anchor, anchor + code.shape[1], *network, len(code))
         if flipped is None or mirror is None:
             return Pose(*poses(sizes, parameters, code, np.zeros(len(code), np.bool_), np.arange(joints)))
         return Pose(*poses(sizes, parameters, code, np.array(flipped), mirror.numpy()))
@@ -135,7 +129,7 @@ class Block(nn.Module):
         self.up, self.down = nn.Linear(width, 2 * width), nn.Linear(2 * width, width)
 
     def forward(self, hidden: Tensor) -> Tensor:
-        """[B, J, K] -> [B, J, K]."""
+        """Apply the block, [B, J, K] -> [B, J, K]."""
         batch, joints, width = hidden.shape
         qkv = self.qkv(self.norm_attention(hidden)).view(batch, joints, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
         query, key, value = qkv.unbind(0)
@@ -156,29 +150,19 @@ def seed_linears(module: nn.Module, generator: torch.Generator) -> None:
 
 
 def joint_transforms(quats: Tensor, shifts: Tensor, pivots: Tensor) -> Tensor:
-    """Rest -> posed: P_j x = R_j (x - c_j) + c_j + d_j.
+    """Compute rest -> posed transforms P_j x = R_j (x - c_j) + c_j + d_j, [..., J, 4, 4].
 
     Args:
         quats: [..., J, 4].
         shifts: d, [..., J, 3].
         pivots: c, [J, 3].
-
-    Returns:
-        [..., J, 4, 4].
     """
     rotation = quat_to_matrix(quats)
     return rigid(rotation, pivots + shifts - (rotation @ pivots[..., None])[..., 0])
 
 
 def blend_poses(pose: Pose, quats: Tensor, shifts: Tensor, weight: float) -> Pose:
-    """(1 - weight) of a pose and weight of another, blended as rotation and translation, never as matrices.
-
-    Args:
-        pose: the network's.
-        quats: the prior's, [B, J, 4].
-        shifts: the prior's, [B, J, 3].
-        weight: of the prior, in [0, 1].
-    """
+    """Blend (1 - weight) of a pose with weight of quats [B, J, 4] and shifts [B, J, 3], never as matrices."""
     if weight == 0:
         return pose
     mixed = (1 - weight) * pose.quats + weight * aligned(quats, pose.quats)
@@ -186,11 +170,11 @@ def blend_poses(pose: Pose, quats: Tensor, shifts: Tensor, weight: float) -> Pos
 
 
 def aligned(quats: Tensor, reference: Tensor) -> Tensor:
-    """Quaternions with the sign that puts them on the reference's side, [..., 4]."""
+    """Flip the signs of quaternions to the reference's hemisphere, [..., 4]."""
     return torch.where((quats * reference).sum(-1, keepdim=True) < 0, -quats, quats)
 
 
 def pose_distance(pose: Pose, quats: Tensor, shifts: Tensor) -> Tensor:
-    """Mean over joints of |q^ - q|^2 + |d^ - d|^2 / diagonal^2: how far poses are from others, scalar."""
-    turn = (pose.quats - aligned(quats, pose.quats).detach()).square().sum(-1)
-    return (turn + (pose.shifts - shifts).square().sum(-1) / OBJECT_DIAGONAL**2).mean()
+    """Compute the mean over joints of |q^ - q|^2 + |d^ - d|^2 / diagonal^2, scalar."""
+    rotation = (pose.quats - aligned(quats, pose.quats).detach()).square().sum(-1)
+    return (rotation + (pose.shifts - shifts).square().sum(-1) / OBJECT_DIAGONAL**2).mean()

@@ -1,4 +1,4 @@
-"""What a fit leaves behind: a function from time to Gaussians in the world."""
+"""The result of a fit: a function from time to Gaussians in the world."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +11,7 @@ from rewild4d.errors import UserError
 from rewild4d.files import atomic, load_tensors, save_tensors
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.config import Config
-from rewild4d.ours.losses.regularizers import relative_turn
+from rewild4d.ours.losses.regularizers import relative_angles
 from rewild4d.ours.model import Model
 from rewild4d.ours.motion import camera_between, frame_position, interpolate_similarity
 from rewild4d.ours.pose import Pose
@@ -29,7 +29,7 @@ class OursReconstruction:
 
     Attributes:
         model: in the object frame.
-        config: what it was trained with.
+        config: of the training.
         times: of the clip's frames in seconds, float64, [T].
         object_to_world: similarity at each frame, float64, [T, 4, 4].
         cameras: of the frames, in the world.
@@ -44,7 +44,8 @@ class OursReconstruction:
 
     @torch.no_grad()
     def at(self, time: float) -> Splats:
-        """The Gaussians at a time in seconds in the world; between frames the networks and the root interpolate."""
+        """Return the Gaussians at a time in seconds in the world; between frames the networks and the root
+        interpolate."""
         position = frame_position(self.times, time)
         pose = self._pose(torch.tensor([position]))
         strength = ramp(1.0, self.config.deform.ramp_start, self.config.deform.ramp_end)
@@ -56,11 +57,11 @@ class OursReconstruction:
         return replace(world, colors=own.splat_colors(world.quats))
 
     def camera(self, time: float) -> Camera | None:
-        """The input camera at a time, in the world frame; between frames it interpolates."""
+        """Return the input camera at a time, in the world frame; between frames it interpolates."""
         return camera_between(self.cameras, frame_position(self.times, time))
 
     def canonical(self) -> Splats:
-        """The Gaussians at rest, in the object frame; `weights` [n, J] belong to the same rows."""
+        """Return the Gaussians at rest, in the object frame; `weights` [n, J] belong to the same rows."""
         return self.model.gaussians.splats()
 
     @property
@@ -75,33 +76,27 @@ class OursReconstruction:
 
     @torch.no_grad()
     def articulation(self, time: float) -> tuple[Tensor, Tensor]:
-        """Rest -> posed transforms, [J, 4, 4], and object_to_world, [4, 4]; the deformation network is not in them."""
+        """Return rest -> posed transforms, [J, 4, 4], without the deformation, and object_to_world, [4, 4]."""
         position = frame_position(self.times, time)
         pose = self._pose(torch.tensor([position]))
         return self.model.transforms(pose)[0], interpolate_similarity(self.object_to_world, position)
 
     @torch.no_grad()
     def diagnostics(self) -> dict[str, float | list[float]]:
-        """Figures that show silent failures: per joint, how far it turns and moves and whether that changes over time.
+        """Return figures that show silent failures.
 
-        Returns:
-            Angles against the parent in degrees and shifts over the rest diagonal (mean and standard deviation over the
-            frames, a list over the joints), the number of Gaussians and their mean opacity.
+        These are angles against the parent in degrees and shifts over the rest diagonal (mean and standard deviation
+        over the frames, a list over the joints), the number of Gaussians and their mean opacity.
         """
         pose = self._pose(torch.arange(len(self.times), dtype=torch.float32))
-        angles = relative_turn(pose.quats, self.model.parents)
+        angles = relative_angles(pose.quats, self.model.parents)
         shifts = pose.shifts.norm(dim=-1) / OBJECT_DIAGONAL
-        lists = {
-            "joint_angle_mean": angles.mean(0), "joint_angle_std": angles.std(0, correction=0),
-            "joint_shift_mean": shifts.mean(0), "joint_shift_std": shifts.std(0, correction=0),
-        }  # fmt: skip
-        figures: dict[str, float | list[float]] = {
-            name: [round(x, 4) for x in value.tolist()] for name, value in lists.items()
-        }
-        return figures | {
-            "gaussians": float(len(self.model.gaussians)),
-            "opacity_mean": float(self.model.gaussians.opacities().mean()),
-        }
+        figures: dict[str, float | list[float]] = {}
+        for name, values in (("angle", angles), ("shift", shifts)):
+            for kind, value in (("mean", values.mean(0)), ("std", values.std(0, correction=0))):
+                figures[f"joint_{name}_{kind}"] = [round(x, 4) for x in value.tolist()]
+        gaussians = self.model.gaussians
+        return figures | {"gaussians": float(len(gaussians)), "opacity_mean": float(gaussians.opacities().mean())}
 
     def save(self, folder: Path) -> None:
         """Write the state and the config into an existing, empty folder."""
@@ -128,17 +123,17 @@ def _camera_state(camera: Camera | None) -> dict[str, Tensor | list[int]] | None
 
 
 def from_fit(model: Model, config: Config, clip: Clip, prior: Prior, rows: list[int]) -> OursReconstruction:
-    """The reconstruction of a clip; ``rows`` are the prior's rows of its frames."""
+    """Build the reconstruction of a clip; ``rows`` are the prior's rows of its frames."""
     times = torch.tensor(clip.times, dtype=torch.float64)
     cameras = tuple(frame.camera for frame in clip.frames)
     return OursReconstruction(model, config, times, prior.object_to_world[rows].double(), cameras)
 
 
 def load_reconstruction(folder: Path, device: torch.device) -> OursReconstruction:
-    """Read back what `OursReconstruction.save` wrote.
+    """Read a reconstruction that `OursReconstruction.save` wrote.
 
     Raises:
-        UserError: a file is missing or is not what `save` writes.
+        UserError: a file is missing or cannot be read.
     """
     for name in (STATE, CONFIG):
         if not (folder / name).is_file():

@@ -1,4 +1,4 @@
-"""What the length of a clip decides, and schedules as pure functions of a fit's progress in [0, 1]."""
+"""Settings that follow the length of a clip, and schedules as functions of progress in [0, 1]."""
 
 import math
 from typing import Any, TypeVar
@@ -11,27 +11,16 @@ C = TypeVar("C", bound=msgspec.Struct)
 
 
 def for_clip(config: C, frames: int) -> C:
-    """The config with enough steps for a clip.
-
-    Args:
-        config: with ``iterations`` and ``steps_per_frame``, of any method.
-        frames: of the clip.
-    """
+    """Raise the iterations of any method's config to ``steps_per_frame`` times the frames of a clip."""
     own: Any = config
     return msgspec.structs.replace(config, iterations=max(own.iterations, own.steps_per_frame * frames))
 
 
 def for_clip_of_ours(config: Config, frames: int, *, filmed: bool = False) -> Config:
-    """`for_clip`, but that short clips may take fewer steps, that long ones have a finer time code, and that a film of
-    unknown cameras has some values of its own.
+    """Resolve settings for a clip: fewer steps if short, a finer time code if long, `Footage` if its cameras are
+    unknown.
 
-    Args:
-        config: as chosen.
-        frames: of the clip.
-        filmed: its cameras are not known.
-
-    Returns:
-        Settings that are plain numbers: they give the same for a clip of any length.
+    The result stays the same for a clip of any length.
     """
     config = _for_footage(config) if filmed and config.footage.use else config
     pose = config.pose
@@ -55,17 +44,17 @@ def _for_footage(config: Config) -> Config:
 
 
 def exponential(first: float, last: float, progress: float) -> float:
-    """From first to last, geometrically."""
+    """Interpolate geometrically."""
     return first * (last / first) ** min(max(progress, 0.0), 1.0)
 
 
 def ramp(progress: float, start: float, end: float) -> float:
-    """Zero before start, one from end on, linear between."""
+    """Rise linearly from zero at start to one at end."""
     if end <= start:
         return float(progress >= start)
     return min(max((progress - start) / (end - start), 0.0), 1.0)
 
 
 def fade(progress: float, end: float) -> float:
-    """One at the beginning, zero from end on, linear between."""
+    """Fall linearly from one to zero at end."""
     return 1.0 - ramp(progress, 0.0, end)

@@ -1,4 +1,4 @@
-"""The learnable skinning field: a voxel grid of logits, sampled trilinearly as probabilities."""
+"""Learnable skinning field: a voxel grid of logits, sampled trilinearly as probabilities."""
 
 import numpy as np
 import torch
@@ -37,14 +37,14 @@ class SkinningField(nn.Module):
         self.register_buffer("flipped", rows, persistent=False)
 
     def probabilities(self) -> Tensor:
-        """Weights of every voxel, [R^3, J]."""
+        """Return the weights of every voxel, [R^3, J]."""
         logits: Tensor = self.logits
         if self.tied:
             logits = 0.5 * (logits + logits[self.flipped][:, self.mirror])
         return logits.softmax(dim=-1)
 
     def sample_and_vary(self, probabilities: Tensor, points: Tensor, delta: float | None) -> tuple[Tensor, Tensor]:
-        """Weights of points as `sample` gives them, and L_tv of the field (zero where ``delta`` is None)."""
+        """Return weights of points as `sample`, and L_tv of the field (zero where ``delta`` is None)."""
         if FIELD.takes(probabilities, owner=self):
             return sample_grid(probabilities, points, self.origin, self.pitch, self.resolution, delta)
         weights = self.sample(probabilities, points)
@@ -53,21 +53,14 @@ class SkinningField(nn.Module):
         return weights, tv_loss(probabilities, self.resolution, delta)
 
     def sample(self, probabilities: Tensor, points: Tensor) -> Tensor:
-        """Weights of points; outside the cube the nearest border counts.
-
-        Args:
-            probabilities: from `probabilities`, [R^3, J].
-            points: in the object frame, no gradient flows to them, [n, 3].
-
-        Returns:
-            Rows on the simplex, [n, J].
-        """
+        """Sample weights [n, J] at points [n, 3] (no gradient) from `probabilities` [R^3, J]; points are clamped to the
+        cube."""
         if FIELD.takes(probabilities, owner=self):
             return sample_grid(probabilities, points, self.origin, self.pitch, self.resolution)[0]
         last = self.resolution - 1
-        place = ((points.detach() - self.origin) / self.pitch).clamp(0, last)
-        base = place.floor().clamp(max=last - 1)
-        part = place - base
+        position = ((points.detach() - self.origin) / self.pitch).clamp(0, last)
+        base = position.floor().clamp(max=last - 1)
+        part = position - base
         x, y, z = (torch.stack((1 - part[:, axis], part[:, axis]), dim=-1) for axis in range(3))
         factors = torch.einsum("na,nb,nc->nabc", x, y, z).flatten(1)
         step = torch.tensor((self.resolution**2, self.resolution, 1), device=points.device)
@@ -77,18 +70,9 @@ class SkinningField(nn.Module):
 
 
 def build_field(vertices: Tensor, weights: Tensor, mirror: Tensor, config: Skinning) -> SkinningField:
-    """Spread the prior's skinning weights over a cube around its rest shape.
+    """Spread the prior's skinning weights [n, J] over a cube around its rest shape [n, 3].
 
     Per voxel the inverse-distance mean of the nearest vertices' weights, then sweeps of neighbour averaging.
-
-    Args:
-        vertices: rest shape, [n, 3].
-        weights: rows sum to one, [n, J].
-        mirror: the bone on the other side of each bone, [J].
-        config: resolution and fill.
-
-    Returns:
-        The field at its start.
     """
     low, high = vertices.amin(0), vertices.amax(0)
     half = config.margin * 0.5 * (high - low).max()

@@ -1,4 +1,4 @@
-"""The two mirrored supervision groups: which image, camera and prior pose go with (m, v, t) (METHOD section 6)."""
+"""The two mirrored supervision groups: image, camera and prior pose of (m, v, t) (METHOD section 6)."""
 
 import math
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ SIGNS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
 class Key(NamedTuple):
-    """Names one supervised view: group m, image sign v, index of the frame."""
+    """One supervised view: group m, image sign v, index of the frame."""
 
     group: int
     view: int
@@ -28,14 +28,14 @@ class Key(NamedTuple):
 
 @dataclass(frozen=True)
 class Target:
-    """What one view is compared with.
+    """Image and camera of one view.
 
     Attributes:
         rgb: premultiplied, [3, h, w].
         mask: [1, h, w].
         camera: in the object frame.
-        side: side of a padded square box around the animal, pixels; image losses are sums over this square's area,
-            so that the frame's margins do not change a weight.
+        side: side of a padded square box around the animal, pixels; image losses are divided by its area, so that the
+            frame's margins do not change a weight.
     """
 
     rgb: Tensor
@@ -45,7 +45,7 @@ class Target:
 
     @cached_property
     def eye(self) -> Tensor:
-        """The camera's centre, [3]."""
+        """Camera centre, [3]."""
         return self.camera.center
 
 
@@ -54,7 +54,7 @@ class Supervision:
 
     Attributes:
         frames: number of frames T.
-        reduction: how many of the clip's pixels one of the training's is wide.
+        reduction: side of a training pixel in pixels of the clip.
         prior_quats: rotation of each joint, for v = +1 and v = -1, [2, T, J, 4].
         prior_shifts: translation about the rest pivot, [2, T, J, 3].
     """
@@ -67,8 +67,10 @@ class Supervision:
         self._targets: dict[Key, Target] = {}
         for index, (frame, row) in enumerate(zip(clip.frames, rows, strict=True)):
             rgb, mask = (_reduced(image, size).to(device) for image in (frame.rgb, frame.mask))
-            plain = _check_camera(prior.cameras[row], frame.mask).resized(mask.shape[2], mask.shape[1])
-            flip = _check_camera(prior.cameras_flip[row], frame.mask).resized(mask.shape[2], mask.shape[1])
+            plain, flip = (
+                _check_camera(cameras[row], frame.mask).resized(mask.shape[2], mask.shape[1])
+                for cameras in (prior.cameras, prior.cameras_flip)
+            )
             side = animal_side(mask, clip.name, index)
             image, mirrored = (rgb, mask), (rgb.flip(-1), mask.flip(-1))
             choices = {
@@ -86,22 +88,23 @@ class Supervision:
         self.prior_shifts = (moved - pivots).to(device)
 
     def target(self, key: Key) -> Target:
-        """Image, matte and camera of one view."""
+        """Return image, matte and camera of one view."""
         return self._targets[key]
 
     def prior_pose(self, keys: list[Key]) -> tuple[Tensor, Tensor]:
-        """The prior's poses of views: P for v = +1 and P_flip for v = -1, whatever m; [B, J, 4] and [B, J, 3]."""
+        """Return the prior's poses of views, P for v = +1 and P_flip for v = -1 whatever m: [B, J, 4] and [B, J, 3]."""
         side = torch.tensor([int(key.view < 0) for key in keys])
         frame = torch.tensor([key.frame for key in keys])
         return self.prior_quats[side, frame], self.prior_shifts[side, frame]
 
     def pixel(self) -> float:
-        """Side of a pixel at the object frame's origin, median over the frames, in that frame's units."""
+        """Return the side of a pixel at the object frame's origin, median over the frames, in object units."""
         cameras = [self._targets[Key(1, 1, index)].camera for index in range(self.frames)]
         return float(torch.stack([each.world_to_camera[2, 3] / each.intrinsics[0, 0] for each in cameras]).median())
 
     def missing_blur(self) -> float:
-        """Standard deviation in space that the clip's own images lack against those of the training, in its units.
+        """Return the standard deviation by which the clip's own images blur less than those of the training, object
+        units.
 
         The rasterizer widens every Gaussian by a share of a pixel. Trained on reduced images, an animal would be thin
         and full of holes in finer ones, whose pixels are smaller. 0 where nothing was reduced.
@@ -109,7 +112,7 @@ class Supervision:
         return self.pixel() * math.sqrt(EPS2D * (1 - 1 / self.reduction**2))
 
     def draw(self, generator: torch.Generator, mirrored: float = 0.5, cameras: str = "both") -> Key:
-        """One view: group and frame uniformly, then the frame's image or, in a share of the draws, its mirror image.
+        """Draw a view: group and frame uniformly, then the frame's image or, in a share of the draws, its mirror image.
 
         With "own" cameras the image decides the group: m = v.
         """
@@ -119,10 +122,10 @@ class Supervision:
 
 
 def match_times(clip: Clip, prior: Prior) -> list[int]:
-    """Row of the prior for each frame of the clip.
+    """Return the prior's row for each frame of the clip.
 
     Raises:
-        UserError: fewer than two frames, or a frame the prior does not know.
+        UserError: fewer than two frames, or a frame outside the prior.
     """
     if len(clip.frames) < 2:
         raise UserError(f"{clip.name}: expected a clip of at least 2 frames, got {len(clip.frames)}.")
@@ -141,7 +144,7 @@ def match_times(clip: Clip, prior: Prior) -> list[int]:
 
 
 def animal_side(mask: Tensor, name: str, index: int) -> float:
-    """Side of the square box around the animal, padded by 15 % each way, pixels.
+    """Return the side of the square box around the animal, padded by 15 % each way, pixels.
 
     Raises:
         UserError: the mask is empty.
@@ -154,7 +157,7 @@ def animal_side(mask: Tensor, name: str, index: int) -> float:
 
 
 def _reduced(image: Tensor, size: int) -> Tensor:
-    """The image with its longest side at most ``size``, area-averaged, [c, h, w]."""
+    """Reduce the image to a longest side of at most ``size``, area-averaged, [c, h, w]."""
     height, width = image.shape[1:]
     if max(height, width) <= size:
         return image.float()

@@ -1,6 +1,6 @@
-"""The pose warm-up: poses from blurred silhouettes while the Gaussians are frozen (METHOD section 11.3).
+"""Pose warm-up: poses from blurred silhouettes while the Gaussians are frozen (METHOD section 11.3).
 
-Gaussians under a pixel give silhouette gradients that are too local to move a limb; a blur that shrinks with time does.
+Silhouette gradients of Gaussians under a pixel are too local to move a limb; a shrinking blur is not.
 """
 
 import math
@@ -23,7 +23,7 @@ OPACITY = 0.9
 
 
 class WarmUp:
-    """A stage of its own: steps 0 .. regress-1 copy the prior's poses, the others follow silhouettes.
+    """The first stage: steps 0 .. regress-1 copy the prior's poses, the others follow silhouettes.
 
     Attributes:
         total: number of steps.
@@ -44,7 +44,7 @@ class WarmUp:
             self.weights = model.field.sample(model.field.probabilities(), self.points)
 
     def step(self, index: int) -> dict[str, float]:
-        """One update; returns the figures for the log."""
+        """Take one step; return the figures for the log."""
         stage = self.config.warmup
         progress = max(0.0, (index - stage.regress) / max(1, stage.iterations))
         self._set_rate(index)
@@ -72,21 +72,22 @@ class WarmUp:
         return {"loss": float(loss.detach()), "prior_distance": float(distance.detach())} | figures
 
     def _set_rate(self, index: int) -> None:
-        """Each part rises over its first tenth and falls to zero; the second starts without the first's moments.
+        """Raise the rate over the first tenth of each part and let it fall to zero; the second part drops the first's
+        moments.
 
         The copy ends with tiny gradients, so Adam would answer the first silhouette with a step that undoes it.
         """
         stage = self.config.warmup
         copied = index < stage.regress
-        place = index / stage.regress if copied else (index - stage.regress) / stage.iterations
+        progress = index / stage.regress if copied else (index - stage.regress) / stage.iterations
         rate = stage.regress_rate if copied else stage.rate
         if index == stage.regress:
             self.optimizer.state.clear()
         for group in self.optimizer.param_groups:
-            group["lr"] = rate * min(1.0, 0.01 + 10 * place, 1.5 * (1 - place))
+            group["lr"] = rate * min(1.0, 0.01 + 10 * progress, 1.5 * (1 - progress))
 
     def _silhouette(self, key: Key, transforms: Tensor, progress: float) -> Tensor:
-        """L2 (per pixel of the animal's box) + Dice of blurred mattes."""
+        """Compute L2 (per pixel of the animal's box) + Dice of blurred mattes."""
         target = self.supervision.target(key)
         camera = target.camera
         means = skin_points(self.points, self.weights, transforms)

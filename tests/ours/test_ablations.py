@@ -105,15 +105,15 @@ def test_without_deformation_the_branches_agree(case: Case) -> None:
 
 
 def test_without_isolation_colours_move_the_joints(case: Case) -> None:
-    key, values, slopes = Key(1, 1, 0), [], []
+    key, values, grads = Key(1, 1, 0), [], []
     for each in (training(case), training(case, loss=Loss(isolated=False))):
         losses, _ = each.losses(key, each.supervision.target(key), index=19)
         values.append({name: value.item() for name, value in losses.items()})
         (losses["l1"] + losses["ssim"]).backward()
-        slopes.append(each.model.network.head.weight.grad)
+        grads.append(each.model.network.head.weight.grad)
     assert values[0] == values[1]
-    assert slopes[0] is None or slopes[0].abs().max() == 0
-    assert slopes[1] is not None and slopes[1].abs().max() > 0
+    assert grads[0] is None or grads[0].abs().max() == 0
+    assert grads[1] is not None and grads[1].abs().max() > 0
 
 
 def test_fixed_skinning_stays_as_the_prior_has_it(case: Case) -> None:

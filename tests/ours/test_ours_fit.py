@@ -90,17 +90,17 @@ def test_gradients_stay_in_their_branch(toy: tuple[Clip, Prior]) -> None:
     losses, _ = training.losses(key, training.supervision.target(key), index=TINY.iterations - 1)
     head, own = model.network.head, model.gaussians
 
-    def slopes(loss: torch.Tensor, *leaves: torch.Tensor) -> list[torch.Tensor | None]:
+    def grads(loss: torch.Tensor, *leaves: torch.Tensor) -> list[torch.Tensor | None]:
         return list(torch.autograd.grad(loss, leaves, retain_graph=True, allow_unused=True))
 
     appearance = losses["l1"] + losses["ssim"] + losses["silhouette"]
-    assert all(slope is None or slope.abs().max() == 0 for slope in slopes(appearance, head.weight, head.bias))
-    assert slopes(losses["pose_silhouette"], head.weight)[0].abs().max() > 0
+    assert all(grad is None or grad.abs().max() == 0 for grad in grads(appearance, head.weight, head.bias))
+    assert grads(losses["pose_silhouette"], head.weight)[0].abs().max() > 0
     apart = (own.colors, own.log_scales, own.logit_opacities, model.deform.out.weight, model.deform.key.weight)
-    assert slopes(losses["pose_silhouette"], *apart) == [None] * len(apart)
-    assert all(slope.abs().max() > 0 for slope in slopes(appearance, *apart[:4], own.means, model.field.logits))
+    assert grads(losses["pose_silhouette"], *apart) == [None] * len(apart)
+    assert all(grad.abs().max() > 0 for grad in grads(appearance, *apart[:4], own.means, model.field.logits))
     # The anchors are the declared shared space.
-    assert slopes(appearance, model.network.anchors)[0].abs().max() > 0
+    assert grads(appearance, model.network.anchors)[0].abs().max() > 0
 
 
 def test_a_change_of_scale_by_the_deformation_costs_its_square(toy: tuple[Clip, Prior]) -> None:

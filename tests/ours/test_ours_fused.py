@@ -58,16 +58,16 @@ def test_deformation_with_few_octaves(frequencies: int) -> None:
 
 @pytest.mark.skipif(not available(), reason="this CPU multiplies no bfloat16 pairs (AVX512_BF16)")
 def test_deformation_in_bfloat16_is_the_same_to_its_rounding() -> None:
-    make, slopes, values = deformation(600, Deform(width=32), spread=0.15), [], []
+    make, grads, values = deformation(600, Deform(width=32), spread=0.15), [], []
     for dtype in (torch.float64, torch.float32):
         (means, quats, log_scales), given = make(dtype)
         moves = torch.cat((means - given["means"], quats - given["quats"], log_scales - given["log_scales"]), dim=1)
         moves.square().sum().backward()
         values.append(moves.double())
-        slopes.append(torch.cat([each.grad.flatten().double() for each in given.values() if each.grad is not None]))
+        grads.append(torch.cat([each.grad.flatten().double() for each in given.values() if each.grad is not None]))
     # A factor keeps eight bits, and six layers follow each other.
     assert (values[0] - values[1]).norm() < 6 / 256 * values[0].norm()
-    assert (slopes[0] - slopes[1]).norm() < 6 / 256 * slopes[0].norm()
+    assert (grads[0] - grads[1]).norm() < 6 / 256 * grads[0].norm()
 
 
 def test_deformation_is_the_same_bits_for_any_number_of_threads() -> None:
@@ -167,9 +167,9 @@ def test_the_second_branch_does_not_reach_the_joints() -> None:
     weights = normal(50, 20, seed=5).softmax(dim=-1).float()
     for own, reached in ((slice(0, 2), True), (slice(2, 4), False)):
         made = skin_both(given["means"], given["quats"], weights, joints["transforms"], joints["quats"])[own]
-        slopes = torch.autograd.grad((made[0].sum() + made[1][:, 1].sum()), [*joints.values(), *given.values()])
-        assert all((slope.abs().max() > 0) == reached for slope in slopes[:2])
-        assert all(slope.abs().max() > 0 for slope in slopes[2:])
+        grads = torch.autograd.grad((made[0].sum() + made[1][:, 1].sum()), [*joints.values(), *given.values()])
+        assert all((grad.abs().max() > 0) == reached for grad in grads[:2])
+        assert all(grad.abs().max() > 0 for grad in grads[2:])
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])

@@ -12,7 +12,7 @@ from twins import check_twins, leaves, normal, same_on_any_threads, unit
 from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.config import Config, Deform, Geometry
 from rewild4d.ours.config import Pose as PoseConfig
-from rewild4d.ours.losses.skeleton import skeleton_losses, stance
+from rewild4d.ours.losses.skeleton import posture, skeleton_losses
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import Pose, PoseNetwork, blend_poses, pose_distance, time_code
 from rewild4d.ours.skinning import SkinningField
@@ -128,7 +128,7 @@ def batch_of_poses(dtype: torch.dtype, batch: int) -> dict[str, Tensor]:
 @pytest.mark.parametrize(
     "only", ["limit", "attach", "temporal", "still", "limb_plane", "body_plane", "sideways", None, ""]
 )
-def test_stance(batch: int, rows: list[int], only: str | None) -> None:
+def test_posture(batch: int, rows: list[int], only: str | None) -> None:
     weights = {"limit": 3.0, "attach": 20.0, "temporal": 10.0, "still": 2.0}
     weights |= {"limb_plane": 40.0, "body_plane": 30.0, "sideways": 50.0}
     if only is not None:
@@ -137,24 +137,24 @@ def test_stance(batch: int, rows: list[int], only: str | None) -> None:
 
     def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
         given = batch_of_poses(dtype, batch)
-        pose, transforms, total = stance(model(dtype), Pose(**given), rows, config)
+        pose, transforms, total = posture(model(dtype), Pose(**given), rows, config)
         return [*pose, transforms, total[None]], given
 
     check_twins(make)
 
 
-def test_the_sum_alone_is_that_of_the_stance() -> None:
+def test_the_sum_alone_is_that_of_the_posture() -> None:
     own, pose, config = model(), Pose(**batch_of_poses(torch.float32, 3)), Geometry()
     alone = skeleton_losses(own, pose, own.transforms(pose), config, True)
-    assert float(alone.detach()) == float(stance(own, pose, [1], config)[2].detach()) > 0
+    assert float(alone.detach()) == float(posture(own, pose, [1], config)[2].detach()) > 0
 
 
 def test_only_neighbouring_frames_have_a_bend() -> None:
     own, pose = model(), Pose(**batch_of_poses(torch.float32, 3))
     config = Geometry(limit=0.0, attach=0.0, temporal=10.0, still=1.0)
     assert float(skeleton_losses(own, pose, own.transforms(pose), config, False).detach()) == 0
-    assert float(stance(own, pose, [0, 1, 2], config)[2].detach()) == 0  # three views of a clip of two frames
-    assert float(stance(own, pose, [1], config)[2].detach()) > 0
+    assert float(posture(own, pose, [0, 1, 2], config)[2].detach()) == 0  # three views of a clip of two frames
+    assert float(posture(own, pose, [1], config)[2].detach()) > 0
 
 
 def test_a_skeleton_without_parents_has_no_joints_to_hold() -> None:
@@ -162,7 +162,7 @@ def test_a_skeleton_without_parents_has_no_joints_to_hold() -> None:
     for dtype, leaf in given.items():
         own = model(dtype)
         own.parents.fill_(-1)
-        total = stance(own, Pose(**leaf), [1], Geometry(temporal=0.0))[2]
+        total = posture(own, Pose(**leaf), [1], Geometry(temporal=0.0))[2]
         assert float(total.detach()) == 0, dtype
 
 
@@ -174,7 +174,7 @@ def test_attachment_of_a_shifted_joint() -> None:
     config = Geometry(limit=0.0, temporal=0.0, attach=2.0)
     bones = sum(parent >= 0 for parent in PARENTS)
     expected = 2.0 * (0.5 / OBJECT_DIAGONAL) ** 2 / bones
-    assert float(stance(own, pose, [0], config)[2]) == pytest.approx(expected, rel=1e-5)
+    assert float(posture(own, pose, [0], config)[2]) == pytest.approx(expected, rel=1e-5)
 
 
 def test_what_drifts_costs_and_what_moves_is_left_alone() -> None:
@@ -183,11 +183,11 @@ def test_what_drifts_costs_and_what_moves_is_left_alone() -> None:
     config = Geometry(limit=0.0, attach=0.0, temporal=0.0, still=2.0, still_step=step)
 
     def cost(way: float) -> tuple[float, float]:
-        """Of one joint that takes the first of its two steps, with the slope by its way in diagonals."""
+        """Of one joint that takes the first of its two steps, with the grad by its way in diagonals."""
         moved = shifts.clone()
         moved[1:, 7, 1] = way * OBJECT_DIAGONAL
         moved.requires_grad_(True)
-        total = stance(own, Pose(quats, moved, torch.zeros(3, 20, 4)), [1], config)[2]
+        total = posture(own, Pose(quats, moved, torch.zeros(3, 20, 4)), [1], config)[2]
         total.backward()
         return float(total.detach()), -float(moved.grad[0, 7, 1]) * OBJECT_DIAGONAL
 
@@ -207,7 +207,7 @@ def test_a_bone_beyond_its_limit() -> None:
     config = Geometry(limit=1.0, limit_degrees=60.0, attach=0.0, temporal=0.0)
     bones = sum(parent >= 0 for parent in PARENTS)
     expected = (math.cos(math.radians(30)) - math.cos(half)) ** 2 / bones
-    assert float(stance(own, pose, [0], config)[2]) == pytest.approx(expected, rel=1e-4)
+    assert float(posture(own, pose, [0], config)[2]) == pytest.approx(expected, rel=1e-4)
 
 
 def test_what_leaves_the_planes_along_the_body() -> None:
@@ -221,7 +221,7 @@ def test_what_leaves_the_planes_along_the_body() -> None:
         quats, shifts = rest.repeat(1, 20, 1), torch.zeros(1, 20, 3)
         quats[0, joint, 0], quats[0, joint, 1 + axis], shifts[0, joint, axis] = math.cos(half), math.sin(half), 0.5
         pose = Pose(-quats, shifts, torch.zeros(1, 20, 4))  # the same rotations
-        return float(stance(own, pose, [0], msgspec.structs.replace(flat, **weights))[2])
+        return float(posture(own, pose, [0], msgspec.structs.replace(flat, **weights))[2])
 
     out = math.sin(half) ** 2
     assert [cost(foot, axis, limb_plane=3.0) for axis in range(3)] == pytest.approx(
@@ -234,7 +234,7 @@ def test_what_leaves_the_planes_along_the_body() -> None:
     turned = torch.tensor((math.cos(half), 0, math.sin(half), 0)).repeat(1, 20, 1)
     pose = Pose(turned, torch.zeros(1, 20, 3), torch.zeros(1, 20, 4))
     held = msgspec.structs.replace(flat, limb_plane=3.0)
-    assert float(stance(own, pose, [0], held)[2]) == pytest.approx(0, abs=1e-12)
+    assert float(posture(own, pose, [0], held)[2]) == pytest.approx(0, abs=1e-12)
 
 
 @pytest.mark.parametrize("weight", [0.3, 1.0])

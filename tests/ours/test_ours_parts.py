@@ -16,7 +16,7 @@ from rewild4d.ours.losses.regularizers import (
     compact_loss,
     limit_loss,
     neighbours,
-    relative_turn,
+    relative_angles,
     tv_loss,
 )
 from rewild4d.ours.motion import frame_position, interpolate_similarity
@@ -103,8 +103,8 @@ def test_deformation_starts_as_skinning_and_its_query_takes_no_gradient() -> Non
     torch.testing.assert_close(out.log_scales, posed.log_scales)
     torch.nn.init.normal_(network.out.weight, generator=generator())
     out = network(features, weights, anchors, posed, 1.0)
-    (slope,) = torch.autograd.grad(out.means.sum(), means)
-    torch.testing.assert_close(slope, torch.ones(5, 3))
+    (grad,) = torch.autograd.grad(out.means.sum(), means)
+    torch.testing.assert_close(grad, torch.ones(5, 3))
     assert (out.log_scales - posed.log_scales).abs().max() <= 1.0
 
 
@@ -219,7 +219,7 @@ def test_joint_limit_and_attachment() -> None:
     assert limit_loss(turned(59), parents, 60) == 0
     expected = (math.cos(math.radians(30)) - math.cos(math.radians(45))) ** 2
     assert float(limit_loss(turned(90), parents, 60)) == pytest.approx(expected, rel=1e-4)
-    assert relative_turn(turned(90).quats, parents)[0].tolist() == pytest.approx([0, 90], abs=1e-3)
+    assert relative_angles(turned(90).quats, parents)[0].tolist() == pytest.approx([0, 90], abs=1e-3)
     shifts = torch.tensor([[[0.0, 0, 0], [0.5, 0, 0]]])
     pose = turned(90)
     assert float(attach_loss(joint_transforms(pose.quats, pose.shifts, pivots), pivots, parents)) < 1e-12

@@ -50,11 +50,11 @@ def test_a_gradient_that_is_not_finite_is_not_left_out() -> None:
 def test_every_gaussian_counts_one_in_the_mean_of_all_offsets() -> None:
     generator = np.random.default_rng(0)
     quats = unit(200, 4, seed=1).numpy().astype(np.float32)
-    slopes = [generator.standard_normal((200, size)).astype(np.float32) for size in (3, 4, 3)]
-    slopes = [each * (generator.random((200, 1)) ** 3).astype(np.float32) for each in slopes]
+    grads = [generator.standard_normal((200, size)).astype(np.float32) for size in (3, 4, 3)]
+    grads = [each * (generator.random((200, 1)) ** 3).astype(np.float32) for each in grads]
     counted, worth, drawn = np.zeros(200), np.ones(200), []
     for offset in (np.arange(4000) + 0.5) / 4000:
-        rows, factors = sample_rows(0.1, 1.0, quats, *slopes, 40, offset)
+        rows, factors = sample_rows(0.1, 1.0, quats, *grads, 40, offset)
         counted[rows] += factors / 4000
         worth[rows] = factors
         drawn.append(len(rows))
@@ -71,7 +71,7 @@ def network() -> DeformNetwork:
     return made
 
 
-def slopes_of(network: DeformNetwork, count: int, offset: float) -> tuple[list[torch.Tensor], torch.Tensor]:
+def grads_of(network: DeformNetwork, count: int, offset: float) -> tuple[list[torch.Tensor], torch.Tensor]:
     """Gradients of the Gaussians and of anchors, and of all parameters in one row."""
     places = [normal(count, 3, seed=2), unit(count, 4, seed=3), normal(count, 3, seed=4) - 3, normal(20, 8, seed=5)]
     leaves = [place.float().requires_grad_() for place in places]
@@ -86,9 +86,9 @@ def slopes_of(network: DeformNetwork, count: int, offset: float) -> tuple[list[t
 
 def test_the_networks_gradient_is_right_in_the_mean_and_that_of_the_gaussians_exact(network: DeformNetwork) -> None:
     offsets = [(i + 0.5) / 200 for i in range(200)]
-    drawn = [slopes_of(network, 300, offset) for offset in offsets]
+    drawn = [grads_of(network, 300, offset) for offset in offsets]
     network.config = Deform(width=16, heads=2, half=False)
-    whole, own = slopes_of(network, 300, 0.0)
+    whole, own = grads_of(network, 300, 0.0)
     for given, _ in drawn:
         assert all(torch.equal(a, b) for a, b in zip(given[:3], whole[:3], strict=True))
     assert (torch.stack([given[3] for given, _ in drawn]).mean(0) - whole[3]).norm() < 0.02 * whole[3].norm()
@@ -99,6 +99,6 @@ def test_the_networks_gradient_is_right_in_the_mean_and_that_of_the_gaussians_ex
 
 
 def test_as_many_as_there_are_is_the_whole_sum(network: DeformNetwork) -> None:
-    _, drawn = slopes_of(network, 60, 0.3)
+    _, drawn = grads_of(network, 60, 0.3)
     network.config = Deform(width=16, heads=2, half=False)
-    assert torch.equal(drawn, slopes_of(network, 60, 0.3)[1])
+    assert torch.equal(drawn, grads_of(network, 60, 0.3)[1])

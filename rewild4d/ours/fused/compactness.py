@@ -1,7 +1,4 @@
-"""Compactness of the parts: small matrix products of the Gaussians' masses in them, sixty-four side by side.
-
-The twin in plain torch is in ours/geometry_losses.py.
-"""
+"""Compactness of the parts: matrix products of the Gaussians' masses, 64 Gaussians side by side."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,12 +14,12 @@ from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.matrix import add_product, transpose
 from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
 from rewild4d.kernels.switch import Kernel
-from rewild4d.kernels.threads import run, thread_count
+from rewild4d.kernels.threads import run_tickets
 
 COMPACTNESS = Kernel("compactness", "c5224f5d75ac", "rewild4d.ours.losses.regularizers:compact_loss")
 
 CHUNK = 16 * BLOCK
-"""Gaussians a unit of work holds; sums are added over these, whatever the number of threads."""
+"""Gaussians of a unit of work; sums run over units, so they do not depend on the number of threads."""
 
 
 @kernel
@@ -38,26 +35,26 @@ def _mass_block(
     opaque = np.zeros(BLOCK, np.float32)
     opaque[: end - begin] = opacities[begin:end]
     for joint in range(joints):
-        for place in range(joint * BLOCK, (joint + 1) * BLOCK, LANES):
-            weight, opacity = load(mass, place), load(opaque, place - joint * BLOCK)
-            store(mass, place, weight * weight * opacity if power == 2 else weight * opacity)
+        for index in range(joint * BLOCK, (joint + 1) * BLOCK, LANES):
+            weight, opacity = load(mass, index), load(opaque, index - joint * BLOCK)
+            store(mass, index, weight * weight * opacity if power == 2 else weight * opacity)
 
 
 @kernel
 def _scratch(joints: int) -> tuple:
-    """Room for masses, and for places and their moments by columns and by rows."""
+    """Allocate masses, points and moments, by columns and by rows."""
     room, size = (joints + LANES - 1) // LANES * LANES * BLOCK, LANES * BLOCK
-    mass, places, moments = np.zeros(room, np.float32), np.zeros(size, np.float32), np.zeros(size, np.float32)
-    return mass, places, moments, np.empty(size, np.float32)
+    mass, points, moments = np.zeros(room, np.float32), np.zeros(size, np.float32), np.zeros(size, np.float32)
+    return mass, points, moments, np.empty(size, np.float32)
 
 
 @kernel
 def _moments(
     tickets: np.ndarray, clouds: tuple, weights: np.ndarray, opacities: np.ndarray, power: float, sums: np.ndarray
 ) -> None:
-    """Add up, by chunks, each part's mass, first and second moments: 10 of 16 numbers, [clouds, chunks, J.. x 16]."""
+    """Sum each part's mass, first and second moments by chunk: 10 of 16 numbers, [clouds, chunks, J.. x 16]."""
     count, joints = weights.shape
-    mass, places, moments, turned = _scratch(joints)
+    mass, points, moments, transposed = _scratch(joints)
     while True:
         chunk = take_ticket(tickets)
         if chunk >= sums.shape[1]:
@@ -66,25 +63,25 @@ def _moments(
             end = min(begin + BLOCK, count)
             _mass_block(begin, end, weights, opacities, power, mass)
             for cloud in range(len(clouds)):
-                read_columns(clouds[cloud], begin, end, places, BLOCK)
+                read_columns(clouds[cloud], begin, end, points, BLOCK)
                 for lane in range(0, BLOCK, LANES):
-                    x, y, z = load(places, lane), load(places, BLOCK + lane), load(places, 2 * BLOCK + lane)
+                    x, y, z = load(points, lane), load(points, BLOCK + lane), load(points, 2 * BLOCK + lane)
                     own = splat(np.float32(1)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z
                     for i in range(len(own)):
                         store(moments, i * BLOCK + lane, own[i])
-                transpose(moments, LANES, BLOCK, turned)
+                transpose(moments, LANES, BLOCK, transposed)
                 rows = (joints + 7) // 8 * 8
-                add_product(mass, 0, BLOCK, 1, turned, 0, LANES, BLOCK, sums[cloud, chunk], 0, LANES, rows, LANES)
+                add_product(mass, 0, BLOCK, 1, transposed, 0, LANES, BLOCK, sums[cloud, chunk], 0, LANES, rows, LANES)
 
 
 @kernel
 def _pull(
     tickets: np.ndarray, clouds: tuple, weights: np.ndarray, opacities: np.ndarray, power: float, rows: np.ndarray,
-    slopes: tuple,
+    grads: tuple,
 ) -> None:  # fmt: skip
     """Set the gradients of the points: mass-weighted sums of linear functions, rows [clouds, J x 16] of 3 x 4."""
     count, joints = weights.shape
-    mass, places, made, own = _scratch(joints)
+    mass, points, made, own = _scratch(joints)
     while True:
         begin = take_ticket(tickets) * BLOCK
         if begin >= count:
@@ -92,37 +89,30 @@ def _pull(
         end = min(begin + BLOCK, count)
         _mass_block(begin, end, weights, opacities, power, mass)
         for cloud in range(len(clouds)):
-            read_columns(clouds[cloud], begin, end, places, BLOCK)
+            read_columns(clouds[cloud], begin, end, points, BLOCK)
             own[:] = 0
             add_product(rows[cloud], 0, 1, LANES, mass, 0, BLOCK, joints, own, 0, BLOCK, LANES, BLOCK)
             for lane in range(0, BLOCK, LANES):
-                x, y, z = load(places, lane), load(places, BLOCK + lane), load(places, 2 * BLOCK + lane)
+                x, y, z = load(points, lane), load(points, BLOCK + lane), load(points, 2 * BLOCK + lane)
                 for i in range(3):
                     a, b, c, d = four_rows(own, 4 * i, lane)
                     store(made, i * BLOCK + lane, fma(a, x, fma(b, y, fma(c, z, d))))
-            write_columns(made, BLOCK, slopes[cloud], begin, end)
+            write_columns(made, BLOCK, grads[cloud], begin, end)
 
 
 def compactness(clouds: Sequence[Tensor], weights: Tensor, opacities: Tensor, power: float) -> Tensor:
-    """Mean over clouds and parts of the two smaller eigenvalues of a part's covariance; float32, CPU.
-
-    Args:
-        clouds: of the same Gaussians, [n, 3] each; the only inputs that get gradients.
-        weights: skinning weights, [n, J].
-        opacities: [n].
-        power: exponent on the weights.
-    """
+    """Compute `compact_loss`; float32 on the CPU, gradients for the clouds only."""
     return _Compactness.apply(weights, opacities, power, *clouds)
 
 
 class _Compactness(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, weights: Tensor, opacities: Tensor, power: float, *clouds: Tensor) -> Tensor:
-        places, given = tuple(map(array, clouds)), (*map(array, (weights, opacities)), power)
+        points, given = tuple(map(array, clouds)), (*map(array, (weights, opacities)), power)
         joints, chunks = weights.shape[1], max(1, -(-len(weights) // CHUNK))
         room = -(-joints // LANES) * LANES
         sums = np.zeros((len(clouds), chunks, room * LANES), np.float32)
-        run(_moments, [(np.zeros(1, np.int64), places, *given, sums)] * thread_count())
+        run_tickets(_moments, points, *given, sums)
         total = sums.sum(axis=1, dtype=np.float64).reshape(len(clouds), room, LANES)[:, :joints]
         used = total[..., 0] >= 1
         mass, parts = np.where(used, total[..., 0], 1.0), np.maximum(1, used.sum(axis=-1, keepdims=True))
@@ -133,16 +123,16 @@ class _Compactness(torch.autograd.Function):
         across = np.eye(3) - top[..., :, None] * top[..., None, :]
         share = used / (mass * parts * len(clouds))
         rows = np.zeros((len(clouds), joints, LANES), np.float32)
-        slopes = np.concatenate((across, -(across @ center[..., :, None])), axis=-1)
-        rows[..., :12] = (2 * share[..., None, None] * slopes).reshape(-1, joints, 12)
-        ctx.places, ctx.given, ctx.rows = places, given, rows.reshape(len(clouds), -1)
+        grads = np.concatenate((across, -(across @ center[..., :, None])), axis=-1)
+        rows[..., :12] = (2 * share[..., None, None] * grads).reshape(-1, joints, 12)
+        ctx.points, ctx.given, ctx.rows = points, given, rows.reshape(len(clouds), -1)
         value = (used / parts * (across * covariance).sum(axis=(-1, -2))).sum() / len(clouds)
         return torch.tensor(value, dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
-        made = [torch.empty(each.shape, dtype=torch.float32) for each in ctx.places]
-        rows, slopes = ctx.rows * slope.item(), tuple(each.numpy() for each in made)
-        run(_pull, [(np.zeros(1, np.int64), ctx.places, *ctx.given, rows, slopes)] * thread_count())
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        made = [torch.empty(each.shape, dtype=torch.float32) for each in ctx.points]
+        rows, grads = ctx.rows * grad.item(), tuple(each.numpy() for each in made)
+        run_tickets(_pull, ctx.points, *ctx.given, rows, grads)
         return None, None, None, *made

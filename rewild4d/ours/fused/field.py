@@ -1,7 +1,4 @@
-"""The skinning field: trilinear samples for the Gaussians, and the total variation, with one gradient for both.
-
-The twins in plain torch are `SkinningField.sample` (ours/skinning.py) and `tv_loss` (ours/geometry_losses.py).
-"""
+"""Skinning field: trilinear samples at the Gaussians, and the total variation, with one gradient for both."""
 
 from typing import Any
 
@@ -16,11 +13,11 @@ from rewild4d.kernels.rows import add_scaled
 from rewild4d.kernels.simd import LANES, fma, maximum, minimum, splat, take_ticket
 from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.tails import lanes_sum, load_first, store_first
-from rewild4d.kernels.threads import run, thread_count
+from rewild4d.kernels.threads import run_tickets
 
 FIELD = Kernel(
     "skinning field",
-    "bbcf56220f1f",
+    "22cb95aaf892",
     "rewild4d.ours.skinning:SkinningField.sample",
     "rewild4d.ours.skinning:SkinningField.sample_and_vary",
     "rewild4d.ours.losses.regularizers:tv_loss",
@@ -34,12 +31,11 @@ RESIDUAL_FIELD = Kernel(
 )
 
 CHUNK = 1024
-"""Gaussians a unit of work holds."""
 
 
 @inlined
 def _held(step: Any, width: float) -> Any:
-    """The Huber function's slope: a step held between -width and width."""
+    """Clamp a difference to [-width, width]: the derivative of the Huber function."""
     return minimum(splat(width), maximum(splat(-width), step))
 
 
@@ -49,11 +45,9 @@ def _huber(step: Any, held: Any) -> Any:
 
 
 @kernel
-def _variation(tickets: np.ndarray, grid: np.ndarray, delta: float, slope: np.ndarray, sums: np.ndarray) -> None:
-    """Set slope [R, R, R J] and sums [R] of the Huber function of forward differences, plane by plane.
-
-    Beyond the border lies the border once more: a difference of zero.
-    """
+def _variation(tickets: np.ndarray, grid: np.ndarray, delta: float, grad: np.ndarray, sums: np.ndarray) -> None:
+    """Set grad [R, R, R J] and sums [R] of the Huber function of forward differences, plane by plane; the border is
+    repeated."""
     size, line = grid.shape[0], grid.shape[2]
     joints, last = line // size, size - 1
     width, zero = np.float32(delta), splat(np.float32(0))
@@ -64,7 +58,7 @@ def _variation(tickets: np.ndarray, grid: np.ndarray, delta: float, slope: np.nd
             return
         plane_sum = 0.0
         for y in range(size):
-            own, out, total = grid[x, y], slope[x, y], zero
+            own, out, total = grid[x, y], grad[x, y], zero
             wide[:joints], wide[joints : joints + line], wide[joints + line :] = own[:joints], own, own[line - joints :]
             behind, ahead = grid[x, max(y - 1, 0)], grid[x, min(y + 1, last)]
             below, above = grid[max(x - 1, 0), y], grid[min(x + 1, last), y]
@@ -85,10 +79,10 @@ def _variation(tickets: np.ndarray, grid: np.ndarray, delta: float, slope: np.nd
 
 @inlined
 def _corner(points: np.ndarray, n: int, axis: int, origin: np.ndarray, pitch: np.ndarray, last: int) -> tuple:
-    """Voxel below a point along one axis, and the share of the one above; outside the cube the border counts."""
-    place = min(max((points[n, axis] - origin[axis]) / pitch[axis], np.float32(0)), np.float32(last))
-    base = min(int(place), last - 1)
-    return base, place - np.float32(base)
+    """Return the voxel below a point along one axis and the weight of the next one; points are clamped to the cube."""
+    position = min(max((points[n, axis] - origin[axis]) / pitch[axis], np.float32(0)), np.float32(last))
+    base = min(int(position), last - 1)
+    return base, position - np.float32(base)
 
 
 @kernel
@@ -96,7 +90,7 @@ def _sample_forward(
     tickets: np.ndarray, table: np.ndarray, points: np.ndarray, origin: np.ndarray, pitch: np.ndarray, size: int,
     joints: int, weights: np.ndarray,
 ) -> None:  # fmt: skip
-    """Set the rows of weights; it and the table are flat."""
+    """Set the rows of weights; weights and table are flat."""
     while True:
         begin = take_ticket(tickets) * CHUNK
         if begin >= len(points):
@@ -123,7 +117,7 @@ def _sample_forward(
 def _sort_by_plane(
     points: np.ndarray, origin: np.ndarray, pitch: np.ndarray, size: int, order: np.ndarray, starts: np.ndarray
 ) -> None:
-    """Points by the voxel plane below them along x; starts [size + 1]."""
+    """Sort points by the voxel plane below them along x; starts [size + 1]."""
     starts[:] = 0
     for n in range(len(points)):
         starts[_corner(points, n, 0, origin, pitch, size - 1)[0] + 1] += 1
@@ -139,12 +133,11 @@ def _sort_by_plane(
 @kernel
 def _sample_backward(
     tickets: np.ndarray, points: np.ndarray, origin: np.ndarray, pitch: np.ndarray, size: int, order: np.ndarray,
-    starts: np.ndarray, joints: int, slope: np.ndarray, variation: np.ndarray, share_of_it: float, on_table: np.ndarray,
+    starts: np.ndarray, joints: int, grad: np.ndarray, variation: np.ndarray, variation_share: float,
+    on_table: np.ndarray,
 ) -> None:  # fmt: skip
-    """Set on_table plane by plane: first from the points below a plane, then from those above it, each in order.
-
-    A plane starts from its share of the slope of the total variation, where that is not empty. All arrays are flat.
-    """
+    """Set on_table plane by plane: the scaled gradient of the variation, if any, then the points below a plane, then
+    those above, each in order. All arrays are flat."""
     line = size * size * joints
     while True:
         plane = take_ticket(tickets)
@@ -153,7 +146,7 @@ def _sample_backward(
         own = on_table[plane * line : (plane + 1) * line]
         own[:] = 0
         if len(variation) > 0:
-            add_scaled(np.float32(share_of_it), variation, plane * line, own, 0, line)
+            add_scaled(np.float32(variation_share), variation, plane * line, own, 0, line)
         for upper in (1, 0):
             if plane < upper:
                 continue
@@ -168,24 +161,17 @@ def _sample_backward(
                         share = along * (ahead_y if j else 1 - ahead_y)
                         share = np.float32(share * (ahead_z if k else 1 - ahead_z))
                         row = (plane * size + y + j) * size + z + k
-                        add_scaled(share, slope, n * joints, on_table, row * joints, joints)
+                        add_scaled(share, grad, n * joints, on_table, row * joints, joints)
 
 
 def sample_grid(
     table: Tensor, points: Tensor, origin: Tensor, pitch: Tensor, size: int, delta: float | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Trilinear samples of a cubic grid of vectors, and its total variation; float32, CPU.
+    """Sample a cubic grid of vectors [size^3, J], x slowest, at points [n, 3], and compute its `tv_loss`; float32 on
+    the CPU.
 
-    Args:
-        table: x slowest, [size^3, J]; differentiable.
-        points: [n, 3].
-        origin: of the first voxel's centre, [3].
-        pitch: [3].
-        size: voxels along each axis, at least 2.
-        delta: where the Huber function of the variation turns linear; None leaves the variation out.
-
-    Returns:
-        Samples [n, J], and the mean over the axes of the mean Huber function of forward differences, scalar.
+    Only the table gets a gradient. ``origin`` is the centre of the first voxel; without ``delta`` the variation is
+    skipped.
     """
     return _Sample.apply(table, points, origin, pitch, size, delta)
 
@@ -197,32 +183,26 @@ class _Sample(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         grid, joints = array(table), table.shape[1]
         weights = table.new_empty(len(points), joints)
-        place = *map(array, (points, origin, pitch)), size
-        run(
-            _sample_forward,
-            [(np.zeros(1, np.int64), grid.ravel(), *place, joints, weights.numpy().ravel())] * thread_count(),
-        )
-        ctx.place, ctx.slope, total = place, np.empty(0, np.float32), 0.0
+        given = *map(array, (points, origin, pitch)), size
+        run_tickets(_sample_forward, grid.ravel(), *given, joints, weights.numpy().ravel())
+        ctx.given, ctx.grad, total = given, np.empty(0, np.float32), 0.0
         # Each axis has as many differences as any other.
         ctx.share = 1 / (3 * (size - 1) * size * size * joints)
         if delta is not None:
-            slope, sums = np.empty((size, size, size * joints), np.float32), np.empty(size)
-            lines = grid.reshape(slope.shape)
-            run(_variation, [(np.zeros(1, np.int64), lines, delta, slope, sums)] * thread_count())
-            ctx.slope, total = slope.ravel(), float(sums.sum()) * ctx.share
+            grad, sums = np.empty((size, size, size * joints), np.float32), np.empty(size)
+            lines = grid.reshape(grad.shape)
+            run_tickets(_variation, lines, delta, grad, sums)
+            ctx.grad, total = grad.ravel(), float(sums.sum()) * ctx.share
         return weights, torch.tensor(total, dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: Tensor, by_variation: Tensor) -> tuple[Tensor | None, ...]:
-        points, size = ctx.place[0], ctx.place[3]
+    def backward(ctx: Any, grad: Tensor, by_variation: Tensor) -> tuple[Tensor | None, ...]:
+        points, size = ctx.given[0], ctx.given[3]
         order, starts = np.empty(len(points), np.int32), np.empty(size + 1, np.int64)
-        _sort_by_plane(*ctx.place, order, starts)
-        joints = slope.shape[1]
+        _sort_by_plane(*ctx.given, order, starts)
+        joints = grad.shape[1]
         on_table = torch.empty(size**3, joints)
-        call = (
-            np.zeros(1, np.int64), *ctx.place, order, starts, joints, array(slope).ravel(), ctx.slope,
-            float(by_variation) * ctx.share, on_table.numpy().ravel(),
-        )  # fmt: skip
-        run(_sample_backward, [call] * thread_count())
+        rows, variation_share = (*ctx.given, order, starts, joints), float(by_variation) * ctx.share
+        run_tickets(_sample_backward, *rows, array(grad).ravel(), ctx.grad, variation_share, on_table.numpy().ravel())
         return on_table, None, None, None, None, None

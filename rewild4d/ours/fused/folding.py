@@ -1,7 +1,5 @@
-"""The deformation network's layers as one flat array, with the few keys and values folded into its first matrices.
-
-The twin in plain torch is `DeformNetwork._attention` (ours/deform.py).
-"""
+"""Flatten the deformation network, its few keys and values folded into the first matrices
+(`DeformNetwork._attention`)."""
 
 from typing import Any, NamedTuple
 
@@ -11,11 +9,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rewild4d.kernels.arrays import array
-from rewild4d.ours.fused.layers import OUTPUTS, Layout, layout, padded
+from rewild4d.ours.fused.layers import OUTPUTS, Layout, layout, round_up
 
 
 class Layers(NamedTuple):
-    """Weights and biases as `DeformNetwork` has them, [outputs, inputs] and [outputs]."""
+    """Weights [outputs, inputs] and biases [outputs] of `DeformNetwork`."""
 
     query: Any
     query_bias: Any
@@ -36,23 +34,14 @@ class Layers(NamedTuple):
 
 
 def fold(features: Tensor, layers: Layers, heads: int) -> tuple[Tensor, Layout]:
-    """The flat array of a network that attends to these parts, and where its matrices lie; float32, CPU.
-
-    Args:
-        features: of the parts, [J, K]; differentiable, as all of ``layers``.
-        layers: weights [outputs, inputs] and biases [outputs].
-        heads: of the attention; they share the width.
-
-    Returns:
-        [total], and its layout.
-    """
+    """Return the flat array [total] of a network that attends to features [J, K], and its layout; float32, CPU."""
     width, inputs = layers.query.shape
     sizes = layout(inputs, heads * len(features), width, heads)
     return _Fold.apply(features, sizes, *layers), sizes
 
 
 def _by_head(own: Layers, heads: int) -> tuple[np.ndarray, np.ndarray]:
-    """Query weights [H, S, inputs] and projection weights [H, width, S] of each head."""
+    """Return query weights [H, S, inputs] and projection weights [H, width, S] of each head."""
     width, inputs = own.query.shape
     asking = own.query.reshape(heads, width // heads, inputs)
     return asking, own.project.reshape(width, heads, width // heads).transpose(1, 0, 2)
@@ -84,13 +73,13 @@ class _Fold(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         features, *layers = ctx.saved_tensors
         given, own = array(features), Layers(*map(array, layers))
         sizes, (keys, values) = ctx.sizes, ctx.made
         heads, width = sizes.heads, sizes.width
         asking, mixing = _by_head(own, heads)
-        pieces = matrices(array(slope), sizes)
+        pieces = matrices(array(grad), sizes)
         on_asked = pieces.ask[0].reshape(heads, -1, sizes.inputs)
         on_bias = pieces.ask[1].reshape(heads, -1, 1)
         on_mixed = pieces.mix[0].reshape(width, heads, -1).transpose(1, 0, 2)
@@ -98,10 +87,10 @@ class _Fold(torch.autograd.Function):
         on_keys = (on_asked @ asking.transpose(0, 2, 1) + on_bias * bias).transpose(1, 0, 2) * ctx.scale
         on_values = (mixing.transpose(0, 2, 1) @ on_mixed).transpose(2, 0, 1)
         on_keys, on_values = on_keys.reshape(-1, width), on_values.reshape(-1, width)
-        turned = keys.transpose(0, 2, 1)
+        transposed = keys.transpose(0, 2, 1)
         found = Layers(
-            query=(turned @ on_asked).reshape(width, -1),
-            query_bias=(turned @ on_bias).ravel(),
+            query=(transposed @ on_asked).reshape(width, -1),
+            query_bias=(transposed @ on_bias).ravel(),
             skip=pieces.skip[0],
             skip_bias=pieces.skip[1],
             key=on_keys.T @ given,
@@ -126,7 +115,7 @@ class _Fold(torch.autograd.Function):
 
 
 class Matrices(NamedTuple):
-    """Views of a matrix and of its bias inside a flat array, without the padding."""
+    """Views of matrices and their biases in a flat array, without the padding."""
 
     ask: tuple[np.ndarray, np.ndarray]
     skip: tuple[np.ndarray, np.ndarray]
@@ -137,11 +126,11 @@ class Matrices(NamedTuple):
 
 
 def matrices(flat: np.ndarray, sizes: Layout) -> Matrices:
-    """The parts of a flat array, [sizes.total]."""
+    """Return the parts of a flat array, [sizes.total]."""
     width = sizes.width
 
     def piece(first: int, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-        wide, end = padded(columns), first + padded(rows) * padded(columns)
+        wide, end = round_up(columns), first + round_up(rows) * round_up(columns)
         return flat[first:end].reshape(-1, wide)[:rows, :columns], flat[end : end + rows]
 
     return Matrices(

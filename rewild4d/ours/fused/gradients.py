@@ -1,4 +1,4 @@
-"""Norms of many gradients in one call, and their scaling; the twin is `torch.nn.utils.clip_grad_norm_`."""
+"""Norm and scaling of many gradients in one call."""
 
 import math
 
@@ -9,7 +9,7 @@ from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.pointers import floats_at
 from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
 from rewild4d.kernels.switch import Kernel
-from rewild4d.kernels.threads import run, thread_count
+from rewild4d.kernels.threads import run_tickets
 
 GRADIENTS = Kernel(
     "norms of gradients",
@@ -21,14 +21,14 @@ GRADIENTS = Kernel(
 )
 
 CHUNK = 65536
-"""Numbers a unit of work holds; sums are added over these, whatever the number of threads."""
+"""Numbers of a unit of work; sums run over units, so they do not depend on the number of threads."""
 SERIAL_BELOW = 8 * CHUNK
-"""Numbers for which a second thread is not woken."""
+"""Count of numbers below which one thread is used."""
 
 
 @kernel
 def _sums(numbers: np.ndarray, rows: np.ndarray) -> tuple:
-    """The sum of squares, and zero or (where one is not finite) NaN; ``rows`` is scratch of 32 numbers."""
+    """Return the sum of squares, and NaN where a number is not finite, else 0; ``rows`` is scratch of 32 numbers."""
     zero = splat(np.float32(0))
     a, b, c, d, e, f = zero, zero, zero, zero, zero, zero
     whole = len(numbers) // (4 * LANES) * (4 * LANES)
@@ -51,44 +51,43 @@ def _sums(numbers: np.ndarray, rows: np.ndarray) -> tuple:
 
 
 @kernel
-def _measure(tickets: np.ndarray, places: np.ndarray, found: np.ndarray) -> None:
-    """Set found [chunks, 2] from places [chunks, 2], which are addresses and lengths."""
+def _measure(tickets: np.ndarray, spans: np.ndarray, found: np.ndarray) -> None:
+    """Set found [chunks, 2] from spans [chunks, 2]: addresses and lengths."""
     rows = np.empty(2 * LANES, np.float32)
     while True:
         chunk = take_ticket(tickets)
-        if chunk >= len(places):
+        if chunk >= len(spans):
             return
-        found[chunk, 0], found[chunk, 1] = _sums(floats_at(places[chunk, 0], places[chunk, 1]), rows)
+        found[chunk, 0], found[chunk, 1] = _sums(floats_at(spans[chunk, 0], spans[chunk, 1]), rows)
 
 
 @kernel
-def _scale(places: np.ndarray, factor: float) -> None:
+def _scale(spans: np.ndarray, factor: float) -> None:
     share = np.float32(factor)
-    for chunk in range(len(places)):
-        numbers = floats_at(places[chunk, 0], places[chunk, 1])
+    for chunk in range(len(spans)):
+        numbers = floats_at(spans[chunk, 0], spans[chunk, 1])
         for i in range(len(numbers)):
             numbers[i] *= share
 
 
 def _chunks(tensors: list[Tensor]) -> np.ndarray:
-    """Addresses and lengths of the chunks of tensors, [chunks, 2]."""
-    places = []
+    """Return addresses and lengths of the chunks of tensors, [chunks, 2]."""
+    spans = []
     for tensor in tensors:
         address, count = tensor.data_ptr(), tensor.numel()
-        places += [(address + 4 * i, min(CHUNK, count - i)) for i in range(0, count, CHUNK)]
-    return np.array(places, np.int64).reshape(-1, 2)
+        spans += [(address + 4 * i, min(CHUNK, count - i)) for i in range(0, count, CHUNK)]
+    return np.array(spans, np.int64).reshape(-1, 2)
 
 
 def measure(tensors: list[Tensor]) -> tuple[float, bool]:
-    """The norm of all numbers, and whether each is finite; float32, CPU, without gaps."""
-    places = _chunks(tensors)
-    found = np.empty((len(places), 2))
-    threads = thread_count() if places[:, 1].sum() > SERIAL_BELOW else 1
-    run(_measure, [(np.zeros(1, np.int64), places, found)] * threads)
+    """Return the norm of all numbers, and whether all are finite; packed float32 tensors on the CPU."""
+    spans = _chunks(tensors)
+    found = np.empty((len(spans), 2))
+    run_tickets(_measure, spans, found, threads=None if spans[:, 1].sum() > SERIAL_BELOW else 1)
     squares, flaw = found.sum(axis=0).tolist()
     return math.sqrt(squares), flaw == 0
 
 
 def scale(tensors: list[Tensor], factor: float) -> None:
-    """Multiply in place; float32, CPU, without gaps."""
+    """Multiply packed float32 tensors on the CPU in place."""
     _scale(_chunks(tensors), factor)

@@ -1,7 +1,4 @@
-"""Colour of every Gaussian from one viewpoint, its direction turned back into the canonical frame first.
-
-The twin in plain torch is `Gaussians.seen_rgb` (ours/canonical.py).
-"""
+"""Colour of every Gaussian from one viewpoint, whose direction is first rotated into the canonical frame."""
 
 from typing import Any
 
@@ -16,18 +13,17 @@ from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.harmonics import set_band
 from rewild4d.kernels.simd import LANES, divide, fma, load, maximum, select_gt, splat, square_root, store, take_ticket
 from rewild4d.kernels.switch import Kernel
-from rewild4d.kernels.threads import run, thread_count
+from rewild4d.kernels.threads import run_tickets
 from rewild4d.ours.fused.quaternions import dot, times_back
 
 COLORS = Kernel(
     "colours from harmonics",
-    "0848b962f5dd",
+    "7fcc9a0fde99",
     "rewild4d.ours.canonical:Gaussians.seen_rgb",
-    "rewild4d.ours.canonical:Gaussians.turns",
+    "rewild4d.ours.canonical:Gaussians.rotations_to",
 )
 
 CHUNK = 8 * BLOCK
-"""Gaussians a unit of work holds."""
 
 
 @inlined
@@ -37,17 +33,17 @@ def _cross(a: tuple, b: tuple) -> tuple:
 
 @inlined
 def _direction(means: np.ndarray, quats: np.ndarray, rest: np.ndarray, lane: int, eye: np.ndarray) -> tuple:
-    """Unit directions from the eye to sixteen Gaussians, as these saw it at rest."""
+    """Return unit directions from the eye to sixteen Gaussians in the canonical frame."""
     one, two, least = splat(np.float32(1)), splat(np.float32(2)), splat(np.float32(1e-24))
     x, y = load(means, lane) - splat(eye[0]), load(means, BLOCK + lane) - splat(eye[1])
     z = load(means, 2 * BLOCK + lane) - splat(eye[2])
     # In this order of the limits a NaN stays one.
     inverse = divide(one, square_root(maximum(least, x * x + y * y + z * z)))
     p, s = four_rows(quats, 0, lane), four_rows(rest, 0, lane)
-    # The quaternion rest conj(posed) turns back; it may have any length.
-    turn = times_back(s, p)
-    w, axis = turn[0], (turn[1], turn[2], turn[3])
-    scale = divide(two, maximum(least, dot(turn, turn)))
+    # The quaternion rest conj(posed) rotations back; it may have any length.
+    back = times_back(s, p)
+    w, axis = back[0], (back[1], back[2], back[3])
+    scale = divide(two, maximum(least, dot(back, back)))
     once = _cross(axis, (x, y, z))
     twice = _cross(axis, once)
     return (
@@ -62,13 +58,13 @@ def _set_block(
     begin: int, end: int, means: np.ndarray, quats: np.ndarray, rest: np.ndarray, eye: np.ndarray, degree: int,
     rows: tuple, values: np.ndarray,
 ) -> None:  # fmt: skip
-    """Set the values of the basis functions above degree 0, [15, BLOCK]; ``rows`` is scratch."""
-    places, turns, rests = rows
-    read_columns(means, begin, end, places, BLOCK)
-    read_columns(quats, begin, end, turns, BLOCK)
+    """Set the basis functions above degree 0, [15, BLOCK]; ``rows`` is scratch."""
+    positions, rotations, rests = rows
+    read_columns(means, begin, end, positions, BLOCK)
+    read_columns(quats, begin, end, rotations, BLOCK)
     read_columns(rest, begin, end, rests, BLOCK)
     for lane in range(0, BLOCK, LANES):
-        x, y, z = _direction(places, turns, rests, lane, eye)
+        x, y, z = _direction(positions, rotations, rests, lane, eye)
         for level in range(1, degree + 1):
             set_band(x, y, z, level, values[(level * level - 1) * BLOCK + lane :], BLOCK)
 
@@ -109,10 +105,10 @@ def _forward(
 @kernel
 def _backward(
     tickets: np.ndarray, means: np.ndarray, quats: np.ndarray, rest: np.ndarray, eye: np.ndarray, degree: int,
-    gain: float, seen: np.ndarray, slope: np.ndarray, on_colors: np.ndarray,
+    gain: float, seen: np.ndarray, grad: np.ndarray, on_colors: np.ndarray,
 ) -> None:  # fmt: skip
     values, rows = np.empty(15 * BLOCK, np.float32), _scratch()
-    shown, slopes = np.empty(LANES * BLOCK, np.float32), np.empty(LANES * BLOCK, np.float32)
+    shown, grads = np.empty(LANES * BLOCK, np.float32), np.empty(LANES * BLOCK, np.float32)
     columns = np.zeros((on_colors.shape[1] + 15) // 16 * 16 * BLOCK, np.float32)
     count, share, zero = (degree + 1) ** 2 - 1, splat(np.float32(1 / gain)), splat(np.float32(0))
     while True:
@@ -123,34 +119,24 @@ def _backward(
             end = min(begin + BLOCK, len(means))
             _set_block(begin, end, means, quats, rest, eye, degree, rows, values)
             read_columns(seen, begin, end, shown, BLOCK)
-            read_columns(slope, begin, end, slopes, BLOCK)
+            read_columns(grad, begin, end, grads, BLOCK)
             for lane in range(0, BLOCK, LANES):
                 for channel in range(3):
-                    place = channel * BLOCK + lane
-                    own = select_gt(load(shown, place), zero, load(slopes, place), zero)
-                    store(columns, place, own)
+                    index = channel * BLOCK + lane
+                    own = select_gt(load(shown, index), zero, load(grads, index), zero)
+                    store(columns, index, own)
                     own = own * share
                     for k in range(count):
-                        store(columns, (3 * k + 3) * BLOCK + place, load(values, k * BLOCK + lane) * own)
+                        store(columns, (3 * k + 3) * BLOCK + index, load(values, k * BLOCK + lane) * own)
             write_columns(columns, BLOCK, on_colors, begin, end)
 
 
 def seen_rgb(
     colors: Tensor, means: Tensor, quats: Tensor, rest: Tensor, eye: Tensor, degree: int, gain: float
 ) -> Tensor:
-    """Colours from a viewpoint; float32, CPU. Gradients reach the colours alone.
+    """Compute `Gaussians.seen_rgb`; float32 on the CPU, gradients for the colours only.
 
-    Args:
-        colors: RGB, then ``gain`` times the coefficients above degree 0, [n, k, 3].
-        means: posed, [n, 3].
-        quats: posed, any length, [n, 4].
-        rest: canonical, any length, [n, 4].
-        eye: [3].
-        degree: in use, 1 to 3.
-        gain: of the coefficients.
-
-    Returns:
-        Not below 0, [n, 3].
+    ``quats`` (posed) and ``rest`` (canonical) may have any length; ``gain`` multiplies the coefficients above degree 0.
     """
     if not 1 <= degree <= 3:
         raise ValueError(f"expected a degree from 1 to 3, got {degree}")
@@ -167,15 +153,14 @@ class _Seen(torch.autograd.Function):
         seen = torch.empty(means.shape, dtype=torch.float32)
         given = *map(array, (means, quats, rest, eye.float())), degree, gain
         flat = array(colors).reshape(len(colors), 3 * colors.shape[1])
-        run(_forward, [(np.zeros(1, np.int64), flat, *given, seen.numpy())] * thread_count())
+        run_tickets(_forward, flat, *given, seen.numpy())
         ctx.given, ctx.seen, ctx.shape = given, seen.numpy(), colors.shape
         return seen
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         on_colors = torch.empty(ctx.shape, dtype=torch.float32)
-        flat = on_colors.numpy().reshape(len(slope), 3 * ctx.shape[1])
-        call = np.zeros(1, np.int64), *ctx.given, ctx.seen, array(slope), flat
-        run(_backward, [call] * thread_count())
+        flat = on_colors.numpy().reshape(len(grad), 3 * ctx.shape[1])
+        run_tickets(_backward, *ctx.given, ctx.seen, array(grad), flat)
         return on_colors, None, None, None, None, None, None

@@ -1,7 +1,4 @@
-"""Image losses and their gradients, strip by strip: L1 and SSIM of two composed images, BCE and Dice of two mattes.
-
-The twins in plain torch are in ours/losses.py.
-"""
+"""Image losses and their gradients, strip by strip: L1 and SSIM of two composed images, BCE and Dice of two mattes."""
 
 import math
 from typing import Any
@@ -15,11 +12,11 @@ from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.simd import LANES, divide, fma, keep_where_ge, load, maximum, splat, store, take_ticket
 from rewild4d.kernels.switch import Kernel
-from rewild4d.kernels.threads import run, thread_count
+from rewild4d.kernels.threads import run_tickets
 
 COLOUR_LOSSES = Kernel(
     "colour losses",
-    "0a0096d03ed4",
+    "9b896ed85346",
     "rewild4d.ours.losses.images:colour_losses",
     "rewild4d.ours.losses.images:ssim_map",
     "rewild4d.ours.losses.images:blur_matrix",
@@ -27,20 +24,20 @@ COLOUR_LOSSES = Kernel(
 SILHOUETTE = Kernel("silhouette loss", "ce00e8a2cb44", "rewild4d.ours.losses.images:silhouette_loss")
 
 STRIP = 24
-"""Rows of a unit of work; sums are added strip by strip, whatever the number of threads."""
+"""Rows of a unit of work; sums run over strips, so they do not depend on the number of threads."""
 HALF = 5
-"""Reach of SSIM's window."""
+"""Radius of SSIM's window in pixels."""
 TAPS = np.exp(-(np.arange(HALF + 1) ** 2) / (2 * 1.5**2))
 TAPS = (TAPS / (TAPS[0] + 2 * TAPS[1:].sum())).astype(np.float32)
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
 LANE_NUMBERS = np.arange(LANES, dtype=np.float32)
 LOWEST = np.float32(1e-5)
-"""A matte is kept this far from 0 and 1 before the logarithm."""
+"""Distance that a matte keeps from 0 and 1 before the logarithm."""
 
 
 @kernel
 def _stride(width: int) -> int:
-    """Length of a row in scratch: a vector of zeros on either side."""
+    """Return the length of a scratch row: the pixels between two vectors of zeros."""
     return (width + LANES - 1) // LANES * LANES + 2 * LANES
 
 
@@ -49,55 +46,46 @@ def _compose(
     image: np.ndarray, matte: np.ndarray, channel: int, behind: float, window: tuple, first: int, last: int,
     rows: np.ndarray,
 ) -> None:  # fmt: skip
-    """Rows first..last of the window over a background, zero beyond the window, into scratch."""
+    """Compose rows first..last of the window over a background into scratch, zero beyond the window."""
     top, left, height, width = window
     stride = _stride(width)
     rows[: (last - first) * stride] = 0
     for row in range(max(first, 0), min(last, height)):
-        place = (row - first) * stride + LANES
+        index = (row - first) * stride + LANES
         for column in range(width):
             y, x = top + row, left + column
-            rows[place + column] = image[channel, y, x] + (np.float32(1) - matte[0, y, x]) * behind
+            rows[index + column] = image[channel, y, x] + (np.float32(1) - matte[0, y, x]) * behind
 
 
 @kernel
-def _across(given: np.ndarray, place: int, taps: np.ndarray) -> Any:
-    """Horizontal blur of sixteen pixels."""
-    total = load(given, place) * splat(taps[0])
+def _blur(given: np.ndarray, index: int, step: int, taps: np.ndarray) -> Any:
+    """Blur sixteen pixels along a row (step 1) or a column (step: the row's length)."""
+    total = load(given, index) * splat(taps[0])
     for k in range(1, HALF + 1):
-        total = fma(load(given, place - k) + load(given, place + k), splat(taps[k]), total)
+        total = fma(load(given, index - k * step) + load(given, index + k * step), splat(taps[k]), total)
     return total
 
 
 @kernel
-def _across_product(a: np.ndarray, b: np.ndarray, place: int, taps: np.ndarray) -> Any:
-    """Horizontal blur of a product of two images, sixteen pixels."""
-    total = load(a, place) * load(b, place) * splat(taps[0])
+def _blur_product(a: np.ndarray, b: np.ndarray, index: int, taps: np.ndarray) -> Any:
+    """Blur a product of two images horizontally, sixteen pixels."""
+    total = load(a, index) * load(b, index) * splat(taps[0])
     for k in range(1, HALF + 1):
-        before, after = load(a, place - k) * load(b, place - k), load(a, place + k) * load(b, place + k)
+        before, after = load(a, index - k) * load(b, index - k), load(a, index + k) * load(b, index + k)
         total = fma(before + after, splat(taps[k]), total)
     return total
 
 
 @kernel
-def _down(given: np.ndarray, place: int, stride: int, taps: np.ndarray) -> Any:
-    """Vertical blur of sixteen pixels."""
-    total = load(given, place) * splat(taps[0])
-    for k in range(1, HALF + 1):
-        total = fma(load(given, place - k * stride) + load(given, place + k * stride), splat(taps[k]), total)
-    return total
-
-
-@kernel
 def _inside(value: Any, column: Any, inner: tuple) -> Any:
-    """The value between the inner columns, zero elsewhere."""
+    """Keep the value between the inner columns, zero elsewhere."""
     value = keep_where_ge(value, column, splat(np.float32(inner[2])))
     return keep_where_ge(value, splat(np.float32(inner[3] - 1)), column)
 
 
 @kernel
 def _similarity(mx: Any, my: Any, xx: Any, yy: Any, xy: Any) -> tuple:
-    """SSIM and its slopes by the blurred x, x x and x y."""
+    """Return SSIM and its gradients by the blurred x, x x and x y."""
     one, two = splat(np.float32(1)), splat(np.float32(2))
     product, squares = mx * my, fma(mx, mx, my * my)
     a, b = fma(two, product, splat(C1)), fma(two, xy - product, splat(C2))
@@ -111,12 +99,11 @@ def _similarity(mx: Any, my: Any, xx: Any, yy: Any, xy: Any) -> tuple:
 
 @kernel
 def _colour_forward(
-    tickets: np.ndarray, image: np.ndarray, matte: np.ndarray, truth: np.ndarray, mask: np.ndarray,
-    behind: np.ndarray, window: tuple, inner: tuple, taps: np.ndarray, lanes: np.ndarray, slopes: np.ndarray,
-    sums: np.ndarray,
+    tickets: np.ndarray, given: tuple, window: tuple, inner: tuple, taps: np.ndarray, lanes: np.ndarray,
+    grads: np.ndarray, sums: np.ndarray,
 ) -> None:  # fmt: skip
-    """Fill slopes [9, height + 10, stride] of SSIM and sums [strips, 2]: of |x - y| and of 1 - SSIM."""
-    _, _, height, width = window
+    """Fill grads [9, height + 10, stride] of SSIM and sums [strips, 2]: of |x - y| and of 1 - SSIM."""
+    (image, matte, truth, mask, behind), (_, _, height, width) = given, window
     stride = _stride(width)
     xs, ys = np.empty((STRIP + 2 * HALF) * stride, np.float32), np.empty((STRIP + 2 * HALF) * stride, np.float32)
     blurred = np.zeros((5, (STRIP + 2 * HALF) * stride), np.float32)
@@ -131,29 +118,29 @@ def _colour_forward(
         for channel in range(3):
             _compose(image, matte, channel, behind[channel], window, first - HALF, last + HALF, xs)
             _compose(truth, mask, channel, behind[channel], window, first - HALF, last + HALF, ys)
-            for place in range(LANES, (last - first + 2 * HALF) * stride - LANES, LANES):
-                store(blurred[0], place, _across(xs, place, taps))
-                store(blurred[1], place, _across(ys, place, taps))
-                store(blurred[2], place, _across_product(xs, xs, place, taps))
-                store(blurred[3], place, _across_product(ys, ys, place, taps))
-                store(blurred[4], place, _across_product(xs, ys, place, taps))
+            for index in range(LANES, (last - first + 2 * HALF) * stride - LANES, LANES):
+                store(blurred[0], index, _blur(xs, index, 1, taps))
+                store(blurred[1], index, _blur(ys, index, 1, taps))
+                store(blurred[2], index, _blur_product(xs, xs, index, taps))
+                store(blurred[3], index, _blur_product(ys, ys, index, taps))
+                store(blurred[4], index, _blur_product(xs, ys, index, taps))
             for row in range(first, last):
                 for column in range(LANES, stride - LANES, LANES):
-                    place = (row - first + HALF) * stride + column
-                    difference = load(xs, place) - load(ys, place)
+                    index = (row - first + HALF) * stride + column
+                    difference = load(xs, index) - load(ys, index)
                     apart = apart + maximum(difference, splat(np.float32(0)) - difference)
                     value, by_mean, by_square, by_product = _similarity(
-                        _down(blurred[0], place, stride, taps), _down(blurred[1], place, stride, taps),
-                        _down(blurred[2], place, stride, taps), _down(blurred[3], place, stride, taps),
-                        _down(blurred[4], place, stride, taps),
+                        _blur(blurred[0], index, stride, taps), _blur(blurred[1], index, stride, taps),
+                        _blur(blurred[2], index, stride, taps), _blur(blurred[3], index, stride, taps),
+                        _blur(blurred[4], index, stride, taps),
                     )  # fmt: skip
                     here = load(lanes, 0) + splat(np.float32(column - LANES))
                     target = (row + HALF) * stride + column
                     if inner[0] <= row < inner[1]:
                         unlike = unlike + _inside(splat(np.float32(1)) - value, here, inner)
-                        store(slopes[3 * channel], target, _inside(by_mean, here, inner))
-                        store(slopes[3 * channel + 1], target, _inside(by_square, here, inner))
-                        store(slopes[3 * channel + 2], target, _inside(by_product, here, inner))
+                        store(grads[3 * channel], target, _inside(by_mean, here, inner))
+                        store(grads[3 * channel + 1], target, _inside(by_square, here, inner))
+                        store(grads[3 * channel + 2], target, _inside(by_product, here, inner))
         store(totals, 0, apart)
         store(totals, LANES, unlike)
         sums[strip, 0], sums[strip, 1] = totals[:LANES].sum(), totals[LANES:].sum()
@@ -161,16 +148,15 @@ def _colour_forward(
 
 @kernel
 def _colour_backward(
-    tickets: np.ndarray, image: np.ndarray, matte: np.ndarray, truth: np.ndarray, mask: np.ndarray,
-    behind: np.ndarray, window: tuple, taps: np.ndarray, slopes: np.ndarray, g_apart: float, g_unlike: float,
-    on_image: np.ndarray, on_matte: np.ndarray,
+    tickets: np.ndarray, given: tuple, window: tuple, taps: np.ndarray, grads: np.ndarray, g_apart: float,
+    g_unlike: float, on_image: np.ndarray, on_matte: np.ndarray,
 ) -> None:  # fmt: skip
     """Set the gradients inside the window, given those of the two sums."""
-    top, left, height, width = window
+    (image, matte, truth, mask, behind), (top, left, height, width) = given, window
     stride = _stride(width)
     xs, ys = np.empty(STRIP * stride, np.float32), np.empty(STRIP * stride, np.float32)
     blurred = np.zeros((3, (STRIP + 2 * HALF) * stride), np.float32)
-    slope = np.empty(stride, np.float32)
+    grad = np.empty(stride, np.float32)
     while True:
         strip = take_ticket(tickets)
         first = strip * STRIP
@@ -182,19 +168,19 @@ def _colour_backward(
             _compose(truth, mask, channel, behind[channel], window, first, last, ys)
             for k in range(3):
                 # Slopes start five rows above the window: row r of the strip's scratch is row first + r of theirs.
-                for place in range(LANES, (last - first + 2 * HALF) * stride - LANES, LANES):
-                    store(blurred[k], place, _across(slopes[3 * channel + k], first * stride + place, taps))
+                for index in range(LANES, (last - first + 2 * HALF) * stride - LANES, LANES):
+                    store(blurred[k], index, _blur(grads[3 * channel + k], first * stride + index, 1, taps))
             for row in range(first, last):
                 for column in range(LANES, stride - LANES, LANES):
-                    place, own = (row - first + HALF) * stride + column, (row - first) * stride + column
-                    total = _down(blurred[0], place, stride, taps)
+                    index, own = (row - first + HALF) * stride + column, (row - first) * stride + column
+                    total = _blur(blurred[0], index, stride, taps)
                     twice = load(xs, own) + load(xs, own)
-                    total = fma(twice, _down(blurred[1], place, stride, taps), total)
-                    total = fma(load(ys, own), _down(blurred[2], place, stride, taps), total)
-                    store(slope, column, total * splat(np.float32(-g_unlike)))
+                    total = fma(twice, _blur(blurred[1], index, stride, taps), total)
+                    total = fma(load(ys, own), _blur(blurred[2], index, stride, taps), total)
+                    store(grad, column, total * splat(np.float32(-g_unlike)))
                 for column in range(width):
                     own = (row - first) * stride + LANES + column
-                    value = slope[LANES + column]
+                    value = grad[LANES + column]
                     if xs[own] > ys[own]:
                         value += np.float32(g_apart)
                     elif xs[own] < ys[own]:
@@ -207,20 +193,10 @@ def colour_means(
     image: Tensor, matte: Tensor, truth: Tensor, mask: Tensor, background: Tensor, window: tuple[int, int, int, int],
     inner: tuple[int, int, int, int], area: float,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Sums over a window of |x - y| and, inside it, of 1 - SSIM, for two images over one background; float32, CPU.
+    """Compute `colour_losses`, divided by ``area``; float32 on the CPU, gradients for image and matte.
 
-    Args:
-        image: premultiplied, [3, h, w]; differentiable.
-        matte: [1, h, w]; differentiable.
-        truth: premultiplied, [3, h, w].
-        mask: [1, h, w].
-        background: RGB, [3].
-        window: top, left, height, width.
-        inner: first and end row, first and end column of the part where SSIM counts, from the window's corner.
-        area: what the sums are divided by.
-
-    Returns:
-        Two scalars.
+    ``window`` is top, left, height, width; ``inner`` are first and end row, first and end column, from the window's
+    corner, of the pixels whose SSIM counts.
     """
     return _Colour.apply(image, matte, truth, mask, background, window, inner, area)
 
@@ -233,11 +209,10 @@ class _Colour(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         given = tuple(array(tensor) for tensor in (image, matte, truth, mask, background))
         _, _, height, width = window
-        slopes = np.zeros((9, (height + 2 * HALF) * _stride(width)), np.float32)
+        grads = np.zeros((9, (height + 2 * HALF) * _stride(width)), np.float32)
         sums = np.zeros((-(-height // STRIP), 2))
-        call = np.zeros(1, np.int64), *given, window, inner, TAPS, LANE_NUMBERS, slopes, sums
-        run(_colour_forward, [call] * thread_count())
-        ctx.given, ctx.window, ctx.slopes, ctx.area = given, window, slopes, area
+        run_tickets(_colour_forward, given, window, inner, TAPS, LANE_NUMBERS, grads, sums)
+        ctx.given, ctx.window, ctx.grads, ctx.area = given, window, grads, area
         apart, unlike = (sums.sum(axis=0) / area).tolist()
         return torch.tensor(apart, dtype=torch.float32), torch.tensor(unlike, dtype=torch.float32)
 
@@ -246,17 +221,14 @@ class _Colour(torch.autograd.Function):
     def backward(ctx: Any, by_apart: Tensor, by_unlike: Tensor) -> tuple[Tensor | None, ...]:
         image, matte = (torch.zeros(ctx.given[i].shape) for i in (0, 1))
         g_apart, g_unlike = by_apart.item() / ctx.area, by_unlike.item() / ctx.area
-        call = (
-            np.zeros(1, np.int64), *ctx.given, ctx.window, TAPS, ctx.slopes, g_apart, g_unlike, image.numpy(),
-            matte.numpy(),
-        )  # fmt: skip
-        run(_colour_backward, [call] * thread_count())
+        given = (ctx.given, ctx.window, TAPS, ctx.grads)
+        run_tickets(_colour_backward, *given, g_apart, g_unlike, image.numpy(), matte.numpy())
         return image, matte, None, None, None, None, None, None
 
 
 @kernel
 def _matte_forward(tickets: np.ndarray, alpha: np.ndarray, mask: np.ndarray, window: tuple, sums: np.ndarray) -> None:
-    """Sums [strips, 4] of the cross entropy, of alpha x mask, of alpha and of mask."""
+    """Set sums [strips, 4] of the cross entropy, of alpha x mask, of alpha and of mask."""
     top, left, height, width = window
     # Where both are empty, which is nearly everywhere, the clamp makes the entropy a constant.
     nothing = -math.log(1.0 - LOWEST)
@@ -296,24 +268,15 @@ def _matte_backward(
         for row in range(strip * STRIP, min((strip + 1) * STRIP, height)):
             for column in range(width):
                 a, t = alpha[0, top + row, left + column], mask[0, top + row, left + column]
-                slope = by_mask * t + by_all
+                grad = by_mask * t + by_all
                 if LOWEST <= a <= np.float32(1) - LOWEST:
-                    slope += g_entropy * ((1 - t) / (1 - a) - t / a)
-                on_alpha[0, top + row, left + column] = slope
+                    grad += g_entropy * ((1 - t) / (1 - a) - t / a)
+                on_alpha[0, top + row, left + column] = grad
 
 
 def matte_loss(alpha: Tensor, mask: Tensor, window: tuple[int, int, int, int], area: float) -> Tensor:
-    """BCE over an area plus Dice of two mattes inside a window; float32, CPU.
-
-    Args:
-        alpha: rendered, [1, h, w]; differentiable.
-        mask: [1, h, w].
-        window: top, left, height, width.
-        area: what the cross entropy is divided by.
-
-    Returns:
-        Scalar.
-    """
+    """Compute `silhouette_loss` inside a window (top, left, height, width); float32 on the CPU, gradient for alpha
+    only."""
     return _Matte.apply(alpha, mask, window, area)
 
 
@@ -321,20 +284,17 @@ class _Matte(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, alpha: Tensor, mask: Tensor, window: Any, area: float) -> Tensor:
         given, sums = (array(alpha), array(mask)), np.zeros((-(-window[2] // STRIP), 4))
-        run(_matte_forward, [(np.zeros(1, np.int64), *given, window, sums)] * thread_count())
+        run_tickets(_matte_forward, *given, window, sums)
         entropy, common, mine, theirs = sums.sum(axis=0).tolist()
         ctx.given, ctx.window, ctx.area, ctx.sums = given, window, area, (common, mine, theirs)
         return torch.tensor(entropy / area + 1 - (2 * common + 1) / (mine + theirs + 1))
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         common, mine, theirs = ctx.sums
         whole, on_alpha = mine + theirs + 1, torch.zeros(ctx.given[0].shape)
-        g = slope.item()
+        g = grad.item()
         parts = g / ctx.area, -2 * g / whole, g * (2 * common + 1) / whole**2
-        run(
-            _matte_backward,
-            [(np.zeros(1, np.int64), *ctx.given, ctx.window, *parts, on_alpha.numpy())] * thread_count(),
-        )
+        run_tickets(_matte_backward, *ctx.given, ctx.window, *parts, on_alpha.numpy())
         return on_alpha, None, None, None

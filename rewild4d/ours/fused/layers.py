@@ -1,6 +1,6 @@
 """The deformation network on a block of 96 Gaussians: features are rows, Gaussians are the lanes of a row.
 
-All matrices and biases lie in one flat array, each padded with zeros to multiples of sixteen; `Layout` says where.
+All matrices and biases lie in one flat array, padded with zeros to multiples of sixteen; see `Layout`.
 """
 
 from typing import NamedTuple
@@ -19,71 +19,45 @@ BLOCK = 96
 OUTPUTS = 9
 
 
-def padded(size: int) -> int:
-    """The next multiple of sixteen."""
-    return -(-size // LANES) * LANES
+@kernel
+def round_up(size: int) -> int:
+    """Round up to a multiple of sixteen."""
+    return (size + LANES - 1) // LANES * LANES
 
 
 class Layout(NamedTuple):
-    """Sizes of the network, and where its parts begin in the flat array (each matrix is followed by its bias).
+    """Sizes of the network, and where its matrices begin in the flat array; each is followed by its bias."""
 
-    Attributes:
-        inputs: of the query.
-        scores: heads times parts.
-        width: hidden width.
-        heads: of the attention.
-        ask: scores from the query, [scores, inputs].
-        skip: hidden from the query, [width, inputs]; its bias is that of the whole sum.
-        mix: hidden from the attention, [width, scores]; its bias is not used.
-        up: [width, width].
-        down: [width, width].
-        out: [9, width].
-        total: length of the flat array.
-    """
-
-    inputs: int
-    scores: int
-    width: int
-    heads: int
-    ask: int
-    skip: int
-    mix: int
-    up: int
-    down: int
-    out: int
-    total: int
+    inputs: int  # of the query
+    scores: int  # heads times parts
+    width: int  # hidden width
+    heads: int  # of the attention
+    ask: int  # scores from the query, [scores, inputs]
+    skip: int  # hidden features from the query, [width, inputs]; with the bias of the whole sum
+    mix: int  # hidden features from the attention, [width, scores]; bias unused
+    up: int  # [width, width]
+    down: int  # [width, width]
+    out: int  # [9, width]
+    total: int  # length of the flat array
 
 
 def layout(inputs: int, scores: int, width: int, heads: int) -> Layout:
-    """Where everything lies for a network of these sizes."""
-    q, s, w = padded(inputs), padded(scores), padded(width)
-    starts, place = [], 0
-    for rows, columns in ((s, q), (w, q), (w, s), (w, w), (w, w), (padded(OUTPUTS), w)):
-        starts.append(place)
-        place += rows * (columns + 1)
+    """Lay out a network of these sizes."""
+    q, s, w = round_up(inputs), round_up(scores), round_up(width)
+    starts, index = [], 0
+    for rows, columns in ((s, q), (w, q), (w, s), (w, w), (w, w), (round_up(OUTPUTS), w)):
+        starts.append(index)
+        index += rows * (columns + 1)
     ask, skip, mix, up, down, out = starts
-    return Layout(inputs, scores, width, heads, ask, skip, mix, up, down, out, place)
+    return Layout(inputs, scores, width, heads, ask, skip, mix, up, down, out, index)
 
 
 class Factors(NamedTuple):
-    """The network's numbers.
+    """The network's numbers."""
 
-    Attributes:
-        flat: matrices and biases, float32, [total].
-        along: words of the matrices (kernels/halves.py), the one at ``first`` from first // 2; empty where products are
-            to be made in single precision, [total / 2].
-        across: words of their transposes, likewise.
-    """
-
-    flat: np.ndarray
-    along: np.ndarray
-    across: np.ndarray
-
-
-@kernel
-def round_up(size: int) -> int:
-    """The next multiple of sixteen."""
-    return (size + LANES - 1) // LANES * LANES
+    flat: np.ndarray  # matrices and biases, float32, [total]
+    along: np.ndarray  # bfloat16 words of the matrices (kernels/halves.py), or empty, [total / 2]
+    across: np.ndarray  # bfloat16 words of their transposes, or empty, [total / 2]
 
 
 @kernel
@@ -100,7 +74,7 @@ def pair_layers(bits: np.ndarray, sizes: Layout, along: np.ndarray, across: np.n
 
 @kernel
 def _bias(flat: np.ndarray, first: int, rows: int, columns: int, result: np.ndarray) -> None:
-    """Start rows of a block with the bias that follows a matrix."""
+    """Fill rows of a block with the bias that follows a matrix."""
     for row in range(rows):
         value = splat(flat[first + rows * columns + row])
         for lane in range(0, BLOCK, LANES):
@@ -122,34 +96,36 @@ def _layer(
 
 @kernel
 def _layer_back(
-    net: Factors, first: int, rows: int, columns: int, slope: np.ndarray, words: np.ndarray, result: np.ndarray,
+    net: Factors, first: int, rows: int, columns: int, grad: np.ndarray, words: np.ndarray, result: np.ndarray,
     wanted: int,
 ) -> None:  # fmt: skip
-    """Add the first ``wanted`` rows of the transposed matrix, times a block, to a block; ``words`` is scratch."""
+    """Add the first ``wanted`` rows of the transposed matrix times a block to a block; ``words`` is scratch."""
     if len(net.across) > 0:
-        pair_rows(slope, rows, BLOCK, words)
+        pair_rows(grad, rows, BLOCK, words)
         half = rows // 2
         add_pair_product(net.across, first // 2, half, words, 0, BLOCK, half, result, 0, BLOCK, wanted, BLOCK)
     else:
-        add_product(net.flat, first, 1, columns, slope, 0, BLOCK, rows, result, 0, BLOCK, wanted, BLOCK)
+        add_product(net.flat, first, 1, columns, grad, 0, BLOCK, rows, result, 0, BLOCK, wanted, BLOCK)
 
 
 @kernel
 def _layer_gradient(
-    half: bool, slope: np.ndarray, given: np.ndarray, words: np.ndarray, turned: np.ndarray, rows: int, columns: int,
+    half: bool, grad: np.ndarray, given: np.ndarray, words: np.ndarray, transposed: np.ndarray, rows: int, columns: int,
     gradient: np.ndarray, first: int,
 ) -> None:  # fmt: skip
-    """Add this block's share to the gradient of a matrix and of the bias behind it; words and turned are scratch."""
+    """Add this block's gradient of a matrix and of the bias behind it; words and transposed are scratch."""
     if half:
         pair_vectors(given, columns, BLOCK, words)
-        transpose(words, columns, BLOCK // 2, turned)
-        pair_vectors(slope, rows, BLOCK, words)
-        add_pair_product(words, 0, BLOCK // 2, turned, 0, columns, BLOCK // 2, gradient, first, columns, rows, columns)
+        transpose(words, columns, BLOCK // 2, transposed)
+        pair_vectors(grad, rows, BLOCK, words)
+        add_pair_product(
+            words, 0, BLOCK // 2, transposed, 0, columns, BLOCK // 2, gradient, first, columns, rows, columns
+        )
     else:
-        transpose(given, columns, BLOCK, turned)
-        add_product(slope, 0, BLOCK, 1, turned, 0, columns, BLOCK, gradient, first, columns, rows, columns)
+        transpose(given, columns, BLOCK, transposed)
+        add_product(grad, 0, BLOCK, 1, transposed, 0, columns, BLOCK, gradient, first, columns, rows, columns)
     bias = first + rows * columns
-    add_row_sums(slope, rows, BLOCK, turned, gradient[bias : bias + rows])
+    add_row_sums(grad, rows, BLOCK, transposed, gradient[bias : bias + rows])
 
 
 @kernel
@@ -160,15 +136,15 @@ def _positive(given: np.ndarray, count: int, result: np.ndarray) -> None:
 
 
 @kernel
-def _where_positive(given: np.ndarray, count: int, slope: np.ndarray) -> None:
+def _where_positive(given: np.ndarray, count: int, grad: np.ndarray) -> None:
     zero = splat(np.float32(0))
     for i in range(0, count, LANES):
-        store(slope, i, select_gt(load(given, i), zero, load(slope, i), zero))
+        store(grad, i, select_gt(load(given, i), zero, load(grad, i), zero))
 
 
 @kernel
 def _softmax(scores: np.ndarray, heads: int, parts: int) -> None:
-    """Over the parts of each head, in place."""
+    """Apply softmax over the parts of each head, in place."""
     lowest, log2_e = splat(np.float32(-126)), splat(LOG2_E)
     for head in range(heads):
         for lane in range(0, BLOCK, LANES):
@@ -187,39 +163,48 @@ def _softmax(scores: np.ndarray, heads: int, parts: int) -> None:
 
 
 @kernel
-def _softmax_back(shares: np.ndarray, heads: int, parts: int, slope: np.ndarray) -> None:
-    """From the slope of the shares to that of the scores, in place."""
+def _softmax_back(shares: np.ndarray, heads: int, parts: int, grad: np.ndarray) -> None:
+    """Compute the gradient of the scores from that of the shares, in place."""
     for head in range(heads):
         for lane in range(0, BLOCK, LANES):
             first = head * parts * BLOCK + lane
             mean = splat(np.float32(0))
             for part in range(parts):
-                place = first + part * BLOCK
-                mean = fma(load(shares, place), load(slope, place), mean)
+                index = first + part * BLOCK
+                mean = fma(load(shares, index), load(grad, index), mean)
             for part in range(parts):
-                place = first + part * BLOCK
-                store(slope, place, load(shares, place) * (load(slope, place) - mean))
+                index = first + part * BLOCK
+                store(grad, index, load(shares, index) * (load(grad, index) - mean))
+
+
+class Blocks(NamedTuple):
+    """Features of one block, [rows, 96]."""
+
+    query: np.ndarray  # [inputs, 96]
+    words: np.ndarray  # scratch, as large as the largest block
+    shares: np.ndarray  # attention of each head over the parts, [scores, 96]
+    first: np.ndarray  # hidden features before the residual layers, [width, 96]
+    opened: np.ndarray  # the same after relu
+    middle: np.ndarray  # inside the residual, after relu
+    last: np.ndarray  # after the residual and relu
+    out: np.ndarray  # outputs, nine rows of which count, [16, 96]
 
 
 @kernel
-def forward_block(
-    net: Factors, sizes: Layout, query: np.ndarray, words: np.ndarray, shares: np.ndarray, first: np.ndarray,
-    opened: np.ndarray, middle: np.ndarray, last: np.ndarray, out: np.ndarray,
-) -> None:  # fmt: skip
-    """Run the network on one block.
+def allocate_blocks(sizes: Layout) -> Blocks:
+    """Allocate the features of one block."""
+    inputs, scores = round_up(sizes.inputs) * BLOCK, round_up(sizes.scores) * BLOCK
+    wide, out = round_up(sizes.width) * BLOCK, np.empty(LANES * BLOCK, np.float32)
+    query, shares = np.empty(inputs, np.float32), np.empty(scores, np.float32)
+    words, first = np.empty(max(wide, scores, inputs), np.float32), np.empty(wide, np.float32)
+    opened, middle, last = np.empty_like(first), np.empty_like(first), np.empty_like(first)
+    return Blocks(query, words, shares, first, opened, middle, last, out)
 
-    Args:
-        net: matrices and biases.
-        sizes: their layout.
-        query: given, [inputs, 96].
-        words: scratch, as large as the largest block.
-        shares: attention of each head over the parts, [scores, 96].
-        first: hidden features before the residual layers; kept after relu in ``opened``, [width, 96].
-        opened: [width, 96].
-        middle: inside the residual, after relu, [width, 96].
-        last: hidden features after it, after relu, [width, 96].
-        out: [16, 96], nine rows count.
-    """
+
+@kernel
+def forward_block(net: Factors, sizes: Layout, blocks: Blocks) -> None:
+    """Run the network on the query of one block; set the other features."""
+    query, words, shares, first, opened, middle, last, out = blocks
     q, s, w = round_up(sizes.inputs), round_up(sizes.scores), round_up(sizes.width)
     _bias(net.flat, sizes.ask, s, q, shares)
     _layer(net, sizes.ask, s, q, query, words, shares)
@@ -242,52 +227,38 @@ def forward_block(
 
 @kernel
 def backward_block(
-    net: Factors, sizes: Layout, query: np.ndarray, words: np.ndarray, shares: np.ndarray, opened: np.ndarray,
-    middle: np.ndarray, last: np.ndarray, slope_out: np.ndarray, slope: np.ndarray, inner: np.ndarray,
-    on_shares: np.ndarray, turned: np.ndarray, gradient: np.ndarray, on_query: np.ndarray,
+    net: Factors, sizes: Layout, blocks: Blocks, grad_out: np.ndarray, grad: np.ndarray, inner: np.ndarray,
+    on_shares: np.ndarray, transposed: np.ndarray, gradient: np.ndarray, on_query: np.ndarray,
 ) -> None:  # fmt: skip
-    """The gradient of one block, after `forward_block` has filled its arguments.
+    """Compute the gradient of one block from grad_out [16, 96], after `forward_block`.
 
-    Args:
-        net: matrices and biases.
-        sizes: their layout.
-        query: given, [inputs, 96].
-        words: scratch, as large as the largest block.
-        shares: from the forward pass.
-        opened: from the forward pass.
-        middle: from the forward pass.
-        last: from the forward pass.
-        slope_out: gradient of ``out``, [16, 96].
-        slope: scratch, [width, 96].
-        inner: scratch, [width, 96].
-        on_shares: scratch, [scores, 96].
-        turned: scratch for a transposed block.
-        gradient: as ``flat``, added to.
-        on_query: gradient of the first sixteen inputs, set, [16, 96].
+    Adds to ``gradient``, laid out as ``flat``, and sets ``on_query`` [16, 96], the gradient of the first inputs.
+    Scratch: grad, inner, on_shares, transposed.
     """
+    query, words, shares, _, opened, middle, last, _ = blocks
     q, s, w = round_up(sizes.inputs), round_up(sizes.scores), round_up(sizes.width)
     half = len(net.along) > 0
-    _layer_gradient(half, slope_out, last, words, turned, LANES, w, gradient, sizes.out)
-    slope[:] = 0
-    _layer_back(net, sizes.out, LANES, w, slope_out, words, slope, w)
-    _where_positive(last, w * BLOCK, slope)
-    _layer_gradient(half, slope, middle, words, turned, w, w, gradient, sizes.down)
+    _layer_gradient(half, grad_out, last, words, transposed, LANES, w, gradient, sizes.out)
+    grad[:] = 0
+    _layer_back(net, sizes.out, LANES, w, grad_out, words, grad, w)
+    _where_positive(last, w * BLOCK, grad)
+    _layer_gradient(half, grad, middle, words, transposed, w, w, gradient, sizes.down)
     inner[:] = 0
-    _layer_back(net, sizes.down, w, w, slope, words, inner, w)
+    _layer_back(net, sizes.down, w, w, grad, words, inner, w)
     _where_positive(middle, w * BLOCK, inner)
-    _layer_gradient(half, inner, opened, words, turned, w, w, gradient, sizes.up)
+    _layer_gradient(half, inner, opened, words, transposed, w, w, gradient, sizes.up)
     # The hidden features feed the residual and what lies inside it.
-    turned[:] = 0
-    _layer_back(net, sizes.up, w, w, inner, words, turned, w)
-    _where_positive(opened, w * BLOCK, turned)
+    transposed[:] = 0
+    _layer_back(net, sizes.up, w, w, inner, words, transposed, w)
+    _where_positive(opened, w * BLOCK, transposed)
     for i in range(0, w * BLOCK, LANES):
-        store(slope, i, load(slope, i) + load(turned, i))
-    _layer_gradient(half, slope, shares, words, turned, w, s, gradient, sizes.mix)
+        store(grad, i, load(grad, i) + load(transposed, i))
+    _layer_gradient(half, grad, shares, words, transposed, w, s, gradient, sizes.mix)
     on_shares[:] = 0
-    _layer_back(net, sizes.mix, w, s, slope, words, on_shares, s)
+    _layer_back(net, sizes.mix, w, s, grad, words, on_shares, s)
     _softmax_back(shares, sizes.heads, sizes.scores // sizes.heads, on_shares)
-    _layer_gradient(half, on_shares, query, words, turned, s, q, gradient, sizes.ask)
-    _layer_gradient(half, slope, query, words, turned, w, q, gradient, sizes.skip)
+    _layer_gradient(half, on_shares, query, words, transposed, s, q, gradient, sizes.ask)
+    _layer_gradient(half, grad, query, words, transposed, w, q, gradient, sizes.skip)
     on_query[:] = 0
     _layer_back(net, sizes.ask, s, q, on_shares, words, on_query, LANES)
-    _layer_back(net, sizes.skip, w, q, slope, words, on_query, LANES)
+    _layer_back(net, sizes.skip, w, q, grad, words, on_query, LANES)

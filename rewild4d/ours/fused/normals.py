@@ -1,7 +1,4 @@
-"""Normals of Gaussians, and how well those of neighbouring pixels agree.
-
-The twins in plain torch are in ours/geometry_losses.py.
-"""
+"""Normals of Gaussians, and how well those of neighbouring pixels agree."""
 
 import math
 from typing import Any
@@ -16,7 +13,7 @@ from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import LANES, absolute, fma, load, select_gt, splat, store
 from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.tails import store_first
-from rewild4d.ours.fused.quaternions import unit_row, unit_slope
+from rewild4d.ours.fused.quaternions import unit_grad, unit_row
 
 NORMALS = Kernel(
     "normals",
@@ -31,7 +28,7 @@ def _forward(
     quats: np.ndarray, log_scales: np.ndarray, means: np.ndarray, eye: np.ndarray, normals: np.ndarray,
     chosen: np.ndarray,
 ) -> None:  # fmt: skip
-    """Set the normals; ``chosen`` gets 1, 2, 3 for the axis, negative where it was turned round, [n]."""
+    """Set the normals; ``chosen`` [n] gets 1, 2, 3 for the axis, negative where it was flipped."""
     one, two = np.float32(1), np.float32(2)
     for n in range(len(quats)):
         axis = 0
@@ -52,13 +49,13 @@ def _forward(
 
 
 @kernel
-def _backward(quats: np.ndarray, chosen: np.ndarray, slope: np.ndarray, on_quats: np.ndarray) -> None:
+def _backward(quats: np.ndarray, chosen: np.ndarray, grad: np.ndarray, on_quats: np.ndarray) -> None:
     two = np.float32(2)
     for n in range(len(quats)):
-        turn = unit_row(quats, n)
-        w, x, y, z, _ = turn
+        unit = unit_row(quats, n)
+        w, x, y, z, _ = unit
         twice = two if chosen[n] > 0 else -two
-        a, b, c = twice * slope[n, 0], twice * slope[n, 1], twice * slope[n, 2]
+        a, b, c = twice * grad[n, 0], twice * grad[n, 1], twice * grad[n, 2]
         axis = abs(chosen[n])
         if axis == 1:
             g_w, g_x = z * b - y * c, y * b + z * c
@@ -69,23 +66,14 @@ def _backward(quats: np.ndarray, chosen: np.ndarray, slope: np.ndarray, on_quats
         else:
             g_w, g_x = y * a - x * b, z * a - w * b - two * x * c
             g_y, g_z = w * a + z * b - two * y * c, x * a + y * b
-        on_quat = unit_slope(turn, (g_w, g_x, g_y, g_z))
+        on_quat = unit_grad(unit, (g_w, g_x, g_y, g_z))
         for i in range(4):
             on_quats[n, i] = on_quat[i]
 
 
 def smallest_axes(quats: Tensor, log_scales: Tensor, means: Tensor, eye: Tensor) -> Tensor:
-    """The axis of each Gaussian's smallest scale, turned towards a point; float32, CPU.
-
-    Args:
-        quats: any length, [n, 4]; the only input that gets a gradient.
-        log_scales: [n, 3].
-        means: [n, 3].
-        eye: the point, [3].
-
-    Returns:
-        Unit vectors, [n, 3].
-    """
+    """Return the axis of each Gaussian's smallest scale, pointing to ``eye`` [3]; float32 on the CPU, gradient for
+    quats only."""
     return _SmallestAxes.apply(quats, log_scales, means, eye)
 
 
@@ -99,9 +87,9 @@ class _SmallestAxes(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         on_quats = torch.empty(ctx.given.shape)
-        _backward(ctx.given, ctx.chosen, array(slope), on_quats.numpy())
+        _backward(ctx.given, ctx.chosen, array(grad), on_quats.numpy())
         return on_quats, None, None, None
 
 
@@ -109,7 +97,7 @@ class _SmallestAxes(torch.autograd.Function):
 def _read(
     image: np.ndarray, matte: np.ndarray, stride: int, field: np.ndarray, cover: np.ndarray, over: np.ndarray
 ) -> None:
-    """Unit vectors [3, (h + 2) stride], mattes and one over the lengths [(h + 2) stride], zeros around the image."""
+    """Set unit vectors [3, (h + 2) stride], mattes and inverse lengths [(h + 2) stride], zero around the image."""
     height, width = matte.shape
     field[:], cover[:], over[:] = 0, 0, 0
     for y in range(height):
@@ -125,18 +113,18 @@ def _read(
 
 
 @inlined
-def _beside(field: np.ndarray, cover: np.ndarray, place: int, other: int) -> tuple:
-    """Sixteen pairs of pixels: the weight, the cosine, and the weighted directions that the first should take."""
+def _beside(field: np.ndarray, cover: np.ndarray, index: int, other: int) -> tuple:
+    """Return weight, cosine and the gradient by the first direction for sixteen pairs of pixels."""
     a, b, c = load(field[0], other), load(field[1], other), load(field[2], other)
-    agree = fma(load(field[0], place), a, fma(load(field[1], place), b, load(field[2], place) * c))
-    both, zero = load(cover, place) * load(cover, other), splat(np.float32(0))
+    agree = fma(load(field[0], index), a, fma(load(field[1], index), b, load(field[2], index) * c))
+    both, zero = load(cover, index) * load(cover, other), splat(np.float32(0))
     share = select_gt(agree, zero, both, select_gt(zero, agree, zero - both, zero))
     return both, agree, share * a, share * b, share * c
 
 
 @kernel
-def _agreement(image: np.ndarray, matte: np.ndarray, slope: np.ndarray) -> tuple:
-    """The loss times the pairs' weight, and that weight; sets the former's slope by the image [3, h, w]."""
+def _agreement(image: np.ndarray, matte: np.ndarray, grad: np.ndarray) -> tuple:
+    """Return the loss times the pairs' weight, and that weight; set the former's gradient by the image [3, h, w]."""
     height, width = matte.shape
     stride = (width + LANES - 1) // LANES * LANES + LANES
     room = (height + 2) * stride + LANES
@@ -147,21 +135,21 @@ def _agreement(image: np.ndarray, matte: np.ndarray, slope: np.ndarray) -> tuple
     for y in range(height):
         lacking, weight = splat(np.float32(0)), splat(np.float32(0))
         for x in range(0, width, LANES):
-            place = (y + 1) * stride + LANES + x
-            right, r_cos, a, b, c = _beside(field, cover, place, place + 1)
-            below, b_cos, d, e, f = _beside(field, cover, place, place + stride)
+            index = (y + 1) * stride + LANES + x
+            right, r_cos, a, b, c = _beside(field, cover, index, index + 1)
+            below, b_cos, d, e, f = _beside(field, cover, index, index + stride)
             lacking = lacking + (right * (one - absolute(r_cos)) + below * (one - absolute(b_cos)))
             weight = weight + (right + below)
             a, b, c = a + d, b + e, c + f
-            for other in (place - 1, place - stride):
-                _, _, d, e, f = _beside(field, cover, place, other)
+            for other in (index - 1, index - stride):
+                _, _, d, e, f = _beside(field, cover, index, other)
                 a, b, c = a + d, b + e, c + f
-            p, q, r = load(field[0], place), load(field[1], place), load(field[2], place)
-            along, inverse = fma(a, p, fma(b, q, c * r)), load(over, place)
+            p, q, r = load(field[0], index), load(field[1], index), load(field[2], index)
+            along, inverse = fma(a, p, fma(b, q, c * r)), load(over, index)
             target = y * width + x
-            store_first(slope[0], target, width - x, inverse * fma(along, p, splat(np.float32(0)) - a))
-            store_first(slope[1], target, width - x, inverse * fma(along, q, splat(np.float32(0)) - b))
-            store_first(slope[2], target, width - x, inverse * fma(along, r, splat(np.float32(0)) - c))
+            store_first(grad[0], target, width - x, inverse * fma(along, p, splat(np.float32(0)) - a))
+            store_first(grad[1], target, width - x, inverse * fma(along, q, splat(np.float32(0)) - b))
+            store_first(grad[2], target, width - x, inverse * fma(along, r, splat(np.float32(0)) - c))
         store(sums, 0, lacking)
         store(sums, LANES, weight)
         total += sums[:LANES].sum()
@@ -170,27 +158,20 @@ def _agreement(image: np.ndarray, matte: np.ndarray, slope: np.ndarray) -> tuple
 
 
 def disagreement(image: Tensor, matte: Tensor) -> Tensor:
-    """How far the directions of neighbouring pixels are from parallel, weighted by both mattes; float32, CPU.
-
-    Args:
-        image: vectors of any length, [3, h, w]; the only input that gets a gradient.
-        matte: [h, w].
-
-    Returns:
-        Mean of 1 - |cos| over horizontal and vertical pairs, scalar.
-    """
+    """Return the mean of 1 - |cos| over pairs of neighbouring pixels' vectors [3, h, w], weighted by both mattes [h,
+    w]."""
     return _Disagreement.apply(image, matte)
 
 
 class _Disagreement(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, matte: Tensor) -> Tensor:
-        ctx.slope = torch.empty(image.shape)
-        total, mass = _agreement(array(image), array(matte), ctx.slope.numpy().reshape(3, -1))
+        ctx.grad = torch.empty(image.shape)
+        total, mass = _agreement(array(image), array(matte), ctx.grad.numpy().reshape(3, -1))
         ctx.mass = max(mass, 1.0)
         return torch.tensor(total / ctx.mass, dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
-        return ctx.slope * (slope.item() / ctx.mass), None
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        return ctx.grad * (grad.item() / ctx.mass), None

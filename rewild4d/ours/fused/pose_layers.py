@@ -1,7 +1,7 @@
-"""The layers of the pose network on a unit of work, a few codes: features are rows, tokens are the lanes of a row.
+"""The layers of the pose network on a few codes: features are rows, tokens are the lanes of a row.
 
-The parameters come as addresses, in the order of `PoseNetwork.parameters`; ``starts`` says where each one's gradient
-begins in a flat array.
+Parameters come as addresses in the order of `PoseNetwork.parameters`; ``starts`` says where each one's gradient begins
+in a flat array.
 """
 
 from functools import cache
@@ -27,7 +27,7 @@ from rewild4d.ours.fused.tokens import (
 )
 
 ITEMS = 12
-"""Codes a unit of work holds; gradients are summed over these, whatever the number of threads."""
+"""Codes of a unit of work; gradients are summed by unit, so they do not depend on the number of threads."""
 OUTPUTS = 7
 """Quaternion and shift of a joint."""
 OF_BLOCK = 12
@@ -35,56 +35,42 @@ OF_BLOCK = 12
 
 
 class Sizes(NamedTuple):
-    """Sizes of a network and of a unit of work.
+    """Sizes of a network and of a unit of work."""
 
-    Attributes:
-        joints: tokens of an item.
-        anchor: length of an anchor.
-        inputs: of the embedding, anchor and code.
-        width: of a token.
-        heads: of the attention.
-        blocks: how many.
-        reach: shift per unit of the head's output.
-        items: of a full unit.
-        wide: its tokens, padded to sixteen.
-        shares: numbers of its attention in a block.
-        kept: numbers that a unit keeps for the backward pass.
-    """
-
-    joints: int
-    anchor: int
-    inputs: int
-    width: int
-    heads: int
-    blocks: int
-    reach: float
-    items: int
-    wide: int
-    shares: int
-    kept: int
+    joints: int  # tokens of an item
+    anchor: int  # length of an anchor
+    inputs: int  # of the embedding, anchor and code
+    width: int  # of a token
+    heads: int  # of the attention
+    blocks: int  # how many
+    shift_scale: float  # shift per unit of the head's output
+    items: int  # of a full unit
+    wide: int  # its tokens, padded to sixteen
+    shares: int  # numbers of its attention in a block
+    kept: int  # numbers that a unit keeps for the backward pass
 
 
 def fits_sizes(width: int, heads: int) -> bool:
-    """Whether the kernels take a network of this width and number of heads."""
+    """Tell whether the kernels support this width and number of heads."""
     return width % LANES == 0 and width % (8 * heads) == 0
 
 
 @cache
 def sizes_of(
-    joints: int, anchor: int, inputs: int, width: int, heads: int, blocks: int, reach: float, items: int
+    joints: int, anchor: int, inputs: int, width: int, heads: int, blocks: int, shift_scale: float, items: int
 ) -> Sizes:
-    """Sizes for a batch of ``items``; the arguments are as in `Sizes`."""
+    """Return the sizes for a batch of ``items``."""
     items = min(max(1, items), ITEMS)
     wide, tile = (-(-count // LANES) * LANES for count in (items * joints, joints))
     shares = items * heads * tile * tile
     of_block = (10 * width + 2) * wide + shares
     kept = (-(-inputs // LANES) * LANES + width + 1 + 8) * wide + blocks * of_block
-    return Sizes(joints, anchor, inputs, width, heads, blocks, reach, items, wide, shares, kept)
+    return Sizes(joints, anchor, inputs, width, heads, blocks, shift_scale, items, wide, shares, kept)
 
 
 @kernel
 def _ends(kept: np.ndarray, s: Sizes) -> tuple:
-    """What a unit keeps beside its blocks: the embedding's inputs, the last norm and one over its spread, outputs."""
+    """Return views of what a unit keeps beside its blocks: inputs, last norm, its inverse deviation, outputs."""
     inputs = (s.inputs + LANES - 1) // LANES * LANES * s.wide
     plain, inverse = inputs + s.width * s.wide, inputs + (s.width + 1) * s.wide
     return kept[:inputs], kept[inputs:plain], kept[plain:inverse], kept[inverse : inverse + 8 * s.wide]
@@ -92,13 +78,14 @@ def _ends(kept: np.ndarray, s: Sizes) -> tuple:
 
 @kernel
 def outputs(kept: np.ndarray, s: Sizes) -> np.ndarray:
-    """The head's outputs of a unit, [8, wide]."""
+    """Return the head's outputs of a unit, [8, wide]."""
     return _ends(kept, s)[3]
 
 
 @kernel
 def _block(kept: np.ndarray, s: Sizes, block: int) -> tuple:
-    """What a unit keeps of a block: both norms and one over their spreads, attention, the perceptron and its slope."""
+    """Return views of what a unit keeps of a block: norms, inverse deviations, attention, perceptron and its
+    derivative."""
     of_block = (10 * s.width + 2) * s.wide + s.shares
     own = kept[len(kept) - (s.blocks - block) * of_block :]
     layer, inverse, spare = s.width * s.wide, 10 * s.width * s.wide, (10 * s.width + 2) * s.wide
@@ -123,7 +110,7 @@ def _gradient(flat: np.ndarray, starts: np.ndarray, index: int) -> np.ndarray:
 def _embed(
     s: Sizes, addresses: np.ndarray, starts: np.ndarray, code: np.ndarray, inputs: np.ndarray, hidden: np.ndarray
 ) -> None:
-    """Anchors and code of each token as rows, then the embedding."""
+    """Write anchors and code of each token as rows, then embed them."""
     anchors = _parameter(addresses, starts, 0)
     inputs[:] = 0
     for item in range(len(code)):
@@ -161,7 +148,7 @@ def _forward_blocks(
 
 @kernel
 def _head(s: Sizes, addresses: np.ndarray, starts: np.ndarray, weight: np.ndarray, bias: np.ndarray) -> None:
-    """The head with an eighth output, always zero."""
+    """Copy the head, with an eighth output that is always zero."""
     last = 3 + OF_BLOCK * s.blocks
     weight[:] = 0
     bias[:] = 0
@@ -171,20 +158,11 @@ def _head(s: Sizes, addresses: np.ndarray, starts: np.ndarray, weight: np.ndarra
 
 @kernel
 def forward_unit(
-    s: Sizes, addresses: np.ndarray, starts: np.ndarray, code: np.ndarray, kept: np.ndarray, turned: np.ndarray
+    s: Sizes, addresses: np.ndarray, starts: np.ndarray, code: np.ndarray, kept: np.ndarray, tokens_first: np.ndarray
 ) -> np.ndarray:
-    """Run the network on a unit.
+    """Run the network on codes [items, inputs - anchor]; return the outputs [8, wide], a part of ``kept``.
 
-    Args:
-        s: sizes.
-        addresses: of the parameters.
-        starts: of their gradients.
-        code: [items, inputs - anchor].
-        kept: what `backward_unit` wants, set.
-        turned: features of each token, set, [wide, width].
-
-    Returns:
-        The head's outputs, a part of ``kept``, [8, wide].
+    Sets ``kept`` for `backward_unit`, and ``tokens_first``, the features of each token, [wide, width].
     """
     inputs, plain, inverse, out = _ends(kept, s)
     layer = s.width * s.wide
@@ -198,21 +176,21 @@ def forward_unit(
     _head(s, addresses, starts, weight, bias)
     out[:] = 0
     linear(weight, bias, scaled, s.wide, out)
-    transpose(scaled, s.width, s.wide, turned)
+    transpose(scaled, s.width, s.wide, tokens_first)
     return out
 
 
 @kernel
 def _head_back(
     s: Sizes, addresses: np.ndarray, starts: np.ndarray, tokens: int, plain: np.ndarray, on_out: np.ndarray,
-    slope: np.ndarray, scaled: np.ndarray, scratch: np.ndarray, flat: np.ndarray,
+    grad: np.ndarray, scaled: np.ndarray, scratch: np.ndarray, flat: np.ndarray,
 ) -> None:  # fmt: skip
-    """Add the head's share to the slope of the features, and its own gradients."""
+    """Add the head's gradients, and its part of the features' gradient."""
     last = 3 + OF_BLOCK * s.blocks
     scale_rows(plain, _parameter(addresses, starts, last), _parameter(addresses, starts, last + 1), s.wide, scaled)
     weight, bias = np.empty(8 * s.width, np.float32), np.empty(8, np.float32)
     _head(s, addresses, starts, weight, bias)
-    add_product(weight, 0, 1, s.width, on_out, 0, s.wide, OUTPUTS, slope, 0, s.wide, s.width, s.wide)
+    add_product(weight, 0, 1, s.width, on_out, 0, s.wide, OUTPUTS, grad, 0, s.wide, s.width, s.wide)
     weight[:] = 0
     transpose(scaled, s.width, s.wide, scratch)
     add_product(on_out, 0, s.wide, 1, scratch, 0, s.width, tokens, weight, 0, s.width, 8, s.width)
@@ -226,13 +204,13 @@ def _head_back(
 
 @kernel
 def _embed_back(
-    s: Sizes, addresses: np.ndarray, starts: np.ndarray, tokens: int, inputs: np.ndarray, slope: np.ndarray,
+    s: Sizes, addresses: np.ndarray, starts: np.ndarray, tokens: int, inputs: np.ndarray, grad: np.ndarray,
     scratch: np.ndarray, flat: np.ndarray,
 ) -> None:  # fmt: skip
-    """The gradients of the embedding and of the anchors."""
+    """Add the gradients of the embedding and of the anchors."""
     wide_inputs = len(inputs) // s.wide
     wider = np.zeros(s.width * wide_inputs, np.float32)
-    linear_gradient(slope, inputs, wide_inputs, s.wide, tokens, scratch, wider, _gradient(flat, starts, 2))
+    linear_gradient(grad, inputs, wide_inputs, s.wide, tokens, scratch, wider, _gradient(flat, starts, 2))
     on_weight, on_anchors = _gradient(flat, starts, 1), _gradient(flat, starts, 0)
     for row in range(s.width):
         for i in range(s.inputs):
@@ -243,78 +221,71 @@ def _embed_back(
         for row in range(s.width):
             factor = splat(weight[row * s.inputs + i])
             for lane in range(0, s.wide, LANES):
-                store(lanes, lane, fma(factor, load(slope, row * s.wide + lane), load(lanes, lane)))
+                store(lanes, lane, fma(factor, load(grad, row * s.wide + lane), load(lanes, lane)))
         for lane in range(tokens):
             on_anchors[lane % s.joints * s.anchor + i] += lanes[lane]
 
 
 @kernel
 def _layer_back(
-    addresses: np.ndarray, starts: np.ndarray, index: int, slope: np.ndarray, given: np.ndarray, wide: int, tokens: int,
+    addresses: np.ndarray, starts: np.ndarray, index: int, grad: np.ndarray, given: np.ndarray, wide: int, tokens: int,
     scratch: np.ndarray, flat: np.ndarray, on_given: np.ndarray,
 ) -> None:  # fmt: skip
-    """Gradients of the matrix at ``index`` and of the bias behind it; sets that of what it was given."""
+    """Add the gradients of the matrix at ``index`` and of the bias behind it; set that of its input."""
     weight, on_bias = _parameter(addresses, starts, index), _gradient(flat, starts, index + 1)
     rows = len(on_bias)
     depth = len(weight) // rows
-    linear_gradient(slope, given, depth, wide, tokens, scratch, _gradient(flat, starts, index), on_bias)
-    linear_back(weight, rows, slope, wide, on_given)
+    linear_gradient(grad, given, depth, wide, tokens, scratch, _gradient(flat, starts, index), on_bias)
+    linear_back(weight, rows, grad, wide, on_given)
 
 
 @kernel
 def _block_back(
-    s: Sizes, addresses: np.ndarray, starts: np.ndarray, items: int, block: int, kept: np.ndarray, slope: np.ndarray,
+    s: Sizes, addresses: np.ndarray, starts: np.ndarray, items: int, block: int, kept: np.ndarray, grad: np.ndarray,
     scaled: np.ndarray, inner: np.ndarray, scratch: np.ndarray, flat: np.ndarray,
 ) -> None:  # fmt: skip
-    """The gradient of one block; ``slope`` goes from that after it to that before it."""
+    """Add the gradients of one block; replace ``grad`` after it by that before it."""
     plain, inverse, qkv, shares, mixed, plain2, inverse2, opened, bend = _block(kept, s, block)
     at, tokens, layer = 3 + OF_BLOCK * block, items * s.joints, s.width * s.wide
     on_opened, on_scaled, on_qkv = inner[: 2 * layer], inner[3 * layer : 4 * layer + LANES], inner[: 3 * layer]
-    _layer_back(addresses, starts, at + 10, slope, opened, s.wide, tokens, scratch, flat, on_opened)
+    _layer_back(addresses, starts, at + 10, grad, opened, s.wide, tokens, scratch, flat, on_opened)
     for i in range(0, 2 * layer, LANES):
         store(on_opened, i, load(on_opened, i) * load(bend, i))
     norm, shift = _parameter(addresses, starts, at + 2), _parameter(addresses, starts, at + 3)
     scale_rows(plain2, norm, shift, s.wide, scaled)
     _layer_back(addresses, starts, at + 8, on_opened, scaled, s.wide, tokens, scratch, flat, on_scaled)
     on_norm, on_shift = _gradient(flat, starts, at + 2), _gradient(flat, starts, at + 3)
-    normalise_back(plain2, inverse2, norm, s.wide, on_scaled, scratch, on_norm, on_shift, slope)
-    _layer_back(addresses, starts, at + 6, slope, mixed, s.wide, tokens, scratch, flat, on_scaled)
+    normalise_back(plain2, inverse2, norm, s.wide, on_scaled, scratch, on_norm, on_shift, grad)
+    _layer_back(addresses, starts, at + 6, grad, mixed, s.wide, tokens, scratch, flat, on_scaled)
     on_qkv[:] = 0
     attend_back(qkv, s.width, s.heads, s.joints, items, s.wide, shares, on_scaled, on_qkv)
     norm, shift = _parameter(addresses, starts, at), _parameter(addresses, starts, at + 1)
     scale_rows(plain, norm, shift, s.wide, scaled)
     _layer_back(addresses, starts, at + 4, on_qkv, scaled, s.wide, tokens, scratch, flat, on_scaled)
     on_norm, on_shift = _gradient(flat, starts, at), _gradient(flat, starts, at + 1)
-    normalise_back(plain, inverse, norm, s.wide, on_scaled, scratch, on_norm, on_shift, slope)
+    normalise_back(plain, inverse, norm, s.wide, on_scaled, scratch, on_norm, on_shift, grad)
 
 
 @kernel
 def backward_unit(
     s: Sizes, addresses: np.ndarray, starts: np.ndarray, items: int, kept: np.ndarray, on_out: np.ndarray,
-    turned: np.ndarray, flat: np.ndarray,
+    tokens_first: np.ndarray, flat: np.ndarray,
 ) -> None:  # fmt: skip
-    """The gradient of a unit, after `forward_unit` has filled ``kept``.
+    """Add the gradients of a unit to ``flat``, after `forward_unit` has filled ``kept``.
 
-    Args:
-        s: sizes.
-        addresses: of the parameters.
-        starts: of their gradients.
-        items: of this unit.
-        kept: from the forward pass.
-        on_out: gradient of the outputs, zero in lanes of no token, [8, wide].
-        turned: gradient of the features, likewise, [wide, width].
-        flat: gradients of the parameters, added to.
+    ``on_out`` [8, wide] and ``tokens_first`` [wide, width] are the gradients of outputs and features, zero in unused
+    lanes.
     """
     inputs, plain, inverse, _ = _ends(kept, s)
     last, layer, tokens = 3 + OF_BLOCK * s.blocks, s.width * s.wide, items * s.joints
     scaled, inner = np.empty(layer, np.float32), np.empty(4 * layer + LANES, np.float32)
     scratch = np.empty(max(2 * layer, 3 * s.width * LANES, len(inputs)), np.float32)
-    features, slope = np.empty(layer, np.float32), np.zeros(layer, np.float32)
-    transpose(turned, s.wide, s.width, features)
+    features, grad = np.empty(layer, np.float32), np.zeros(layer, np.float32)
+    transpose(tokens_first, s.wide, s.width, features)
     _head_back(s, addresses, starts, tokens, plain, on_out, features, scaled, scratch, flat)
     on_norm, on_shift = _gradient(flat, starts, last), _gradient(flat, starts, last + 1)
     norm = _parameter(addresses, starts, last)
-    normalise_back(plain, inverse, norm, s.wide, features, scratch, on_norm, on_shift, slope)
+    normalise_back(plain, inverse, norm, s.wide, features, scratch, on_norm, on_shift, grad)
     for block in range(s.blocks - 1, -1, -1):
-        _block_back(s, addresses, starts, items, block, kept, slope, scaled, inner, scratch, flat)
-    _embed_back(s, addresses, starts, tokens, inputs, slope, scratch, flat)
+        _block_back(s, addresses, starts, items, block, kept, grad, scaled, inner, scratch, flat)
+    _embed_back(s, addresses, starts, tokens, inputs, grad, scratch, flat)

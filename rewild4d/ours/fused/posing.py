@@ -1,7 +1,4 @@
-"""Poses of codes: the pose network in one forward and one backward pass.
-
-The twin in plain torch is `PoseNetwork.forward` itself (ours/pose.py).
-"""
+"""Poses of codes: the pose network in one forward and one backward pass."""
 
 import math
 from collections.abc import Sequence
@@ -17,9 +14,9 @@ from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.simd import take_ticket
 from rewild4d.kernels.switch import Kernel
-from rewild4d.kernels.threads import run, thread_count
+from rewild4d.kernels.threads import run_tickets, thread_count
 from rewild4d.ours.fused.pose_layers import Sizes, backward_unit, forward_unit, outputs
-from rewild4d.ours.fused.quaternions import unit, unit_slope
+from rewild4d.ours.fused.quaternions import unit, unit_grad
 
 POSE_NETWORK = Kernel(
     "pose network",
@@ -45,60 +42,60 @@ def _codes(time: np.ndarray, group: np.ndarray, view: np.ndarray, frequencies: i
 
 
 def codes(time: Tensor, group: Tensor, view: Tensor, frequencies: int, explicit_group: bool) -> Tensor:
-    """The time codes of `pose.time_code`, without gradients; float32 on the CPU."""
+    """Compute the time codes of `pose.time_code`, without gradients; float32 on the CPU."""
     code = np.empty((len(time), 2 + 2 * frequencies + explicit_group), np.float32)
     _codes(time.numpy(), group.numpy(), view.numpy(), frequencies, code)
     return torch.from_numpy(code)
 
 
 @inlined
-def _turn(out: np.ndarray, wide: int, lane: int) -> tuple:
-    """The unit quaternion of the first four outputs, which are added to the identity; and one over its length."""
+def _rotation(out: np.ndarray, wide: int, lane: int) -> tuple:
+    """Return the normalised sum of identity and first four outputs, and one over its length."""
     return unit((1 + out[lane], out[wide + lane], out[2 * wide + lane], out[3 * wide + lane]))
 
 
 @kernel
 def _finish(
-    s: Sizes, out: np.ndarray, turned: np.ndarray, flipped: np.ndarray, mirror: np.ndarray, quats: np.ndarray,
+    s: Sizes, out: np.ndarray, tokens_first: np.ndarray, flipped: np.ndarray, mirror: np.ndarray, quats: np.ndarray,
     shifts: np.ndarray, features: np.ndarray,
 ) -> None:  # fmt: skip
-    """From outputs [8, wide] and features [tokens, width] to the poses of a unit; left and right exchanged if told."""
+    """Convert outputs [8, wide] and features [tokens, width] to the poses of a unit, mirrored where flipped."""
     for item in range(len(quats)):
         for joint in range(s.joints):
             other = mirror[joint] if flipped[item] else joint
             sign = -1.0 if flipped[item] else 1.0
             lane = item * s.joints + other
-            turn = _turn(out, s.wide, lane)
-            quats[item, joint, 0], quats[item, joint, 1] = turn[0], turn[1]
-            quats[item, joint, 2], quats[item, joint, 3] = sign * turn[2], sign * turn[3]
-            shifts[item, joint, 0] = sign * s.reach * out[4 * s.wide + lane]
-            shifts[item, joint, 1] = s.reach * out[5 * s.wide + lane]
-            shifts[item, joint, 2] = s.reach * out[6 * s.wide + lane]
-            features[item, joint] = turned[lane * s.width : (lane + 1) * s.width]
+            rotation = _rotation(out, s.wide, lane)
+            quats[item, joint, 0], quats[item, joint, 1] = rotation[0], rotation[1]
+            quats[item, joint, 2], quats[item, joint, 3] = sign * rotation[2], sign * rotation[3]
+            shifts[item, joint, 0] = sign * s.shift_scale * out[4 * s.wide + lane]
+            shifts[item, joint, 1] = s.shift_scale * out[5 * s.wide + lane]
+            shifts[item, joint, 2] = s.shift_scale * out[6 * s.wide + lane]
+            features[item, joint] = tokens_first[lane * s.width : (lane + 1) * s.width]
 
 
 @kernel
 def _finish_back(
     s: Sizes, out: np.ndarray, flipped: np.ndarray, mirror: np.ndarray, g_quats: np.ndarray, g_shifts: np.ndarray,
-    g_features: np.ndarray, on_out: np.ndarray, turned: np.ndarray,
+    g_features: np.ndarray, on_out: np.ndarray, tokens_first: np.ndarray,
 ) -> None:  # fmt: skip
-    """The gradient of `_finish`."""
+    """Compute the gradient of `_finish`."""
     on_out[:] = 0
-    turned[: s.wide * s.width] = 0
+    tokens_first[: s.wide * s.width] = 0
     for item in range(len(g_quats)):
         for joint in range(s.joints):
             other = mirror[joint] if flipped[item] else joint
             sign = -1.0 if flipped[item] else 1.0
             lane = item * s.joints + other
-            turn = _turn(out, s.wide, lane)
+            rotation = _rotation(out, s.wide, lane)
             g = g_quats[item, joint]
-            slope = unit_slope(turn, (1.0 * g[0], 1.0 * g[1], sign * g[2], sign * g[3]))
+            grad = unit_grad(rotation, (1.0 * g[0], 1.0 * g[1], sign * g[2], sign * g[3]))
             for i in range(4):
-                on_out[i * s.wide + lane] += slope[i]
-            on_out[4 * s.wide + lane] += sign * s.reach * g_shifts[item, joint, 0]
-            on_out[5 * s.wide + lane] += s.reach * g_shifts[item, joint, 1]
-            on_out[6 * s.wide + lane] += s.reach * g_shifts[item, joint, 2]
-            turned[lane * s.width : (lane + 1) * s.width] += g_features[item, joint]
+                on_out[i * s.wide + lane] += grad[i]
+            on_out[4 * s.wide + lane] += sign * s.shift_scale * g_shifts[item, joint, 0]
+            on_out[5 * s.wide + lane] += s.shift_scale * g_shifts[item, joint, 1]
+            on_out[6 * s.wide + lane] += s.shift_scale * g_shifts[item, joint, 2]
+            tokens_first[lane * s.width : (lane + 1) * s.width] += g_features[item, joint]
 
 
 @kernel
@@ -106,15 +103,15 @@ def _forward(
     tickets: np.ndarray, s: Sizes, addresses: np.ndarray, starts: np.ndarray, code: np.ndarray, flipped: np.ndarray,
     mirror: np.ndarray, kept: np.ndarray, quats: np.ndarray, shifts: np.ndarray, features: np.ndarray,
 ) -> None:  # fmt: skip
-    turned = np.empty(s.wide * s.width, np.float32)
+    tokens_first = np.empty(s.wide * s.width, np.float32)
     while True:
         unit = take_ticket(tickets)
         begin, end = unit * s.items, min((unit + 1) * s.items, len(code))
         if begin >= len(code):
             return
-        out = forward_unit(s, addresses, starts, code[begin:end], kept[min(unit, len(kept) - 1)], turned)
+        out = forward_unit(s, addresses, starts, code[begin:end], kept[min(unit, len(kept) - 1)], tokens_first)
         own = quats[begin:end], shifts[begin:end], features[begin:end]
-        _finish(s, out, turned, flipped[begin:end], mirror, own[0], own[1], own[2])
+        _finish(s, out, tokens_first, flipped[begin:end], mirror, own[0], own[1], own[2])
 
 
 @kernel
@@ -122,44 +119,38 @@ def _backward(
     tickets: np.ndarray, s: Sizes, addresses: np.ndarray, starts: np.ndarray, flipped: np.ndarray, mirror: np.ndarray,
     kept: np.ndarray, g_quats: np.ndarray, g_shifts: np.ndarray, g_features: np.ndarray, gradients: np.ndarray,
 ) -> None:  # fmt: skip
-    turned, on_out = np.empty(s.wide * s.width, np.float32), np.empty(8 * s.wide, np.float32)
+    tokens_first, on_out = np.empty(s.wide * s.width, np.float32), np.empty(8 * s.wide, np.float32)
     while True:
         unit = take_ticket(tickets)
         if unit >= len(gradients):
             return
         begin, end = unit * s.items, min((unit + 1) * s.items, len(g_quats))
         own = g_quats[begin:end], g_shifts[begin:end], g_features[begin:end]
-        _finish_back(s, outputs(kept[unit], s), flipped[begin:end], mirror, own[0], own[1], own[2], on_out, turned)
+        _finish_back(
+            s, outputs(kept[unit], s), flipped[begin:end], mirror, own[0], own[1], own[2], on_out, tokens_first
+        )
         gradients[unit] = 0
-        backward_unit(s, addresses, starts, end - begin, kept[unit], on_out, turned, gradients[unit])
+        backward_unit(s, addresses, starts, end - begin, kept[unit], on_out, tokens_first, gradients[unit])
 
 
 @cache
 def _starts(counts: tuple[int, ...]) -> np.ndarray:
-    """Where each parameter's gradient begins, and where the last one ends."""
+    """Return where each parameter's gradient begins, and where the last one ends."""
     return np.cumsum((0, *counts))
 
 
 def poses(
     sizes: Sizes, parameters: Sequence[Tensor], code: Tensor, flipped: np.ndarray, mirror: np.ndarray
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Poses of a batch of codes; float32 on the CPU.
+    """Compute quats [B, J, 4], shifts [B, J, 3] and features [B, J, K] of codes [B, E]; float32 on the CPU.
 
-    Args:
-        sizes: of the network.
-        parameters: float32, in the network's own order; the only inputs that get gradients.
-        code: [B, E].
-        flipped: which poses are wanted with left and right exchanged, bool, [B].
-        mirror: joint on the other side, int64, [J].
-
-    Returns:
-        Quats [B, J, 4], shifts [B, J, 3] and features [B, J, K].
+    Only the parameters, in the network's own order, get gradients; ``flipped`` [B] poses are mirrored.
     """
     return _Poses.apply(sizes, code, flipped, mirror, torch.is_grad_enabled(), *parameters)
 
 
 def _placed(parameters: Sequence[Tensor]) -> tuple[list[Tensor], np.ndarray]:
-    """The parameters without gaps, to be held while a kernel reads them, and their addresses."""
+    """Return packed parameters, to be held while a kernel reads them, and their addresses."""
     flat = [parameter.contiguous() for parameter in parameters]
     return flat, np.array([parameter.data_ptr() for parameter in flat])
 
@@ -174,21 +165,21 @@ class _Poses(torch.autograd.Function):
         kept = np.empty((units if keep else 1, sizes.kept), np.float32)
         flat, addresses = _placed(parameters)
         starts = _starts(tuple(parameter.numel() for parameter in parameters))
-        call = (np.zeros(1, np.int64), sizes, addresses, starts, array(code), flipped, mirror, kept, *made)
-        run(_forward, [call] * min(thread_count(), len(kept)))
+        given, threads = (sizes, addresses, starts, array(code), flipped, mirror), min(thread_count(), len(kept))
+        run_tickets(_forward, *given, kept, *made, threads=threads)
         ctx.save_for_backward(*parameters)
         ctx.given = sizes, starts, flipped, mirror, kept
         return tuple(map(torch.from_numpy, made))
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         parameters = ctx.saved_tensors
         flat, addresses = _placed(parameters)
         sizes, starts, flipped, mirror, kept = ctx.given
         gradients = np.empty((len(kept), starts[-1]), np.float32)
-        call = (np.zeros(1, np.int64), sizes, addresses, starts, flipped, mirror, kept, *map(array, slopes), gradients)
-        run(_backward, [call] * min(thread_count(), len(kept)))
+        given, threads = (sizes, addresses, starts, flipped, mirror, kept), min(thread_count(), len(kept))
+        run_tickets(_backward, *given, *map(array, grads), gradients, threads=threads)
         total = torch.from_numpy(gradients[0] if len(kept) == 1 else gradients.sum(axis=0))
         pieces = total.split([parameter.numel() for parameter in parameters])
         shaped = (

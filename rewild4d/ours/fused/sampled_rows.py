@@ -1,8 +1,7 @@
-"""A few Gaussians stand for all in the gradient of the deformation network's parameters.
+"""Importance sampling of Gaussians for the gradient of the deformation network's parameters.
 
-That gradient is a sum over the Gaussians, and few of them hold most of it. Each is drawn with a probability in
-proportion to the gradient that reaches it, at most 1, and counts one over that probability: the expected sum is the
-whole one (importance sampling with systematic draws).
+That gradient is a sum over the Gaussians, and few of them hold most of it. Each is drawn with a probability (at most 1)
+in proportion to the gradient that reaches it, and weighted by one over that: the expected sum is the whole one.
 """
 
 import math
@@ -11,12 +10,12 @@ import numpy as np
 
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.simd import take_ticket
-from rewild4d.kernels.threads import run, thread_count
+from rewild4d.kernels.threads import run_tickets
 
 ROUNDS = 30
-"""Most rounds of finding the limit. After fewer than it needs the draw is smaller than wanted, and as unbiased."""
+"""Most iterations for the limit; if they do not suffice, the sample is smaller than wanted but still unbiased."""
 CHUNK = 2048
-"""Gaussians a unit of work holds; sums are added over these, whatever the number of threads."""
+"""Gaussians of a unit of work; sums run over units, so they do not depend on the number of threads."""
 
 
 @kernel
@@ -24,7 +23,7 @@ def _weigh(
     tickets: np.ndarray, far: float, grow: float, quats: np.ndarray, g_means: np.ndarray, g_quats: np.ndarray,
     g_log_scales: np.ndarray, worth: np.ndarray, totals: np.ndarray,
 ) -> None:  # fmt: skip
-    """Set the worth of each Gaussian [n], which is the length of its gradient, and its sum over each chunk."""
+    """Set the worth [n] of each Gaussian, the norm of its gradient, and its sum over each chunk."""
     while True:
         chunk = take_ticket(tickets)
         if chunk >= len(totals):
@@ -45,7 +44,7 @@ def _weigh(
 
 @kernel
 def _certain_from(worth: np.ndarray, wanted: int) -> float:
-    """The worth L from which a Gaussian is certain: the sum of min(1, worth / L) is ``wanted``."""
+    """Return the limit L beyond which a Gaussian is always drawn: the sum of min(1, worth / L) is ``wanted``."""
     limit, whole = math.inf, len(worth) // 4 * 4
     for _ in range(ROUNDS):
         certain = 0
@@ -68,15 +67,15 @@ def _certain_from(worth: np.ndarray, wanted: int) -> float:
 
 @kernel
 def _draw(worth: np.ndarray, wanted: int, offset: float, rows: np.ndarray, factors: np.ndarray) -> int:
-    """Set the rows that are drawn and what each counts, and give their number."""
+    """Set the rows that are drawn and their weights, and return their number."""
     limit = _certain_from(worth, wanted)
-    chosen, place = 0, offset
+    chosen, position = 0, offset
     for n in range(len(worth)):
         share = 1.0
         if worth[n] < limit:
-            share, before = worth[n] / limit, math.floor(place)
-            place += share
-            if math.floor(place) == before:
+            share, before = worth[n] / limit, math.floor(position)
+            position += share
+            if math.floor(position) == before:
                 continue
         rows[chosen], factors[chosen] = n, 1 / share
         chosen += 1
@@ -87,26 +86,15 @@ def sample_rows(
     far: float, grow: float, quats: np.ndarray, g_means: np.ndarray, g_quats: np.ndarray, g_log_scales: np.ndarray,
     wanted: int, offset: float,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Draw about ``wanted`` of n Gaussians by the gradients of what the network made of them.
+    """Draw about ``wanted`` of n Gaussians in proportion to the gradients of the network's outputs.
 
-    Args:
-        far: displacement per unit of output.
-        grow: change of log scale per unit of output.
-        quats: the turned orientations, unit, [n, 4].
-        g_means: [n, 3].
-        g_quats: [n, 4].
-        g_log_scales: [n, 3].
-        wanted: how many, at least 1.
-        offset: uniform in [0, 1); the only randomness.
-
-    Returns:
-        Rows in rising order, int64 [k], and what each counts, float32 [k]; all rows, counting 1, where a gradient is
-        not finite, and none where all are zero.
+    ``far`` and ``grow`` are displacement and change of log scale per unit of output; ``offset`` in [0, 1) is the only
+    randomness. Returns ascending rows and their weights [k]: all with weight 1 where a gradient is not finite, none
+    where all are zero.
     """
     count = len(quats)
     worth, totals = np.empty(count), np.empty(-(-count // CHUNK))
-    call = np.zeros(1, np.int64), far, grow, quats, g_means, g_quats, g_log_scales, worth, totals
-    run(_weigh, [call] * thread_count())
+    run_tickets(_weigh, far, grow, quats, g_means, g_quats, g_log_scales, worth, totals)
     if not math.isfinite(totals.sum()):  # what is wrong has to be seen: every Gaussian counts
         return np.arange(count), np.ones(count, np.float32)
     rows, factors = np.empty(count, np.int64), np.empty(count, np.float32)

@@ -1,7 +1,6 @@
-"""Poses as transforms, with a skeleton's regularisers, distances and blends: a few hundred numbers, one thread.
+"""Poses as transforms, with the skeleton's regularizers: a few hundred numbers, one thread.
 
-The twins in plain torch are in ours/skeleton.py and ours/pose.py. A loss is found with its gradient at once; the
-backward pass scales it.
+Each loss is computed with its gradient; the backward pass scales it.
 """
 
 from typing import Any, NamedTuple
@@ -14,39 +13,26 @@ from torch.autograd.function import once_differentiable
 from rewild4d.kernels.arrays import array
 from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.switch import Kernel
-from rewild4d.ours.fused.quaternions import dot, rotation, rotation_slope, side, unit, unit_slope
+from rewild4d.ours.fused.quaternions import dot, rotation, rotation_grad, side, unit, unit_grad
 
-STANCE = Kernel(
-    "stance", "3b43920b19d4", "rewild4d.ours.losses.skeleton:stance", "rewild4d.ours.losses.skeleton:skeleton_losses"
+POSTURE = Kernel(
+    "posture", "c6a13064e900", "rewild4d.ours.losses.skeleton:posture", "rewild4d.ours.losses.skeleton:skeleton_losses"
 )
 
 
 class Weights(NamedTuple):
-    """Of the regularisers.
+    """Weights and constants of the pose regularizers."""
 
-    Attributes:
-        limit: of the joint limits.
-        limb_plane: of limbs' turns out of the planes along the body.
-        body_plane: of the other bones'.
-        sideways: of the gaps of limbs across the body.
-        cosine: of half the angle at which they begin.
-        attach: of the gaps between a joint and its parent.
-        temporal: of second differences over triples; 0 where the poses are none.
-        still: of the steps between neighbours in triples; 0 where the poses are none.
-        step: length beyond which a step is taken for motion.
-        unit: length that distances are divided by.
-    """
-
-    limit: float
-    limb_plane: float
-    body_plane: float
-    sideways: float
-    cosine: float
-    attach: float
-    temporal: float
-    still: float
-    step: float
-    unit: float
+    limit: float  # of the joint limits
+    limb_plane: float  # of limb rotations out of the planes along the body
+    body_plane: float  # of the same of other bones
+    sideways: float  # of the gaps of limbs across the body
+    cosine: float  # of half the limit angle
+    attach: float  # of the gaps between a joint and its parent
+    temporal: float  # of second differences over triples; 0 without triples
+    still: float  # of the steps between neighbours in triples; 0 without triples
+    step: float  # rotation or shift that separates drift from motion
+    unit: float  # length that distances are divided by
 
 
 @inlined
@@ -56,14 +42,14 @@ def _quat(quats: np.ndarray, item: int, joint: int) -> tuple:
 
 
 @inlined
-def _add(slope: tuple, target: np.ndarray) -> None:
+def _add(grad: tuple, target: np.ndarray) -> None:
     for i in range(4):
-        target[i] += slope[i]
+        target[i] += grad[i]
 
 
 @kernel
 def _limits(quats: np.ndarray, parents: np.ndarray, weight: float, cosine: float, on_quats: np.ndarray) -> float:
-    """Mean squared excess of a cosine over that of half the angle to the parent, and its gradient."""
+    """Compute the mean squared excess of a cosine over that of half the angle to the parent, and its gradient."""
     count = len(quats) * max(1, (parents >= 0).sum())
     total = 0.0
     for item in range(len(quats)):
@@ -72,14 +58,14 @@ def _limits(quats: np.ndarray, parents: np.ndarray, weight: float, cosine: float
             if above < 0:
                 continue
             one, other = _quat(quats, item, joint), _quat(quats, item, above)
-            turned = dot(one, other)
-            excess = cosine - abs(turned)
+            alike = dot(one, other)
+            excess = cosine - abs(alike)
             if excess > 0:
                 total += excess * excess
-                slope = -2 * weight / count * excess * np.sign(turned)
+                grad = -2 * weight / count * excess * np.sign(alike)
                 for i in range(4):
-                    on_quats[item, joint, i] += slope * other[i]
-                    on_quats[item, above, i] += slope * one[i]
+                    on_quats[item, joint, i] += grad * other[i]
+                    on_quats[item, above, i] += grad * one[i]
     return weight * total / count
 
 
@@ -88,8 +74,8 @@ def _gaps(
     quats: np.ndarray, shifts: np.ndarray, pivots: np.ndarray, parents: np.ndarray, mirror: np.ndarray,
     weights: Weights, on_quats: np.ndarray, on_shifts: np.ndarray,
 ) -> float:  # fmt: skip
-    """Mean squared gap between a joint, pivot plus shift, and its parent's copy of it, and mean squared x of the limbs'
-    gaps, weighted; and the gradient."""
+    """Compute the weighted mean squared gaps between joints and their parents' copies, and their x for limbs; and the
+    gradient."""
     limbs, square = (mirror != np.arange(len(mirror))).sum(), weights.unit * weights.unit
     share = weights.attach / (len(quats) * max(1, (parents >= 0).sum()) * square)
     sideways = weights.sideways / (len(quats) * max(1, limbs) * square)
@@ -99,8 +85,8 @@ def _gaps(
             above = parents[joint]
             if above < 0:
                 continue
-            turn = unit(_quat(quats, item, above))
-            rows = rotation(turn)
+            quat = unit(_quat(quats, item, above))
+            rows = rotation(quat)
             arm = (
                 np.float64(pivots[joint, 0]) - pivots[above, 0], np.float64(pivots[joint, 1]) - pivots[above, 1],
                 np.float64(pivots[joint, 2]) - pivots[above, 2],
@@ -111,12 +97,12 @@ def _gaps(
                 gap = arm[i] + np.float64(shifts[item, joint, i]) - shifts[item, above, i] - moved
                 weight = share + (sideways if i == 0 and mirror[joint] != joint else 0.0)
                 total += weight * gap * gap
-                slope = 2 * weight * gap
-                on_shifts[item, joint, i] += slope
-                on_shifts[item, above, i] -= slope
+                grad = 2 * weight * gap
+                on_shifts[item, joint, i] += grad
+                on_shifts[item, above, i] -= grad
                 for j in range(3):
-                    on_matrix[i, j] = -slope * arm[j]
-            _add(unit_slope(turn, rotation_slope(turn, on_matrix)), on_quats[item, above])
+                    on_matrix[i, j] = -grad * arm[j]
+            _add(unit_grad(quat, rotation_grad(quat, on_matrix)), on_quats[item, above])
     return total
 
 
@@ -124,7 +110,8 @@ def _gaps(
 def _out_of_plane(
     quats: np.ndarray, parents: np.ndarray, mirror: np.ndarray, weights: Weights, on_quats: np.ndarray
 ) -> float:
-    """Mean squared y and z of the turns against the parent, of limbs and of other bones, weighted; and the gradient."""
+    """Compute the weighted mean squared y and z of rotations against the parent, for limbs and other bones; and the
+    gradient."""
     limbs = (mirror != np.arange(len(mirror))).sum()
     of_limb = weights.limb_plane / (len(quats) * max(1, limbs))
     of_body = weights.body_plane / (len(quats) * max(1, len(mirror) - limbs))
@@ -152,7 +139,7 @@ def _combined(p: float, a: tuple, q: float, b: tuple) -> tuple:
 def _second_differences(
     quats: np.ndarray, shifts: np.ndarray, weight: float, unit: float, on_quats: np.ndarray, on_shifts: np.ndarray
 ) -> float:
-    """Mean squared second difference of rotations and of shifts over triples, and its gradient."""
+    """Compute the mean squared second difference of rotations and shifts over triples, and its gradient."""
     joints, total = quats.shape[1], 0.0
     share = 3 * weight / (len(quats) * joints)
     by_length = share / (unit * unit)
@@ -182,7 +169,8 @@ def _steps(
     quats: np.ndarray, shifts: np.ndarray, weight: float, step: float, unit: float, on_quats: np.ndarray,
     on_shifts: np.ndarray,
 ) -> float:  # fmt: skip
-    """Mean of s v^2 / (v^2 + s^2) over the steps v of rotations in triples, plus that of shifts; and its gradient."""
+    """Compute the mean of s v^2 / (v^2 + s^2) over steps v of rotations in triples, plus that of shifts; and the
+    gradient."""
     joints, square, total = quats.shape[1], step * step, 0.0
     share = 3 * weight * step / (2 * len(quats) * joints)
     for item in range(len(quats)):
@@ -191,22 +179,22 @@ def _steps(
         for joint in range(joints):
             one, other = _quat(quats, item, joint), _quat(quats, item + 1, joint)
             same = side(one, other)
-            turned, moved = 0.0, 0.0
+            rotated, moved = 0.0, 0.0
             for i in range(4):
-                turned += (other[i] - same * one[i]) ** 2
+                rotated += (other[i] - same * one[i]) ** 2
             for i in range(3):
                 moved += ((np.float64(shifts[item + 1, joint, i]) - shifts[item, joint, i]) / unit) ** 2
-            total += share * (turned / (turned + square) + moved / (moved + square))
-            by_turn = 2 * share * square / (turned + square) ** 2
-            by_move = 2 * share * square / ((moved + square) * unit) ** 2
+            total += share * (rotated / (rotated + square) + moved / (moved + square))
+            by_rotation = 2 * share * square / (rotated + square) ** 2
+            by_shift = 2 * share * square / ((moved + square) * unit) ** 2
             for i in range(4):
-                slope = by_turn * (other[i] - same * one[i])
-                on_quats[item + 1, joint, i] += slope
-                on_quats[item, joint, i] -= same * slope
+                grad = by_rotation * (other[i] - same * one[i])
+                on_quats[item + 1, joint, i] += grad
+                on_quats[item, joint, i] -= same * grad
             for i in range(3):
-                slope = by_move * (np.float64(shifts[item + 1, joint, i]) - shifts[item, joint, i])
-                on_shifts[item + 1, joint, i] += slope
-                on_shifts[item, joint, i] -= slope
+                grad = by_shift * (np.float64(shifts[item + 1, joint, i]) - shifts[item, joint, i])
+                on_shifts[item + 1, joint, i] += grad
+                on_shifts[item, joint, i] -= grad
     return total
 
 
@@ -215,7 +203,7 @@ def _regularise(
     quats: np.ndarray, shifts: np.ndarray, pivots: np.ndarray, parents: np.ndarray, mirror: np.ndarray,
     weights: Weights, on_quats: np.ndarray, on_shifts: np.ndarray,
 ) -> float:  # fmt: skip
-    """The weighted sum of all; adds its gradients."""
+    """Return the weighted sum of all regularizers; add their gradients."""
     total = 0.0
     if weights.limit:
         total += _limits(quats, parents, weights.limit, weights.cosine, on_quats)
@@ -231,31 +219,31 @@ def _regularise(
 
 
 @kernel
-def _stand(
+def _select(
     quats: np.ndarray, shifts: np.ndarray, features: np.ndarray, rows: np.ndarray, pivots: np.ndarray,
     own_quats: np.ndarray, own_shifts: np.ndarray, own_features: np.ndarray, transforms: np.ndarray,
 ) -> None:  # fmt: skip
-    """Pick rows of the poses, and set their transforms."""
+    """Select rows of the poses, and set their transforms."""
     for k in range(len(rows)):
         item = rows[k]
         own_quats[k], own_shifts[k], own_features[k] = quats[item], shifts[item], features[item]
         for joint in range(len(pivots)):
-            matrix, turn = transforms[k, joint], rotation(unit(_quat(quats, item, joint)))
+            matrix, matrix_rows = transforms[k, joint], rotation(unit(_quat(quats, item, joint)))
             for i in range(3):
-                row, place = turn[i], np.float64(pivots[joint, i]) + shifts[item, joint, i]
+                row, position = matrix_rows[i], np.float64(pivots[joint, i]) + shifts[item, joint, i]
                 for j in range(3):
-                    place -= row[j] * pivots[joint, j]
-                matrix[i, 0], matrix[i, 1], matrix[i, 2], matrix[i, 3] = row[0], row[1], row[2], place
+                    position -= row[j] * pivots[joint, j]
+                matrix[i, 0], matrix[i, 1], matrix[i, 2], matrix[i, 3] = row[0], row[1], row[2], position
             matrix[3, 0], matrix[3, 1], matrix[3, 2], matrix[3, 3] = 0, 0, 0, 1
 
 
 @kernel
-def _stand_back(
+def _select_back(
     quats: np.ndarray, rows: np.ndarray, pivots: np.ndarray, g_quats: np.ndarray, g_shifts: np.ndarray,
     g_features: np.ndarray, g_transforms: np.ndarray, on_quats: np.ndarray, on_shifts: np.ndarray,
     on_features: np.ndarray,
 ) -> None:  # fmt: skip
-    """Add the gradients of what `_stand` gives."""
+    """Add the gradients of `_select`."""
     on_matrix = np.empty((3, 3))
     for k in range(len(rows)):
         item = rows[k]
@@ -263,15 +251,15 @@ def _stand_back(
         on_shifts[item] += g_shifts[k]
         on_features[item] += g_features[k]
         for joint in range(len(pivots)):
-            turn, g = unit(_quat(quats, item, joint)), g_transforms[k, joint]
+            quat, g = unit(_quat(quats, item, joint)), g_transforms[k, joint]
             for i in range(3):
                 on_shifts[item, joint, i] += g[i, 3]
                 for j in range(3):
                     on_matrix[i, j] = g[i, j] - np.float64(g[i, 3]) * pivots[joint, j]
-            _add(unit_slope(turn, rotation_slope(turn, on_matrix)), on_quats[item, joint])
+            _add(unit_grad(quat, rotation_grad(quat, on_matrix)), on_quats[item, joint])
 
 
-def stand(
+def posture_and_losses(
     quats: Tensor,
     shifts: Tensor,
     features: Tensor,
@@ -281,45 +269,32 @@ def stand(
     mirror: Tensor,
     weights: Weights,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Rows of a batch of poses, their transforms, and the weighted regularisers of all; float32 on the CPU.
-
-    Args:
-        quats: [B, J, 4].
-        shifts: [B, J, 3].
-        features: [B, J, K].
-        rows: which poses, k of them.
-        pivots: [J, 3].
-        parents: -1 for a root, [J].
-        mirror: bone on the other side, [J].
-        weights: of the regularisers.
-
-    Returns:
-        Quats, shifts and features of the rows [k, J, ...], transforms [k, J, 4, 4], and the sum, scalar.
-    """
-    return _Stand.apply(quats, shifts, features, rows, pivots, parents, mirror, weights)
+    """Select rows of a batch of poses with their transforms [k, J, 4, 4], and sum the regularizers of all; float32,
+    CPU."""
+    return _Posture.apply(quats, shifts, features, rows, pivots, parents, mirror, weights)
 
 
-class _Stand(torch.autograd.Function):
+class _Posture(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, quats: Tensor, shifts: Tensor, features: Tensor, rows: list[int], pivots: Tensor, parents: Tensor,
         mirror: Tensor, weights: Weights,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         joints, chosen = len(pivots), np.array(rows, np.int64)
-        turns, moves, centers = array(quats), array(shifts), pivots.numpy()
+        all_quats, all_shifts, centers = array(quats), array(shifts), pivots.numpy()
         sizes = ((4,), (3,), (features.shape[2],), (4, 4))
         made = tuple(np.empty((len(rows), joints, *size), np.float32) for size in sizes)
-        _stand(turns, moves, array(features), chosen, centers, *made)
-        slopes = np.zeros(turns.shape), np.zeros(moves.shape)
-        total = _regularise(turns, moves, centers, parents.numpy(), mirror.numpy(), weights, *slopes)
-        ctx.given, ctx.slopes, ctx.size = (turns, chosen, centers), slopes, features.shape
+        _select(all_quats, all_shifts, array(features), chosen, centers, *made)
+        grads = np.zeros(all_quats.shape), np.zeros(all_shifts.shape)
+        total = _regularise(all_quats, all_shifts, centers, parents.numpy(), mirror.numpy(), weights, *grads)
+        ctx.given, ctx.grads, ctx.size = (all_quats, chosen, centers), grads, features.shape
         return tuple(map(torch.from_numpy, (*made, np.array(total, np.float32))))
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
-        scale, on_features = slopes[4].item(), np.zeros(ctx.size, np.float32)
-        on_quats, on_shifts = (slope * scale for slope in ctx.slopes)
-        _stand_back(*ctx.given, *map(array, slopes[:4]), on_quats, on_shifts, on_features)
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        scale, on_features = grads[4].item(), np.zeros(ctx.size, np.float32)
+        on_quats, on_shifts = (grad * scale for grad in ctx.grads)
+        _select_back(*ctx.given, *map(array, grads[:4]), on_quats, on_shifts, on_features)
         made = (on_quats.astype(np.float32), on_shifts.astype(np.float32), on_features)
         return *map(torch.from_numpy, made), *[None] * 5

@@ -1,7 +1,4 @@
-"""Pieces of a transformer on a few tokens: features are rows, tokens are the lanes of a row.
-
-Parameters are read where they lie, by address; their gradients lie one behind the other in one flat array.
-"""
+"""Transformer layers on a few tokens: features are rows, tokens are the lanes of a row."""
 
 import math
 
@@ -14,7 +11,7 @@ from rewild4d.kernels.rows import add_row_sums, sum_rows
 from rewild4d.kernels.simd import LANES, absolute, divide, fma, load, maximum, select_gt, splat, store
 
 NORM_EPS = 1e-5
-"""As `torch.nn.LayerNorm` has it."""
+"""As in `torch.nn.LayerNorm`."""
 
 
 @kernel
@@ -24,34 +21,34 @@ def linear(weight: np.ndarray, bias: np.ndarray, given: np.ndarray, wide: int, r
     depth = len(weight) // rows
     for row in range(rows):
         value = splat(bias[row])
-        for place in range(row * wide, (row + 1) * wide, LANES):
-            store(result, place, load(result, place) + value)
+        for index in range(row * wide, (row + 1) * wide, LANES):
+            store(result, index, load(result, index) + value)
     add_product(weight, 0, depth, 1, given, 0, wide, depth, result, 0, wide, rows, wide)
 
 
 @kernel
-def linear_back(weight: np.ndarray, rows: int, slope: np.ndarray, wide: int, result: np.ndarray) -> None:
-    """Set rows to the transposed matrix times a slope; a multiple of 8 inputs."""
+def linear_back(weight: np.ndarray, rows: int, grad: np.ndarray, wide: int, result: np.ndarray) -> None:
+    """Set rows to the transposed matrix times a gradient; a multiple of 8 inputs."""
     depth = len(weight) // rows
     result[: depth * wide] = 0
-    add_product(weight, 0, 1, depth, slope, 0, wide, rows, result, 0, wide, depth, wide)
+    add_product(weight, 0, 1, depth, grad, 0, wide, rows, result, 0, wide, depth, wide)
 
 
 @kernel
 def linear_gradient(
-    slope: np.ndarray, given: np.ndarray, inputs: int, wide: int, tokens: int, scratch: np.ndarray, weight: np.ndarray,
+    grad: np.ndarray, given: np.ndarray, inputs: int, wide: int, tokens: int, scratch: np.ndarray, weight: np.ndarray,
     bias: np.ndarray,
 ) -> None:  # fmt: skip
-    """Add to the gradients of a matrix and of its bias; multiples of sixteen inputs and outputs."""
+    """Add the gradients of a matrix and of its bias; multiples of sixteen inputs and outputs."""
     rows = len(bias)
     transpose(given, inputs, wide, scratch)
-    add_product(slope, 0, wide, 1, scratch, 0, inputs, tokens, weight, 0, inputs, rows, inputs)
-    add_row_sums(slope, rows, wide, scratch, bias)
+    add_product(grad, 0, wide, 1, scratch, 0, inputs, tokens, weight, 0, inputs, rows, inputs)
+    add_row_sums(grad, rows, wide, scratch, bias)
 
 
 @kernel
 def normalise(hidden: np.ndarray, width: int, wide: int, plain: np.ndarray, inverse: np.ndarray) -> None:
-    """Each token less its mean, over its standard deviation; and one over that."""
+    """Normalise each token to mean 0 and deviation 1; set one over the deviation."""
     share = splat(np.float32(1 / width))
     for lane in range(0, wide, LANES):
         mean, square = splat(np.float32(0)), splat(np.float32(0))
@@ -71,27 +68,27 @@ def normalise(hidden: np.ndarray, width: int, wide: int, plain: np.ndarray, inve
 
 @kernel
 def scale_rows(plain: np.ndarray, weight: np.ndarray, bias: np.ndarray, wide: int, result: np.ndarray) -> None:
-    """Each row times a weight plus a bias."""
+    """Multiply each row by a weight and add a bias."""
     for row in range(len(weight)):
         factor, start = splat(weight[row]), splat(bias[row])
-        for place in range(row * wide, (row + 1) * wide, LANES):
-            store(result, place, fma(factor, load(plain, place), start))
+        for index in range(row * wide, (row + 1) * wide, LANES):
+            store(result, index, fma(factor, load(plain, index), start))
 
 
 @kernel
 def normalise_back(
-    plain: np.ndarray, inverse: np.ndarray, weight: np.ndarray, wide: int, slope: np.ndarray, scratch: np.ndarray,
+    plain: np.ndarray, inverse: np.ndarray, weight: np.ndarray, wide: int, grad: np.ndarray, scratch: np.ndarray,
     on_weight: np.ndarray, on_bias: np.ndarray, on_hidden: np.ndarray,
 ) -> None:  # fmt: skip
-    """From the slope after `normalise` and `scale_rows`, which is overwritten; adds to all three gradients."""
+    """Add the gradients of `normalise` and `scale_rows`; overwrites ``grad``."""
     width = len(weight)
-    add_row_sums(slope, width, wide, scratch, on_bias)
+    add_row_sums(grad, width, wide, scratch, on_bias)
     for row in range(width):
         total, factor = splat(np.float32(0)), splat(weight[row])
-        for place in range(row * wide, (row + 1) * wide, LANES):
-            value = load(slope, place)
-            total = fma(value, load(plain, place), total)
-            store(slope, place, value * factor)
+        for index in range(row * wide, (row + 1) * wide, LANES):
+            value = load(grad, index)
+            total = fma(value, load(plain, index), total)
+            store(grad, index, value * factor)
         store(scratch, row * LANES, total)
     sum_rows(scratch, width, scratch, 0)
     for row in range(0, width, LANES):
@@ -100,22 +97,22 @@ def normalise_back(
     for lane in range(0, wide, LANES):
         mean, along = splat(np.float32(0)), splat(np.float32(0))
         for row in range(width):
-            value = load(slope, row * wide + lane)
+            value = load(grad, row * wide + lane)
             mean, along = mean + value, fma(value, load(plain, row * wide + lane), along)
         mean, along, factor = mean * share, along * share, load(inverse, lane)
         for row in range(width):
-            place = row * wide + lane
-            change = load(slope, place) - mean - along * load(plain, place)
-            store(on_hidden, place, fma(change, factor, load(on_hidden, place)))
+            index = row * wide + lane
+            change = load(grad, index) - mean - along * load(plain, index)
+            store(on_hidden, index, fma(change, factor, load(on_hidden, index)))
 
 
 @kernel
 def gelu(given: np.ndarray, count: int, bend: np.ndarray) -> None:
-    """x Phi(x) in place, and its derivative; Phi to 8e-8 (Abramowitz and Stegun 7.1.26)."""
+    """Compute x Phi(x) in place, and its derivative; Phi to 8e-8 (Abramowitz and Stegun 7.1.26)."""
     zero, one, half = splat(np.float32(0)), splat(np.float32(1)), splat(np.float32(0.5))
     lowest, exponent = splat(np.float32(-126)), splat(np.float32(-0.5) * LOG2_E)
-    for place in range(0, count, LANES):
-        x = load(given, place)
+    for index in range(0, count, LANES):
+        x = load(given, index)
         bell = exp2(maximum(lowest, x * x * exponent))
         t = divide(one, fma(absolute(x), splat(np.float32(0.3275911 / math.sqrt(2.0))), one))
         tail = fma(t, splat(np.float32(1.061405429)), splat(np.float32(-1.453152027)))
@@ -123,13 +120,13 @@ def gelu(given: np.ndarray, count: int, bend: np.ndarray) -> None:
         tail = fma(tail, t, splat(np.float32(-0.284496736)))
         tail = fma(tail, t, splat(np.float32(0.254829592))) * t * bell * half
         below = select_gt(x, zero, one - tail, tail)
-        store(given, place, x * below)
-        store(bend, place, fma(x * bell, splat(np.float32(1 / math.sqrt(2 * math.pi))), below))
+        store(given, index, x * below)
+        store(bend, index, fma(x * bell, splat(np.float32(1 / math.sqrt(2 * math.pi))), below))
 
 
 @kernel
 def softmax(scores: np.ndarray, first: int, keys: int, wide: int, factor: float) -> None:
-    """Over the rows, of the scores times a factor, in place."""
+    """Apply softmax over the rows to the scores times a factor, in place."""
     lowest, scale = splat(np.float32(-126)), splat(np.float32(factor) * LOG2_E)
     for lane in range(first, first + wide, LANES):
         top, total = load(scores, lane), splat(np.float32(0))
@@ -145,42 +142,35 @@ def softmax(scores: np.ndarray, first: int, keys: int, wide: int, factor: float)
 
 
 @kernel
-def softmax_back(shares: np.ndarray, first: int, keys: int, wide: int, factor: float, slope: np.ndarray) -> None:
-    """From the slope of the shares to that of the scores, in place."""
+def softmax_back(shares: np.ndarray, first: int, keys: int, wide: int, factor: float, grad: np.ndarray) -> None:
+    """Compute the gradient of the scores from that of the shares, in place."""
     scale = splat(np.float32(factor))
     for lane in range(0, wide, LANES):
         mean = splat(np.float32(0))
         for key in range(keys):
-            mean = fma(load(shares, first + lane + key * wide), load(slope, lane + key * wide), mean)
+            mean = fma(load(shares, first + lane + key * wide), load(grad, lane + key * wide), mean)
         for key in range(keys):
-            place = lane + key * wide
-            store(slope, place, load(shares, first + place) * (load(slope, place) - mean) * scale)
+            index = lane + key * wide
+            store(grad, index, load(shares, first + index) * (load(grad, index) - mean) * scale)
 
 
 @kernel
 def _copy_lanes(
-    source: np.ndarray, wide: int, lanes: int, rows: int, target: np.ndarray, place: int, step: int
+    source: np.ndarray, wide: int, lanes: int, rows: int, target: np.ndarray, index: int, step: int
 ) -> None:
-    """Write the first lanes of rows ``wide`` apart to rows ``step`` apart."""
+    """Copy the first lanes of rows ``wide`` apart to rows ``step`` apart."""
     for row in range(rows):
         for lane in range(lanes):
-            target[place + row * step + lane] = source[row * wide + lane]
+            target[index + row * step + lane] = source[row * wide + lane]
 
 
 @kernel
 def attend(qkv: np.ndarray, width: int, heads: int, joints: int, items: int, wide: int, shares: np.ndarray,
            mixed: np.ndarray) -> None:  # fmt: skip
-    """Self-attention within each item.
+    """Apply self-attention within each item; item b has the lanes from b joints on.
 
-    Args:
-        qkv: queries, keys and values, [3 width, wide].
-        width: of a token.
-        heads: of the attention.
-        joints: tokens of an item; item b has lanes b joints and on.
-        items: how many.
-        wide: lanes of a row.
-        shares: of the keys (rows) for each query (lanes), set, [items, heads, P, P] with P joints padded to sixteen.
-        mixed: set, zero in lanes of no item, [width, wide].
+    Reads queries, keys and values, [3 width, wide]. Sets the weights of keys (rows) for queries (lanes), [items, heads,
+    P, P] with P joints padded to sixteen, and mixed [width, wide], zero in unused lanes.
     """
     size, tile = width // heads, (joints + LANES - 1) // LANES * LANES
     keys = (joints + 7) // 8 * 8
@@ -202,18 +192,18 @@ def attend(qkv: np.ndarray, width: int, heads: int, joints: int, items: int, wid
 @kernel
 def attend_back(qkv: np.ndarray, width: int, heads: int, joints: int, items: int, wide: int, shares: np.ndarray,
                 on_mixed: np.ndarray, on_qkv: np.ndarray) -> None:  # fmt: skip
-    """The gradient of `attend`: sets ``on_qkv`` in the items' lanes; ``on_mixed`` has sixteen numbers to spare."""
+    """Set ``on_qkv``, the gradient of `attend`, in the items' lanes; ``on_mixed`` has sixteen numbers to spare."""
     size, tile = width // heads, (joints + LANES - 1) // LANES * LANES
     keys = (joints + 7) // 8 * 8
     part, on_shares = np.empty(size * tile, np.float32), np.empty(tile * tile, np.float32)
-    turned = np.empty(tile * tile, np.float32)
+    transposed = np.empty(tile * tile, np.float32)
     for item in range(items):
         for head in range(heads):
             query, slot = head * size * wide + item * joints, (item * heads + head) * tile * tile
             key, value = query + width * wide, query + 2 * width * wide
-            transpose(shares[slot : slot + tile * tile], tile, tile, turned)
+            transpose(shares[slot : slot + tile * tile], tile, tile, transposed)
             part[:] = 0
-            add_product(on_mixed, query, wide, 1, turned, 0, tile, joints, part, 0, tile, size, tile)
+            add_product(on_mixed, query, wide, 1, transposed, 0, tile, joints, part, 0, tile, size, tile)
             _copy_lanes(part, tile, joints, size, on_qkv, value, wide)
             on_shares[:] = 0
             add_product(qkv, value, 1, wide, on_mixed, query, wide, size, on_shares, 0, tile, keys, tile)
@@ -221,7 +211,7 @@ def attend_back(qkv: np.ndarray, width: int, heads: int, joints: int, items: int
             part[:] = 0
             add_product(qkv, key, wide, 1, on_shares, 0, tile, joints, part, 0, tile, size, tile)
             _copy_lanes(part, tile, joints, size, on_qkv, query, wide)
-            transpose(on_shares, tile, tile, turned)
+            transpose(on_shares, tile, tile, transposed)
             part[:] = 0
-            add_product(qkv, query, wide, 1, turned, 0, tile, joints, part, 0, tile, size, tile)
+            add_product(qkv, query, wide, 1, transposed, 0, tile, joints, part, 0, tile, size, tile)
             _copy_lanes(part, tile, joints, size, on_qkv, key, wide)

@@ -1,7 +1,7 @@
 """Image losses of one view, each a sum over pixels divided by the area of the animal's box.
 
-Outside the union of both silhouettes render and target are the same background, so everything is computed on a crop and
-is exactly what the whole frame would give.
+Outside the union of both silhouettes render and target are the same background, so the losses are computed on a crop
+and equal those of the whole frame.
 """
 
 import math
@@ -15,7 +15,7 @@ from rewild4d.ours.fused.images import COLOUR_LOSSES, SILHOUETTE, colour_means, 
 from rewild4d.ours.symmetry import Target
 
 WINDOW, SIGMA = 11, 1.5
-"""SSIM's Gaussian window (pixels)."""
+"""Size and standard deviation of SSIM's Gaussian window, pixels."""
 C1, C2 = 0.01**2, 0.03**2
 """SSIM's constants for images in [0, 1]."""
 
@@ -23,12 +23,8 @@ Window = tuple[slice, slice]
 
 
 def union_window(alphas: list[Tensor], margin: int) -> Window:
-    """Rows and columns that hold every pixel where any matte is above zero, and a margin, clipped to the image.
-
-    Args:
-        alphas: mattes of one size, [1, h, w].
-        margin: pixels.
-    """
+    """Return rows and columns of all pixels where any matte [1, h, w] is above zero, with a margin, clipped to the
+    image."""
     slices = []
     for (first, last), length in zip(_extent(alphas), alphas[0].shape[1:], strict=True):
         slices.append(slice(max(0, first - margin), min(length, last + 1 + margin)))
@@ -36,18 +32,18 @@ def union_window(alphas: list[Tensor], margin: int) -> Window:
 
 
 def _extent(alphas: list[Tensor]) -> tuple[tuple[int, int], tuple[int, int]]:
-    """First and last row and column where any matte is above zero."""
+    """Return first and last row and column where any matte is above zero."""
     union = torch.stack([alpha[0].detach() for alpha in alphas]).amax(0) > 0
     ends = []
     for marks in (union.any(dim=1), union.any(dim=0)):
-        places = torch.arange(len(marks), device=marks.device)
-        ends += [torch.where(marks, places, len(marks)).amin(), torch.where(marks, places, -1).amax()]
+        positions = torch.arange(len(marks), device=marks.device)
+        ends += [torch.where(marks, positions, len(marks)).amin(), torch.where(marks, positions, -1).amax()]
     top, bottom, left, right = torch.stack(ends).tolist()  # one look: each waits for a GPU
     return ((top, bottom), (left, right)) if top <= bottom else ((0, 0), (0, 0))
 
 
 def silhouette_loss(alpha: Tensor, target: Target, window: Window) -> Tensor:
-    """BCE + Dice of a rendered matte, alpha [1, h, w] clamped at 1e-5, Dice smoothing 1; scalar."""
+    """Compute BCE + Dice of a rendered matte, alpha [1, h, w] clamped at 1e-5, Dice smoothing 1; scalar."""
     if SILHOUETTE.takes(alpha):
         return matte_loss(alpha, target.mask, _corner_and_size(window), target.side**2)
     rendered, truth = alpha[:, *window], target.mask[:, *window]
@@ -59,7 +55,7 @@ def silhouette_loss(alpha: Tensor, target: Target, window: Window) -> Tensor:
 def colour_losses(
     rgb: Tensor, alpha: Tensor, target: Target, background: Tensor, window: Window
 ) -> tuple[Tensor, Tensor]:
-    """L1 and 1 - SSIM of render and target over one background colour.
+    """Compute L1 and 1 - SSIM of render and target over one background colour.
 
     Args:
         rgb: rendered colour, premultiplied, [3, h, w].
@@ -88,7 +84,7 @@ def _corner_and_size(window: Window) -> tuple[int, int, int, int]:
 
 
 def _inner(window: Window, alpha: Tensor) -> Window:
-    """The part of a window where SSIM sees no false border: five pixels in, but to the image's own edge."""
+    """Return the part of a window where SSIM sees no false border: five pixels in, but to the image's own edge."""
     half = WINDOW // 2
     inner = []
     for part, length in zip(window, alpha.shape[1:], strict=True):
@@ -99,7 +95,7 @@ def _inner(window: Window, alpha: Tensor) -> Window:
 
 
 def ssim_map(x: Tensor, y: Tensor) -> Tensor:
-    """SSIM per pixel with zero padding, window 11, sigma 1.5 (3DGS's loss), [c, h, w] each.
+    """Compute SSIM per pixel with zero padding, window 11, sigma 1.5 (3DGS's loss), [c, h, w] each.
 
     The window is separable, so the five means are products with two banded matrices.
     """
@@ -114,16 +110,16 @@ def ssim_map(x: Tensor, y: Tensor) -> Tensor:
 
 @cache
 def blur_matrix(size: int, sigma: float, radius: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """Banded matrix that convolves a column of pixels with a normalised Gaussian, zero padding, [size, size]."""
-    place = torch.arange(size, dtype=torch.float64)
-    offset = place[:, None] - place
+    """Return the banded matrix that blurs a column of pixels by a normalised Gaussian, zero padding, [size, size]."""
+    position = torch.arange(size, dtype=torch.float64)
+    offset = position[:, None] - position
     kernel = torch.exp(-(torch.arange(-radius, radius + 1, dtype=torch.float64) ** 2) / (2 * sigma**2)).sum()
     band = torch.exp(-(offset**2) / (2 * sigma**2)) * (offset.abs() <= radius) / kernel
     return band.to(device, dtype)
 
 
 def blurred(image: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur with zero padding, [h, w]; below a third of a pixel nothing happens."""
+    """Blur by a Gaussian with zero padding, [h, w]; not at all below a third of a pixel."""
     if sigma < 0.3:
         return image
     radius = math.ceil(3 * sigma)

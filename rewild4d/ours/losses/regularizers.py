@@ -1,4 +1,4 @@
-"""Regularisers: total variation of the skinning field, compact parts, smooth normals, and a skeleton's own."""
+"""Regularizers: total variation of the skinning field, compact parts, smooth normals, and a skeleton's."""
 
 import math
 from collections.abc import Sequence
@@ -19,12 +19,9 @@ from rewild4d.types import OBJECT_DIAGONAL
 
 
 def tv_loss(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
-    """L_tv: mean over the axes of the mean Huber function of forward differences.
+    """Compute L_tv of a field [R^3, J]: the mean over the axes of the mean Huber function of forward differences.
 
-    Args:
-        probabilities: of the field, x slowest, [R^3, J].
-        resolution: R.
-        delta: x^2 / 2 inside, delta (|x| - delta / 2) outside.
+    The Huber function is x^2 / 2 inside delta, delta (|x| - delta / 2) outside.
     """
     grid = probabilities.view(resolution, resolution, resolution, -1)
     terms = [
@@ -35,17 +32,11 @@ def tv_loss(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
 
 
 def compact_loss(clouds: Sequence[Tensor], weights: Tensor, opacities: Tensor, power: float) -> Tensor:
-    """L_compact: mean over clouds and parts of the two smaller eigenvalues of a part's covariance.
+    """Compute L_compact: the mean over clouds [n, 3] and parts of the two smaller eigenvalues of a part's covariance.
 
     They are tr C - v^T C v with v the top eigenvector of the detached C: exactly the eigenvalues' gradient, and defined
-    where the two coincide. Parts of mass below 1 are skipped; weights and opacities are taken as given, otherwise the
-    weights would move to cut the loss.
-
-    Args:
-        clouds: places of the same Gaussians, [n, 3] each.
-        weights: skinning weights, [n, J].
-        opacities: [n].
-        power: exponent on the weights.
+    where the two coincide. Masses are opacity times weight to a ``power``, without gradients; parts of mass below 1 are
+    skipped.
     """
     if COMPACTNESS.takes(*clouds):
         return compactness(clouds, weights, opacities, power)
@@ -66,16 +57,10 @@ def compact_loss(clouds: Sequence[Tensor], weights: Tensor, opacities: Tensor, p
 
 
 def smooth_loss(posed: Posed, opacities: Tensor, size: int, generator: torch.Generator) -> Tensor:
-    """L_smooth: neighbouring pixels of a rendered normal map agree, from a random viewpoint around the animal.
+    """Compute L_smooth: agreement of neighbouring pixels of a rendered normal map, ``size`` pixels wide.
 
-    A Gaussian's normal is the axis of its smallest scale, turned towards the camera before blending. Only the normals
-    get gradients; the blending weights and the mattes are constants.
-
-    Args:
-        posed: deformed Gaussians.
-        opacities: [n].
-        size: side of the image, pixels.
-        generator: draws azimuth in [0, 360) and elevation in [-10, 60) degrees.
+    The viewpoint is random: azimuth in [0, 360), elevation in [-10, 60) degrees. A Gaussian's normal is the axis of its
+    smallest scale, pointing to the camera. Only the normals get gradients.
     """
     means, log_scales = posed.means.detach(), posed.log_scales.detach()
     azimuth, elevation = torch.rand(2, generator=generator).tolist()
@@ -94,7 +79,7 @@ def smooth_loss(posed: Posed, opacities: Tensor, size: int, generator: torch.Gen
 
 
 def _normals(quats: Tensor, log_scales: Tensor, means: Tensor, eye: Tensor) -> Tensor:
-    """The axis of each Gaussian's smallest scale, turned towards ``eye`` [3], [n, 3]."""
+    """Return the axis of each Gaussian's smallest scale, pointing to ``eye`` [3], [n, 3]."""
     if NORMALS.takes(quats):
         return smallest_axes(quats, log_scales, means, eye)
     axis = log_scales.argmin(-1)[:, None, None].expand(-1, 3, 1)
@@ -104,7 +89,7 @@ def _normals(quats: Tensor, log_scales: Tensor, means: Tensor, eye: Tensor) -> T
 
 
 def _disagreement(image: Tensor, matte: Tensor) -> Tensor:
-    """Mean of 1 - |cos| between neighbouring pixels' vectors [3, h, w], weighted by both mattes [h, w]; scalar."""
+    """Compute the mean of 1 - |cos| between neighbouring pixels' vectors [3, h, w], weighted by both mattes [h, w]."""
     if NORMALS.takes(image):
         return disagreement(image, matte)
     # torch's own norm over the channels takes longer than the rest of this function.
@@ -119,7 +104,7 @@ def _disagreement(image: Tensor, matte: Tensor) -> Tensor:
 
 
 def limit_loss(pose: Pose, parents: Tensor, degrees: float) -> Tensor:
-    """Mean squared excess of cos(half the angle between a bone and its parent) below that of ``degrees``."""
+    """Compute the mean squared excess of cos(half the angle of a bone to its parent) below that of ``degrees``."""
     has_parent = parents >= 0
     if not bool(has_parent.any()):
         return pose.quats.sum() * 0.0
@@ -129,7 +114,7 @@ def limit_loss(pose: Pose, parents: Tensor, degrees: float) -> Tensor:
 
 
 def attach_loss(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
-    """Mean squared gap between a joint and its parent's copy of it, over the squared diagonal."""
+    """Compute the mean squared gap between a joint and its parent's copy of it, over the squared diagonal."""
     has_parent = parents >= 0
     if not bool(has_parent.any()):
         return transforms.sum() * 0.0
@@ -137,13 +122,7 @@ def attach_loss(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
 
 
 def joint_gaps(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
-    """From each joint's place as its parent carries it to its own, zero for a root, [B, J, 3].
-
-    Args:
-        transforms: rest -> posed, [B, J, 4, 4].
-        pivots: [J, 3].
-        parents: -1 for a root, [J].
-    """
+    """Return each joint's position relative to its parent's copy, zero for a root, [B, J, 3]."""
     carrier = torch.where(parents >= 0, parents, torch.arange(len(parents), device=parents.device))
     pivot = torch.nn.functional.pad(pivots, (0, 1), value=1.0)[..., None]
     return ((transforms - transforms[:, carrier]) @ pivot)[..., :3, 0]
@@ -152,20 +131,13 @@ def joint_gaps(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
 def sagittal_losses(
     pose: Pose, transforms: Tensor, pivots: Tensor, parents: Tensor, mirror: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """How far bones turn out of the planes along the body, and how far limbs gape sideways: means over what they count.
+    """Compute mean rotations of bones out of the planes along the body, and mean gaps of limbs across it.
 
-    A turn against the parent within such a plane is about x. Limbs are the bones that have another on the other side.
-
-    Args:
-        pose: unit quaternions.
-        transforms: of the same poses, rest -> posed, [B, J, 4, 4].
-        pivots: [J, 3].
-        parents: -1 for a root, [J].
-        mirror: bone on the other side, [J].
+    Rotations within such a plane are about x. Limbs are the bones that have a counterpart on the other side.
 
     Returns:
-        Squares of the y and z of the quaternion against the parent, of limbs and of other bones; and the squared x of
-        the limbs' gaps (`joint_gaps`) over the squared diagonal.
+        Squared y and z of the quaternion against the parent, of limbs and of other bones; squared x of the limbs' gaps
+            (`joint_gaps`) over the squared diagonal.
     """
     limbs = (mirror != torch.arange(len(mirror), device=mirror.device)).to(pose.quats)
     rest = pose.quats.new_tensor((1.0, 0, 0, 0))
@@ -178,7 +150,7 @@ def sagittal_losses(
 
 
 def temporal_loss(pose: Pose) -> Tensor:
-    """Mean squared second difference of rotations and shifts over triples of neighbouring frames, B = 3 k."""
+    """Compute the mean squared second difference of rotations and shifts over triples of frames, B = 3 k."""
     quats, shifts = pose.quats.unflatten(0, (-1, 3)), pose.shifts.unflatten(0, (-1, 3))
     middle = quats[:, 1]
     bend = aligned(quats[:, 0], middle) + aligned(quats[:, 2], middle) - 2 * middle
@@ -187,40 +159,34 @@ def temporal_loss(pose: Pose) -> Tensor:
 
 
 def still_loss(pose: Pose, step: float) -> Tensor:
-    """Mean of s v^2 / (v^2 + s^2) over the steps v of rotations within triples of frames, B = 3 k, plus that of shifts.
+    """Compute the mean of s v^2 / (v^2 + s^2) over steps v of rotations within triples of frames, B = 3 k, plus that of
+    shifts.
 
-    Steps much longer than s cost s and feel nothing: what moves is left alone, what drifts slowly is held still
-    (Geman and McClure's function).
+    Steps much longer than s cost s and get no gradient; slow drift is held still (Geman and McClure's function).
     """
     quats, shifts = pose.quats.unflatten(0, (-1, 3)), pose.shifts.unflatten(0, (-1, 3))
-    turned = quats[:, 1:] - aligned(quats[:, :-1], quats[:, 1:])
+    rotated = quats[:, 1:] - aligned(quats[:, :-1], quats[:, 1:])
     moved = (shifts[:, 1:] - shifts[:, :-1]) / OBJECT_DIAGONAL
-    squares = torch.stack([way.square().sum(-1) for way in (turned, moved)])
+    squares = torch.stack([each.square().sum(-1) for each in (rotated, moved)])
     return 2 * step * (squares / (squares + step**2)).mean()
 
 
 def neighbours(points: Tensor, count: int) -> Tensor:
-    """Indices of the nearest other points, of all others where there are fewer, [n, 3] -> [n, min(count, n - 1)]."""
-    place = points.detach().cpu().double().numpy()
-    _, index = cKDTree(place).query(place, k=list(range(1, min(count, len(place) - 1) + 2)))
+    """Return indices of the nearest other points, [n, 3] -> [n, min(count, n - 1)]."""
+    positions = points.detach().cpu().double().numpy()
+    _, index = cKDTree(positions).query(positions, k=list(range(1, min(count, len(positions) - 1) + 2)))
     return torch.from_numpy(np.ascontiguousarray(index[:, 1:]))
 
 
 def rigid_loss(canonical: Tensor, deformed: Tensor, near: Tensor) -> Tensor:
-    """As isometric as possible: mean change of distance between canonical neighbours.
-
-    Args:
-        canonical: [n, 3], a constant here.
-        deformed: [n, 3].
-        near: from `neighbours`, [n, k].
-    """
+    """Compute the mean change of distance to canonical neighbours ``near`` [n, k] (as isometric as possible)."""
     rest = (canonical.detach()[:, None] - canonical.detach()[near]).norm(dim=-1)
     moved = ((deformed[:, None] - deformed[near]).square().sum(-1) + 1e-12).sqrt()
     return (moved - rest).abs().mean()
 
 
-def relative_turn(quats: Tensor, parents: Tensor) -> Tensor:
-    """Rotation of each bone against its parent in degrees (against rest for a root), [..., J, 4] -> [..., J]."""
+def relative_angles(quats: Tensor, parents: Tensor) -> Tensor:
+    """Compute each bone's rotation against its parent (rest for a root) in degrees, [..., J, 4] -> [..., J]."""
     conjugate = quats * quats.new_tensor((1.0, -1.0, -1.0, -1.0))
     above = torch.where(
         (parents >= 0)[:, None], conjugate[..., parents.clamp_min(0), :], quats.new_tensor((1.0, 0, 0, 0))

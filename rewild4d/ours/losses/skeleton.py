@@ -1,11 +1,11 @@
-"""The skeleton's own regularisers of a batch of poses, and the neighbouring frames that one of them needs."""
+"""The skeleton's regularizers of a batch of poses, and the neighbouring frames that one of them needs."""
 
 import math
 
 from torch import Tensor
 
 from rewild4d.ours.config import Geometry
-from rewild4d.ours.fused.skeleton import STANCE, Weights, stand
+from rewild4d.ours.fused.skeleton import POSTURE, Weights, posture_and_losses
 from rewild4d.ours.losses.regularizers import attach_loss, limit_loss, sagittal_losses, still_loss, temporal_loss
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import Pose
@@ -14,14 +14,10 @@ from rewild4d.types import OBJECT_DIAGONAL
 
 
 def neighbour_keys(keys: list[Key], frames: int, config: Geometry) -> tuple[list[Key], list[int]]:
-    """Each view with the frames before and after it, in triples, and the rows of the views themselves.
+    """Return each view with the frames before and after it, in triples, and the rows of the views themselves.
 
-    At an end of the clip the triple is moved inwards. Clips of two frames get no neighbours, nor does who needs none.
-
-    Args:
-        keys: the views of a step.
-        frames: number of frames.
-        config: the weights of the temporal terms.
+    At an end of the clip the triple is moved inwards. No neighbours where the clip has two frames or no term needs
+    them.
     """
     if (not config.temporal and not config.still) or frames < 3:
         return keys, list(range(len(keys)))
@@ -33,22 +29,15 @@ def neighbour_keys(keys: list[Key], frames: int, config: Geometry) -> tuple[list
     return triples, own
 
 
-def stance(model: Model, poses: Pose, rows: list[int], config: Geometry) -> tuple[Pose, Tensor, Tensor]:
-    """Chosen poses of a batch, their transforms, and the regularisers of the whole batch.
+def posture(model: Model, poses: Pose, rows: list[int], config: Geometry) -> tuple[Pose, Tensor, Tensor]:
+    """Select poses of a batch, with their transforms, and sum the weighted regularizers of the whole batch.
 
-    Args:
-        model: gives the skeleton.
-        poses: [B, J, ...]; where B = 3 k, triples of neighbouring frames as `neighbour_keys` makes them.
-        rows: which are chosen, k of them.
-        config: the weights of joint limits, attachment, planes and (over triples) temporal smoothness and stillness.
-
-    Returns:
-        Poses [k, J, ...], transforms [k, J, 4, 4] and the weighted sum, scalar.
+    Where B = 3 k, the poses are triples of neighbouring frames from `neighbour_keys`, ``rows`` the k selected ones.
     """
     triples = len(poses.quats) == 3 * len(rows)
     skeleton = model.pivots, model.parents, model.mirror
-    if STANCE.takes(poses.quats):
-        *own, transforms, total = stand(*poses, rows, *skeleton, _weights(config, triples))
+    if POSTURE.takes(poses.quats):
+        *own, transforms, total = posture_and_losses(*poses, rows, *skeleton, _weights(config, triples))
         return Pose(*own), transforms, total
     transforms = model.transforms(poses)
     total = skeleton_losses(model, poses, transforms, config, triples)
@@ -56,24 +45,17 @@ def stance(model: Model, poses: Pose, rows: list[int], config: Geometry) -> tupl
 
 
 def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geometry, triples: bool) -> Tensor:
-    """Weighted sum of joint limits, attachment, planes and (over triples) smoothness and stillness, scalar.
-
-    Args:
-        model: gives the skeleton.
-        pose: [B, J, ...].
-        transforms: of the same poses, [B, J, 4, 4].
-        config: the weights.
-        triples: whether the poses are those of triples of neighbouring frames; of others no step is known.
-    """
-    if STANCE.takes(pose.quats):
-        return stand(*pose, [], model.pivots, model.parents, model.mirror, _weights(config, triples))[-1]
+    """Sum the weighted regularizers of poses [B, J, ...] with transforms [B, J, 4, 4]: joint limits, attachment, planes
+    and, if the poses are triples of neighbouring frames, smoothness and stillness."""
+    if POSTURE.takes(pose.quats):
+        return posture_and_losses(*pose, [], model.pivots, model.parents, model.mirror, _weights(config, triples))[-1]
     total = pose.shifts.sum() * 0.0
     if config.limit:
         total = total + config.limit * limit_loss(pose, model.parents, config.limit_degrees)
     if config.attach:
         total = total + config.attach * attach_loss(transforms, model.pivots, model.parents)
-    planes, skeleton = _plane_weights(config), (model.pivots, model.parents, model.mirror)
-    for weight, loss in zip(planes, sagittal_losses(pose, transforms, *skeleton), strict=True):
+    planes = sagittal_losses(pose, transforms, model.pivots, model.parents, model.mirror)
+    for weight, loss in zip((config.limb_plane, config.body_plane, config.sideways), planes, strict=True):
         total = total + weight * loss
     if config.temporal and triples:
         total = total + config.temporal * temporal_loss(pose)
@@ -83,19 +65,7 @@ def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geomet
 
 
 def _weights(config: Geometry, triples: bool) -> Weights:
+    planes = (config.limb_plane, config.body_plane, config.sideways)
     cosine = math.cos(math.radians(config.limit_degrees) / 2)
-    temporal, still = (config.temporal, config.still) if triples else (0.0, 0.0)
-    return Weights(
-        config.limit,
-        *_plane_weights(config),
-        cosine,
-        config.attach,
-        temporal,
-        still,
-        config.still_step,
-        OBJECT_DIAGONAL,
-    )
-
-
-def _plane_weights(config: Geometry) -> tuple[float, float, float]:
-    return config.limb_plane, config.body_plane, config.sideways
+    steps = (config.temporal, config.still) if triples else (0.0, 0.0)
+    return Weights(config.limit, *planes, cosine, config.attach, *steps, config.still_step, OBJECT_DIAGONAL)
