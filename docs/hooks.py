@@ -20,7 +20,7 @@ CELL = re.compile(r"^# %%(.*)$", re.MULTILINE)
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Copy the package and the folders that install below it, so that `rewild4d.metrics` is found without installing."""
+    """Copy the package and the folders that install below it, so that mkdocstrings finds `rewild4d.metrics`."""
     shutil.rmtree(COLLECTED, ignore_errors=True)
     sources = shutil.ignore_patterns("__pycache__")
     shutil.copytree(ROOT / "rewild4d", COLLECTED, ignore=sources)

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # A first fit
 #
-# Fit two methods to a small case, look at a held-out view, score both. The case is the template itself, walking, so that
-# all of this runs in seconds; `rw.load_case("artemis", "horse/walk")` loads a built-in animal instead, and
+# Fit two methods to a small case, look at a held-out view, score both. The case is the template itself, walking, so
+# that all of this runs in seconds; `rw.load_case("artemis", "horse/walk")` loads a built-in animal instead, and
 # `rw.case_from_frames(frames, masks, fps)` your own video.
 
 # %%
@@ -31,16 +31,22 @@ fitted = {
 # %% [markdown]
 # A reconstruction is a function from time to Gaussians. Here it is seen from a camera that no method was shown.
 
+
 # %%
+def side_by_side(images: dict[str, np.ndarray]) -> Figure:
+    """Draw images [h, w, 3] in a row, each with its name."""
+    figure = Figure(figsize=(9, 2.4), layout="constrained")
+    for axes, (name, image) in zip(figure.subplots(1, len(images)), images.items(), strict=True):
+        axes.imshow(np.clip(image, 0, 1))
+        axes.set_title(name)
+        axes.axis("off")
+    return figure
+
+
 frame = case.truth.held_out[2]
 images = {"truth": frame.over(1.0).permute(1, 2, 0).numpy()}
 images |= {name: rw.render(each, frame.time, frame.camera) for name, each in fitted.items()}
-figure = Figure(figsize=(9, 2.4), layout="constrained")
-for axes, (name, image) in zip(figure.subplots(1, len(images)), images.items(), strict=True):
-    axes.imshow(np.clip(image, 0, 1))
-    axes.set_title(name)
-    axes.axis("off")
-figure
+side_by_side(images)
 
 # %% [markdown]
 # The protocol says what is measured. A score that cannot be computed here has no value, and its `note` says why.

@@ -28,7 +28,8 @@ psnr.groupby(["method", "case"]).value.std().unstack().round(2)
 rw.plot(psnr, "psnr")
 
 # %% [markdown]
-# Which metric tells what: LPIPS ranks methods differently from PSNR, and by the shape no method is better than the prior.
+# Other metrics rank differently: by LPIPS, GART is as good as `ours`, and by the shape no method is better than the
+# prior alone.
 
 # %%
 chosen = frame[frame.latest & frame.metric.isin(["psnr", "lpips_alex", "chamfer_relative"])]
