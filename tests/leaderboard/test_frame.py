@@ -173,7 +173,7 @@ def test_a_notebook_reads_and_plots_them(tmp_path: Path) -> None:
     several = [record(run_id=f"{i:02d}", case=made.case, seed=made.seed, scores=made.scores)
                for i, made in enumerate(runs({"a": [20.0, 22.0], "b": [30.0]}))]  # fmt: skip
     frame = rw.records(keep(tmp_path, *several))
-    assert frame["value"].tolist() == [20.0, 22.0, 30.0]
+    assert frame["value"].tolist() == rw.items(tmp_path)["value"].tolist() == [20.0, 22.0, 30.0]
     (axes,) = rw.plot(frame, "psnr").axes
     assert [bar.get_height() for bar in axes.patches] == [21.0, 30.0] and axes.get_ylabel() == "psnr, dB"
 
