@@ -1,17 +1,13 @@
-"""Figures of tables: the mean of a score over cases and seeds, the difference to another row, or why there is none."""
+"""Cells of tables: the mean of a score over cases and seeds, the difference to another row, or why there is none."""
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from itertools import islice
 
 from rewild4d.leaderboard.layout import Cell
 from rewild4d.leaderboard.records import RunRecord
-from rewild4d.leaderboard.statistics import estimate, paired
+from rewild4d.leaderboard.statistics import Cases, Estimate, estimate, paired
 from rewild4d.leaderboard.titles import digits_of
 from rewild4d.metrics.score import Score
-
-Values = dict[str, dict[int, float]]
-"""Case -> seed -> value."""
 
 
 def cell(records: Sequence[RunRecord], cases: Sequence[str], name: str, absent: str = "") -> Cell:
@@ -35,10 +31,14 @@ def cell(records: Sequence[RunRecord], cases: Sequence[str], name: str, absent: 
     values = values_of(good, name)
     if empty := next((record for record in good if record.case not in values), None):
         return Cell("n/a", note=f"not computed: {_reason(empty, name)}")
-    found, digits = estimate(values), digits_of(name, _unit(good, name))
+    return figure(estimate(values), digits_of(name, _unit(good, name)), _left_out(wanted, name))
+
+
+def figure(found: Estimate, digits: int, note: str, interval: tuple[float, float] | None = None) -> Cell:
+    """Print a mean with so many digits after the point, its spread, and the interval in brackets if there is one."""
+    ends = " [" + ", ".join(f"{end:.{digits}f}" for end in interval) + "]" if interval else ""
     spread = "" if found.spread is None else f"{found.spread:.{digits}f}"
-    note = _left_out(wanted, name)
-    return Cell(f"{found.mean:.{digits}f}", spread, note=note, value=found.mean, deviation=found.spread)
+    return Cell(f"{found.mean:.{digits}f}{ends}", spread, "", note, found.mean, found.spread, interval)
 
 
 def difference(records: Sequence[RunRecord], reference: Sequence[RunRecord], name: str, absent: str = "") -> Cell:
@@ -65,9 +65,9 @@ def difference(records: Sequence[RunRecord], reference: Sequence[RunRecord], nam
 
 def values_of(
     records: Sequence[RunRecord], name: str, quantity: Callable[[Score], float | None] = lambda score: score.value
-) -> Values:
+) -> Cases:
     """Gather by case and seed, from good records, a score's value (or another quantity of it) where there is one."""
-    values: Values = defaultdict(dict)
+    values: dict[str, dict[int, float]] = defaultdict(dict)
     for record in records:
         score = record.scores.get(name) if record.status == "ok" else None
         found = None if score is None else quantity(score)
@@ -77,12 +77,12 @@ def values_of(
 
 
 def _unit(records: Sequence[RunRecord], name: str) -> str:
-    """The unit of a score; "1" where none of the records has it."""
+    """Return the unit of a score; "1" where none of the records has it."""
     return next((record.scores[name].unit for record in records if name in record.scores), "1")
 
 
 def _reason(record: RunRecord, name: str) -> str:
-    """Why a good record has no value."""
+    """Say why a good record has no value."""
     score = record.scores.get(name)
     if score is None:
         return f"{record.protocol['name']} does not measure it"
@@ -90,25 +90,23 @@ def _reason(record: RunRecord, name: str) -> str:
 
 
 def _left_out(records: Sequence[RunRecord], name: str) -> str:
-    """What the mean is without: runs of cases that have a value all the same, and items; "" where it is whole."""
+    """Say which runs and which items are left out of the mean; "" where none are."""
     failed = [record for record in records if record.status != "ok"]
     values = values_of(records, name)
     empty = [r for r in records if r.status == "ok" and r.seed not in values.get(r.case, {})]
     notes = [f"{len(failed)} of {len(records)} runs failed: {failed[0].error}"] if failed else []
     if empty:
         notes.append(f"{len(empty)} of {len(records)} runs without a value, left out: {_reason(empty[0], name)}")
-    partial = (f"{r.case}: {note}" for r in records if (note := _items_left_out(r.scores.get(name))))
-    return "; ".join([*notes, *islice(partial, 1)])
-
-
-def _items_left_out(score: Score | None) -> str:
-    """The first clause of the note of a mean that some items are not in."""
-    partial = score is not None and score.value is not None and None in score.per_item
-    return score.note.partition("; ")[0] if score is not None and partial else ""
+    partial = [
+        f"{r.case}: {score.note.partition('; ')[0]}"
+        for r in records
+        if (score := r.scores.get(name)) and score.note and score.value is not None and None in score.per_item
+    ]
+    return "; ".join(notes + partial[:1])
 
 
 def _no_difference(records: Sequence[RunRecord], reference: Sequence[RunRecord], name: str) -> str:
-    """Why no case has a value on both sides: what keeps the first side that lacks one from having it."""
+    """Say why no case has a value on both sides."""
     cases = [record.case for record in records]
     common = list(dict.fromkeys(record.case for record in reference if record.case in cases))
     if not common:

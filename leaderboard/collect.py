@@ -4,7 +4,7 @@ import json
 import re
 import shutil
 import subprocess
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +18,7 @@ from rewild4d.files import replaced_folder
 from rewild4d.leaderboard.curves import MOMENT, moments
 from rewild4d.leaderboard.privacy import without_paths
 from rewild4d.leaderboard.records import FILE, RunRecord
-from rewild4d.leaderboard.variants import by_protocol, latest, variants
+from rewild4d.leaderboard.variants import by_protocol, grouped, latest, variants
 from rewild4d.metrics.score import Score
 
 MARKER = "collection.json"
@@ -89,7 +89,7 @@ def collect(found: Sequence[Found], out: Path, *, title: str, pictures: str = "o
 
 
 def title_of(folder: Path) -> str:
-    """The title of a collected folder; the name of any other.
+    """Read the title of a collected folder; of any other, return its name.
 
     Raises:
         UserError: the file that should hold the title does not.
@@ -142,12 +142,9 @@ def _place(record: RunRecord) -> Path:
 
 
 def _first_seeds(records: Sequence[RunRecord]) -> set[str]:
-    """Run ids of the lowest good seed of every case of every variant."""
-    best: dict[tuple[int, str], RunRecord] = {}
-    for index, variant in enumerate(variants(records)):
-        for record in sorted(variant.records, key=lambda r: (r.status != "ok", r.seed)):
-            best.setdefault((index, record.case), record)
-    return {record.run_id for record in best.values()}
+    """List the run ids of the lowest good seed of every case of every variant."""
+    cases = [runs for variant in variants(records) for runs in grouped(variant.records, lambda r: r.case).values()]
+    return {min(runs, key=lambda run: (run.status != "ok", run.seed)).run_id for runs in cases}
 
 
 def _may_show(record: RunRecord, pictures: str, made: Collection) -> bool:
@@ -161,7 +158,7 @@ def _may_show(record: RunRecord, pictures: str, made: Collection) -> bool:
 
 
 def _picture(source: Path, place: Path) -> str:
-    """The comparison as a small WebP."""
+    """Save the comparison as a small WebP."""
     target = place / "comparison.webp"
     if (source / target.name).is_file():
         shutil.copyfile(source / target.name, target)
@@ -178,7 +175,7 @@ def _picture(source: Path, place: Path) -> str:
 
 
 def _video(source: Path, place: Path) -> str:
-    """The orbit as a small H.264 film; one that is small already is copied."""
+    """Save the orbit as a small H.264 film; one that is small already is copied."""
     film, target = source / "orbit.mp4", place / "orbit.mp4"
     if not film.is_file():
         return ""
@@ -196,7 +193,7 @@ def _video(source: Path, place: Path) -> str:
 
 
 def compact(record: RunRecord) -> str:
-    """The record as JSON, a line a field and a line a score: small, and changes can be read."""
+    """Write the record as JSON, a line a field and a line a score: small, and differences can be read."""
     parts = msgspec.to_builtins(record)
     lines = [f"{json.dumps(name)}: {_line(value)}" for name, value in sorted(parts.items()) if name != "scores"]
     scores = ",\n".join(f"  {json.dumps(name)}: {_line(value)}" for name, value in sorted(parts["scores"].items()))
@@ -209,7 +206,7 @@ def _line(value: object) -> str:
 
 
 def rounded(record: RunRecord) -> RunRecord:
-    """The values of single items with `DIGITS` significant digits; means stay as they are."""
+    """Round the values of single items to `DIGITS` significant digits; means stay as they are."""
 
     def short(score: Score) -> Score:
         items = [None if value is None else float(f"{value:.{DIGITS}g}") for value in score.per_item]
@@ -219,14 +216,10 @@ def rounded(record: RunRecord) -> RunRecord:
 
 
 def per_moment(record: RunRecord) -> RunRecord:
-    """The values of single images averaged over the views of each moment; the curve over time stays the same."""
-    views: dict[float, int] = defaultdict(int)
-    for label in record.items:
-        found = MOMENT.search(label)
-        if not found:
-            return record
-        views[float(found[1])] += 1
-    if len(views) == len(record.items):
+    """Average the values of single images over the views of each moment; the curve over time stays the same."""
+    times = [float(found[1]) for found in map(MOMENT.search, record.items) if found]
+    views = Counter(times)
+    if len(times) < len(record.items) or len(views) == len(times):
         return record
 
     def mean(score: Score) -> Score:

@@ -120,7 +120,7 @@ class _Style:
     text: Callable[[str], str]
 
     def rows(self, table: Table) -> Iterator[tuple[Row, list[str], list[str]]]:
-        """Each row with its stubs and its cells as they are printed."""
+        """Yield each row with its stubs and its cells as they are printed."""
         for row in table.rows:
             stubs = [self.text(stub) for stub in row.stubs]
             stubs[0] = self.summary % stubs[0] if row.summary else stubs[0]
@@ -128,7 +128,7 @@ class _Style:
             yield row, stubs, [self._cell(cell, table) for cell in row.cells]
 
     def notes(self, table: Table) -> list[str]:
-        """The numbered notes, then the remarks."""
+        """List the numbered notes, then the remarks."""
         numbered = [f"{self.number % number} {self.text(note)}" for number, note in enumerate(table.notes, 1)]
         return [*numbered, *map(self.text, table.remarks)]
 
@@ -141,7 +141,7 @@ class _Style:
 
 
 def _latex_groups(table: Table) -> list[str]:
-    """The line of group titles, with a rule under each."""
+    """Write the line of group titles, with a rule under each."""
     if not any(title for title, _ in table.groups):
         return []
     cells, rules, start = [" & " * (len(table.stubs) - 1)], [], len(table.stubs) + 1

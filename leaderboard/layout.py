@@ -93,15 +93,15 @@ class Table:
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Each note of a row or a cell once, in the order in which they are met."""
+        """List each note of a row or a cell once, in the order in which they are met."""
         found = [note for row in self.rows for note in (*row.notes, *(cell.note for cell in row.cells)) if note]
         return tuple(dict.fromkeys(found))
 
     @cached_property
     def groups(self) -> list[tuple[str, int]]:
-        """Title of each group of columns that stand together, and how many they are."""
+        """List the title of each group of neighbouring columns, and how many they are."""
         return [(title, len(list(columns))) for title, columns in groupby(column.group for column in self.columns)]
 
     def number(self, *notes: str) -> str:
-        """Numbers of notes among `notes`, from 1: "1,3", or ""."""
+        """Return the numbers of notes among `notes`, from 1: "1,3", or ""."""
         return ",".join(str(self.notes.index(note) + 1) for note in dict.fromkeys(notes) if note)

@@ -1,13 +1,14 @@
-"""Scores of sets pooled over cases: one distance over the features of all of them, from the files beside the records.
+"""Distances pooled over cases: one KID or FVD over the features of all cases, from the files beside the records.
 
-The mean over cases of KID or FVD is another number: each case alone has few samples, and FVD of few is mostly bias.
-Only a method with features of every case is pooled, so that rows of one table lean on the same videos.
+The mean over cases is another number: each case alone has few samples, and FVD of few samples is mostly bias. Only a
+method with features of every case is pooled, so that all rows of a table are computed from the same videos.
 """
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rewild4d.errors import UserError
+from rewild4d.leaderboard.cells import figure
 from rewild4d.leaderboard.layout import Cell, Column, Table
 from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.statistics import estimate
@@ -15,7 +16,7 @@ from rewild4d.leaderboard.tables import Entrant, Frame, cases_of, ranked, rests_
 from rewild4d.leaderboard.titles import TITLES, digits_of
 from rewild4d.leaderboard.variants import by_protocol, latest, variants
 from rewild4d.metrics.names import KINDS
-from rewild4d.metrics.samples import Distance
+from rewild4d.metrics.score import Distance
 from rewild4d.metrics.sets import FILE, Compared, distances, pool, read_features
 
 NAMES = {name: kind for kind, scores in KINDS.items() for name in scores}
@@ -87,7 +88,7 @@ def pooled_table(frame: Frame, entrants: Sequence[Entrant], found: Sequence[Foun
 def _cells(
     records: Sequence[RunRecord], cases: Sequence[str], kind: str, folders: Mapping[str, Path]
 ) -> dict[str, Cell]:
-    """Score -> its cell, for the scores of one kind of sets."""
+    """Make a cell for each score of one kind of sets."""
     try:
         by_seed = _pooled(records, cases, kind, folders)
     except NotPooled as error:
@@ -97,27 +98,20 @@ def _cells(
 
 
 def _cell(name: str, found: Sequence[Distance], cases: int) -> Cell:
-    """Mean and spread of one score's pooled distances, one a seed; of a single one its interval in brackets."""
+    """Average one score's pooled distances, one a seed; a single one has its interval in brackets."""
     if missing := [each.note for each in found if each.value is None]:
         return Cell("n/a", note=missing[0] or "not computed")
     first, digits = found[0], digits_of(name, "1")
-    mean = estimate({"pooled": {seed: each.value or 0.0 for seed, each in enumerate(found)}})
-    interval = first.interval if len(found) == 1 else None
-    shown = "" if interval is None else " [" + ", ".join(f"{end:.{digits}f}" for end in interval) + "]"
-    spread = "" if mean.spread is None else f"{mean.spread:.{digits}f}"
     counts = f"{TITLES[name]}: {cases} cases pooled, n = {first.n}, m = {first.m}"
     note = counts + (f", T = {first.frames}" if first.frames else "") + (f"; {first.note}" if first.note else "")
-    return Cell(f"{mean.mean:.{digits}f}{shown}", spread, "", note, mean.mean, mean.spread, interval)
+    mean = estimate({"pooled": {seed: each.value or 0.0 for seed, each in enumerate(found)}})
+    return figure(mean, digits, note, first.interval if len(found) == 1 else None)
 
 
 def _pooled(
     records: Sequence[RunRecord], cases: Sequence[str], kind: str, folders: Mapping[str, Path]
 ) -> list[list[Distance]]:
-    """Of each seed, the distances of one kind over all cases.
-
-    Raises:
-        NotPooled: a case has no result or no features, or the cases' features do not belong together.
-    """
+    """Compute for each seed the distances of one kind over all cases; `NotPooled` says why there are none."""
     found = []
     for seed in sorted({record.seed for record in records}):
         by_case = {record.case: record for record in records if record.seed == seed}
@@ -132,11 +126,7 @@ def _pooled(
 
 
 def _sets(record: RunRecord, kind: str, folder: Path) -> Compared:
-    """The features of one run.
-
-    Raises:
-        NotPooled: there are none; the text says why.
-    """
+    """Read the features of one run; `NotPooled` says why there are none."""
     if record.status != "ok":
         raise NotPooled(f"{record.case}, {record.method}: failed: {record.error}")
     try:

@@ -18,12 +18,12 @@ _HOMES = re.compile(r"(?:[A-Za-z]:|[\\/]{2}[^\\/]+|/*)[\\/](?:home|Users)[\\/][^
 
 
 def without_paths(record: RunRecord) -> RunRecord:
-    """The record with every absolute path cut to its last part; home folders, which are user names, to "~"."""
+    """Cut every absolute path in a record to its last part; home folders, which are user names, to "~"."""
     return msgspec.convert(_cleaned(msgspec.to_builtins(record)), RunRecord)
 
 
 def last_part(path: str) -> str:
-    """The name of a file or folder without where it lies."""
+    """Return the name of a file or folder without where it lies."""
     bare = path.removeprefix("file:").rstrip("\\/.")
     return "~" if _HOMES.fullmatch(bare) else re.split(r"[\\/]", bare)[-1] + path[len(path.rstrip(".")) :]
 
@@ -41,7 +41,7 @@ def _cleaned(tree: Any) -> Any:
 
 
 def _shortened(found: re.Match[str]) -> str:
-    """What a path inside of a text is cut to."""
+    """Cut a path inside of a text."""
     if found["url"]:
         return found[0]
     flag = found["flag"] or ""

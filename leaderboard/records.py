@@ -9,8 +9,7 @@ import msgspec
 
 from rewild4d.errors import UserError
 from rewild4d.files import digest, write_text
-from rewild4d.metrics.samples import Distance
-from rewild4d.metrics.score import Score
+from rewild4d.metrics.score import Distance, Score
 
 SCHEMA = 1
 FILE = "record.json"
@@ -107,7 +106,7 @@ class _Data(msgspec.Struct):
 
 
 def make_run_id(**parts: Any) -> str:
-    """Sixteen hex digits of the SHA-256 over the JSON of all parts, in a fixed order."""
+    """Return sixteen hex digits of the SHA-256 over the JSON of all parts, in a fixed order."""
     return digest(msgspec.json.encode(parts, order="deterministic"))[:16]
 
 
@@ -119,7 +118,7 @@ def write_record(record: RunRecord, folder: Path) -> Path:
 
 
 def to_json(record: RunRecord) -> str:
-    """The record as indented JSON.
+    """Write the record as indented JSON.
 
     Raises:
         ValueError: a number that is not finite; the text says where.
@@ -154,7 +153,7 @@ def read_record(path: Path) -> RunRecord:
 
 
 def _not_finite(tree: Any, place: str = "") -> Iterator[str]:
-    """Numbers that JSON has no word for, with where they are: "nan at scores.psnr.value"."""
+    """Find numbers that JSON cannot hold, with their place: "nan at scores.psnr.value"."""
     if isinstance(tree, dict):
         for name, value in tree.items():
             yield from _not_finite(value, f"{place}.{name}" if place else str(name))
@@ -166,7 +165,7 @@ def _not_finite(tree: Any, place: str = "") -> Iterator[str]:
 
 
 def find_records(folder: Path) -> list[tuple[Path, RunRecord]]:
-    """All records below a folder, sorted by path, each with the folder that holds it.
+    """Read all records below a folder, sorted by path, each with the folder that holds it.
 
     Raises:
         UserError: no such folder, or a record that cannot be read.

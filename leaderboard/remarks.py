@@ -1,4 +1,4 @@
-"""Sentences that only the records can say of a table: over which cases its means are, what is known of the spread."""
+"""Sentences below a table: over which cases its means are, and what is known of the spread over seeds."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ FEW = 12
 
 
 def cases_said(words: str, titles: Sequence[str], cases: Sequence[Sequence[str]]) -> str:
-    """How many cases the figures are over, and which; "" where there is no record.
+    """Say how many cases the figures are over, and which; "" where there is no record.
 
     Args:
         words: that the sentence starts with.
@@ -31,7 +31,7 @@ def cases_said(words: str, titles: Sequence[str], cases: Sequence[Sequence[str]]
 
 
 def seeds_said(groups: Sequence[Sequence[RunRecord]]) -> str:
-    """What is known of the spread over seeds; "" where there is no result.
+    """Say what is known of the spread over seeds; "" where there is no result.
 
     Args:
         groups: the records behind each mean that competes as a method.
@@ -51,6 +51,6 @@ def seeds_said(groups: Sequence[Sequence[RunRecord]]) -> str:
 
 
 def _has_spread(good: Sequence[RunRecord]) -> bool:
-    """Whether two seeds have a result on every case, as `statistics.estimate` wants for a spread."""
+    """Tell whether two seeds have a result on every case, as `statistics.estimate` needs for a spread."""
     by_case = grouped(good, lambda run: run.case).values()
     return len(set.intersection(*({run.seed for run in runs} for runs in by_case))) > 1

@@ -65,15 +65,14 @@ def build_site(parts: Sequence[Part], out: Path) -> Path:
         UserError: the folder holds something else, or cannot be written.
     """
     with replaced_folder(out, MARKER, "an earlier leaderboard") as building:
-        _write(parts, building)
+        _write([replace(part, found=_unique(part.found)) for part in parts], building)
     return out / "index.html"
 
 
 def _write(parts: Sequence[Part], folder: Path) -> None:
     (folder / MARKER).touch()
-    pages = jinja2.Environment(
-        loader=jinja2.FunctionLoader(_template), autoescape=True, undefined=jinja2.StrictUndefined
-    )
+    loader = jinja2.FunctionLoader(_template)
+    pages = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     assets = {"style": Markup(_template("style.css")), "script": Markup(_template("script.js"))}
     found = _unique([pair for part in parts for pair in part.found])
     for source, record in found:
@@ -94,8 +93,8 @@ def _write(parts: Sequence[Part], folder: Path) -> None:
 
 
 def _part(part: Part, key: str) -> dict[str, Any]:
-    """What the first page shows of a folder of runs; ``key`` tells its tables from those of other parts."""
-    records = [record for _, record in _unique(part.found)]
+    """Fill in a folder of runs on the first page; ``key`` tells its tables from those of other parts."""
+    records = [record for _, record in part.found]
     tables = [[_shown(table, key) for table in group] for group in part.tables]
     return {"title": part.title, "counts": _counts(part.found), "tables": tables, "sections": _sections(records, key)}
 
@@ -110,25 +109,24 @@ def _template(name: str) -> str:
 
 
 def _unique(found: Sequence[Found]) -> list[Found]:
-    """One of each run, should a folder hold copies."""
+    """Drop copies of a run."""
     return list({record.run_id: (source, record) for source, record in found}.values())
 
 
 def _place(record: RunRecord) -> Path:
-    """Where a run's page lies; a record is a file from anybody, so its id is no path until it looks like one."""
+    """Return where a run's page lies; anybody may have written the record, so its id is checked first."""
     if not re.fullmatch(r"[0-9A-Za-z_-]{1,64}", record.run_id):
         raise UserError(f"expected a run id of letters and digits, got '{record.run_id}'.")
     return Path("runs") / record.run_id
 
 
 def _counts(found: Sequence[Found]) -> str:
-    records = [record for _, record in _unique(found)]
-    cases, methods = len({r.case for r in records}), len({r.method for r in records})
-    return f"{len(records)} runs of {methods} methods on {cases} cases."
+    cases, methods = len({record.case for _, record in found}), len({record.method for _, record in found})
+    return f"{len(found)} runs of {methods} methods on {cases} cases."
 
 
 def _sections(records: Sequence[RunRecord], key: str) -> list[dict[str, Any]]:
-    """What the first page shows of each protocol."""
+    """Fill in each protocol on the first page."""
     sections = []
     for group, table in zip(by_protocol(records), standings(records), strict=True):
         labels = {record.run_id: variant.label for variant in variants(group) for record in variant.records}
@@ -150,7 +148,7 @@ def _run_row(record: RunRecord, label: str) -> dict[str, Any]:
 
 
 def _scores(record: RunRecord) -> Iterator[dict[str, Any]]:
-    """What a run's page shows of each score, with a curve of those that have values at several moments."""
+    """Fill in each score on a run's page, with a curve where it has values at several moments."""
     names = [name for name in record.protocol["scores"] if name in record.scores]
     for column in columns_of([record], names):
         score = record.scores[column.score]
@@ -163,7 +161,7 @@ def _scores(record: RunRecord) -> Iterator[dict[str, Any]]:
 
 
 def _copy_pictures(source: Path, record: RunRecord, page: Path) -> Iterator[dict[str, Any]]:
-    """Pictures that lie beside the record, held-out comparison first."""
+    """Copy the pictures that lie beside the record, the held-out comparison first."""
     order = list(CAPTIONS)
     stems = {Path(name).name: Path(name).stem + " film" * (Path(name).suffix == ".mp4") for name in record.pictures}
     names = sorted(stems, key=lambda name: order.index(stems[name]) if stems[name] in order else len(order))
@@ -174,7 +172,7 @@ def _copy_pictures(source: Path, record: RunRecord, page: Path) -> Iterator[dict
 
 
 def _provenance(record: RunRecord) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Every part of the record that is no score, as tables of names and values."""
+    """List every part of the record that is no score as names and values."""
     parts = {
         "Settings of the method": record.config, "Data": record.data, "Prior": record.prior,
         "Protocol": record.protocol, "What the numbers lean on": record.coverage,

@@ -107,12 +107,12 @@ class Reported(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def load_specs() -> dict[str, Spec]:
-    """All tables that ship with the package, by name."""
+    """Read all tables that ship with the package, by name."""
     return {name: _decode(f"tables/{name}.toml", data, Spec) for name, data in _files("tables", ".toml").items()}
 
 
 def find_spec(name: str) -> Spec:
-    """The table of that name.
+    """Find the table of that name.
 
     Raises:
         UserError: there is none.
@@ -124,7 +124,7 @@ def find_spec(name: str) -> Spec:
 
 
 def load_reported(name: str) -> Reported:
-    """The paper's table of that name.
+    """Find the paper's table of that name.
 
     Raises:
         UserError: there is none.

@@ -1,4 +1,4 @@
-"""What several seeds and several cases say together: means, spreads, ranks, paired differences."""
+"""Means and spreads over seeds and cases, ranks, paired differences."""
 
 import statistics
 from collections.abc import Mapping, Sequence
@@ -6,12 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-Seeds = Mapping[int, float]
-"""Seed -> value."""
-Cases = Mapping[str, Seeds]
+Cases = Mapping[str, Mapping[int, float]]
 """Case -> seed -> value."""
 DRAWS = 10_000
-"""Of the bootstrap; with ten thousand the ends of a 95 % interval stand still to two digits."""
+"""Draws of the bootstrap; ten thousand settle two digits of the ends of a 95 % interval."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +43,7 @@ class Difference:
 
 
 def estimate(values: Cases) -> Estimate:
-    """Mean and spread; every case counts once, however many seeds it has.
+    """Compute mean and spread; every case counts once, however many seeds it has.
 
     Args:
         values: at least one case, each with at least one seed.
@@ -57,7 +55,7 @@ def estimate(values: Cases) -> Estimate:
 
 
 def paired(values: Cases, reference: Cases) -> Difference:
-    """Difference to a reference, case by case, with a bootstrap interval.
+    """Compute the difference to a reference, case by case, with a bootstrap interval.
 
     Cases are drawn with replacement, then the seeds of either side within each drawn one (a case that is drawn twice
     gets new seeds the second time), so that the interval holds both what another set of animals and what another set
@@ -87,12 +85,7 @@ def paired(values: Cases, reference: Cases) -> Difference:
 
 
 def _redrawn(side: Sequence[np.ndarray], rows: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Of each drawn case the mean of as many seeds as it has, drawn with replacement anew for every draw.
-
-    Args:
-        side: the seeds' values of each case, [seeds] each.
-        rows: indices of the drawn cases, [draws].
-    """
+    """Draw again the seeds of each drawn case (rows [draws] into side, [seeds] a case), and average them, [draws]."""
     means = np.empty(len(rows))
     for row, seeds in enumerate(side):
         places = np.flatnonzero(rows == row)
@@ -102,7 +95,7 @@ def _redrawn(side: Sequence[np.ndarray], rows: np.ndarray, generator: np.random.
 
 
 def ranks(estimates: Sequence[Estimate | None], better: str, digits: int) -> list[str]:
-    """Which entries are "best" and which "second"; the others, and those without a value, get "".
+    """Mark entries as "best", "second" or "" (all others, and those without a value).
 
     An entry that the spread over seeds does not tell apart from the one before it is not ranked behind it: where the
     lead of the best is within the larger of the two spreads nobody is best, and all those within it are second.
@@ -127,6 +120,6 @@ def ranks(estimates: Sequence[Estimate | None], better: str, digits: int) -> lis
 
 
 def _leaders(ordered: Sequence[tuple[float, int, float]]) -> list[int]:
-    """Indices of the first of (value, index, spread) and of all that the spread does not tell apart from it."""
+    """List the indices of the first (value, index, spread) and of all within the spread of it."""
     best, _, spread = ordered[0]
     return [index for value, index, other in ordered if value - best <= max(spread, other)]

@@ -151,15 +151,10 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
             cells = [difference(*pair, name, entrant.absent) for pair in pairs for name in frame.scores]
             row = row_of(entrant, cells)
             rows.append(row if row.flags else _leading(row, columns))
-    return Table(
-        f"{frame.name}-difference",
-        f"{frame.title}: difference to {reference.label}",
-        _difference_caption(reference.label, entrants),
-        ("method",),
-        columns,
-        tuple(_apart(rows)),
-        (*_over(frame, entrants, "Mean over"), *frame.remarks),
-    )
+    title = f"{frame.title}: difference to {reference.label}"
+    caption = _difference_caption(reference.label, entrants)
+    remarks = tuple(filter(None, [_over(frame, entrants), *frame.remarks]))
+    return Table(f"{frame.name}-difference", title, caption, ("method",), columns, tuple(_apart(rows)), remarks)
 
 
 def runs_of(entrants: Sequence[Entrant]) -> list[RunRecord]:
@@ -176,13 +171,11 @@ def row_of(entrant: Entrant, cells: Sequence[Cell]) -> Row:
 def rests_on(frame: Frame, entrants: Sequence[Entrant], words: str = "Mean over") -> list[str]:
     """Say over which cases and how many seeds the rows' figures are; nothing where nothing was run."""
     seeds = seeds_said([under for entrant in entrants if kind_of(entrant) != "floor" for under in entrant.records])
-    return _over(frame, entrants, words) + ([seeds] if seeds else [])
+    return list(filter(None, [_over(frame, entrants, words), seeds]))
 
 
-def _over(frame: Frame, entrants: Sequence[Entrant], words: str) -> list[str]:
-    cases = [cases_of(entrants, index) for index in range(len(frame.conditions))]
-    said = cases_said(words, frame.conditions, cases)
-    return [said] if said else []
+def _over(frame: Frame, entrants: Sequence[Entrant], words: str = "Mean over") -> str:
+    return cases_said(words, frame.conditions, [cases_of(entrants, i) for i in range(len(frame.conditions))])
 
 
 def cases_of(entrants: Sequence[Entrant], condition: int) -> list[str]:
@@ -201,7 +194,7 @@ def _difference_caption(reference: str, entrants: Sequence[Entrant]) -> str:
 
 
 def _leading(row: Row, columns: Sequence[Column]) -> Row:
-    """The row, with its differences marked whose whole interval is on the better side of 0."""
+    """Mark the differences of a row whose whole interval is on the better side of 0."""
     cells = []
     for found, column in zip(row.cells, columns, strict=True):
         low, high = found.interval or (0.0, 0.0)
@@ -232,10 +225,10 @@ def _frame(records: Sequence[RunRecord], remarks: Sequence[str]) -> Frame:
 
 
 def _floors(records: Sequence[RunRecord], scores: Sequence[str]) -> list[str]:
-    """One sentence on what a perfect shape would get; none where no score has a floor.
+    """Say what a perfect shape would get; nothing where no score has a floor.
 
-    A floor is of as many points as its row has, so that rows have floors of their own: the sentence gives the lowest
-    and the highest of the rows' means, and whose they are.
+    The floor depends on the number of points, so that rows have floors of their own: the sentence tells the lowest and
+    the highest of the rows' means, and whose they are.
     """
     shapes = {variant.label: [run for run in variant.records if _has_shape(run)] for variant in variants(records)}
     parts = []
@@ -251,12 +244,12 @@ def _floors(records: Sequence[RunRecord], scores: Sequence[str]) -> list[str]:
 
 
 def _has_shape(record: RunRecord) -> bool:
-    """Whether points stood behind its scores of the shape; the floor of a row without any says nothing."""
+    """Tell whether its scores of the shape have values; the floor of a row without points says nothing."""
     return all(score.value is not None for score in record.scores.values() if score.floor is not None)
 
 
 def _timed_row(variant: Variant, cases: list[str], scores: Sequence[str]) -> Row | None:
-    """A row of one case or of the mean over several, with seeds and the time of a fit; None where nothing was run."""
+    """Make a row of one case or of the mean over several, with seeds and seconds; None where nothing was run."""
     runs = [record for record in variant.records if record.case in cases]
     if not runs:
         return None
@@ -277,7 +270,7 @@ def kind_of(entrant: Entrant) -> str:
 
 
 def _apart(rows: list[Row]) -> list[Row]:
-    """Methods, then those that are not ranked, then floors."""
+    """Sort: methods, then those that are not ranked, then floors."""
     order = {"method": 0, "unranked": 1, "floor": 2}
     return sorted(rows, key=lambda row: order[row.kind])
 

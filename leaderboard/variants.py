@@ -99,7 +99,7 @@ def row_kind(records: Sequence[RunRecord]) -> str:
 
 
 def coverage_text(records: Sequence[RunRecord]) -> str:
-    """Say what the numbers lean on, averaged over the cases."""
+    """Say how much of an image is animal and how much of it was shown, averaged over the cases."""
     by_case = {record.case: record.coverage for record in records if record.coverage}
     parts = []
     for key, text in (("foreground", "of a held-out image is animal"), ("seen_surface", "of its surface ever shown")):
@@ -114,25 +114,25 @@ def _age(record: RunRecord) -> tuple[str, str]:
 
 
 def _comparable(run: RunRecord, other: RunRecord) -> bool:
-    """Whether two runs of a case are of one protocol and of one data set."""
+    """Tell whether two runs of a case are of one protocol and of one data set."""
     recipe = _recipe(run)
     same = _digests(run) == _digests(other) or (recipe is not None and recipe == _recipe(other))
     return same and run.protocol.get("digest") == other.protocol.get("digest")
 
 
 def _recipe(record: RunRecord) -> str | None:
-    """What the data was rendered from, if it was."""
+    """Name what the data was rendered from, if it was."""
     built_in = _BUILT_IN.fullmatch(PurePath(record.data.get("root", "")).name)
     return built_in[1] if built_in else record.data.get("recipe") or None
 
 
 def _digests(record: RunRecord) -> tuple[Any, Any]:
-    """Of every pixel, camera and time that the method saw, and of the truth."""
+    """Return the digests of every pixel, camera and time that the method saw, and of the truth."""
     return record.data.get("clip"), record.data.get("truth")
 
 
 def _settings(record: RunRecord) -> dict[str, Any]:
-    """Everything that tells variants of a method apart, flat: "deform.enabled" -> False."""
+    """Flatten all that tells variants of a method apart: {"deform.enabled": False, ...}."""
     fit = json.dumps(record.prior.get("config"), sort_keys=True).encode()
     seen = record.prior.get("keypoints", "none")
     return flat(record.config) | {
@@ -155,8 +155,7 @@ def _identity(record: RunRecord) -> str:
 
 
 def _label(record: RunRecord, others: Sequence[RunRecord]) -> str:
-    """The method; its preset where there are several; the settings in which it differs from most of its variants, and
-    a prior that was not fitted to the clip."""
+    """Name the method, its preset where there are several, and the settings and prior that tell it from the others."""
     kin = [other for other in others if other.method == record.method]
     peers = [_settings(other) for other in kin if other.preset == record.preset]
     preset = f" ({record.preset})" if len({other.preset for other in kin}) > 1 else ""

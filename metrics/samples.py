@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.metrics.networks.layers import check_range
+from rewild4d.metrics.score import Distance
 
 ORIGINAL = ("inception-fid", "i3d-k400")
 """Networks under which a metric has its plain name; under any other the network's name stands behind it."""
@@ -73,41 +74,6 @@ class Features:
     digest: str
     resize: str
     frames: int | None = None
-
-
-@dataclass(frozen=True)
-class Distance:
-    """A distance between two sets, with all that decides its value.
-
-    Attributes:
-        name: of the metric; lower is better.
-        value: None where it could not be computed; ``note`` then says why.
-        n: predicted images or clips.
-        m: true ones.
-        sequences: how many sequences they come from (of the side with fewer).
-        estimator: in words.
-        interval: 2.5 and 97.5 % of a bootstrap over sequences, or None (too few sequences, or no such estimate).
-        note: why there is no value, or what to beware of.
-        extractor, digest, resize: the network, the SHA-256 of its weights, how images reach its input size.
-        background, crop, fps: see `Conditions`.
-        frames: T of the clips; None for still images.
-    """
-
-    name: str
-    value: float | None
-    n: int
-    m: int
-    sequences: int
-    estimator: str
-    interval: tuple[float, float] | None
-    note: str
-    extractor: str
-    digest: str
-    resize: str
-    background: str
-    crop: str
-    frames: int | None
-    fps: float | None
 
 
 def image_features(

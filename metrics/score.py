@@ -1,4 +1,6 @@
-"""One measured quantity, with its unit, its direction and what it is a mean of."""
+"""What a measurement returns: a score or a distance between two sets, each with all that decides its value."""
+
+from dataclasses import dataclass
 
 import msgspec
 
@@ -23,3 +25,38 @@ class Score(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     per_item: list[float | None] = []
     note: str = ""
     floor: float | None = None
+
+
+@dataclass(frozen=True)
+class Distance:
+    """A distance between two sets, with all that decides its value.
+
+    Attributes:
+        name: of the metric; lower is better.
+        value: None where it could not be computed; ``note`` then says why.
+        n: predicted images or clips.
+        m: true ones.
+        sequences: how many sequences they come from (of the side with fewer).
+        estimator: in words.
+        interval: 2.5 and 97.5 % of a bootstrap over sequences, or None (too few sequences, or no such estimate).
+        note: why there is no value, or what to beware of.
+        extractor, digest, resize: the network, the SHA-256 of its weights, how images reach its input size.
+        background, crop, fps: see `metrics.samples.Conditions`.
+        frames: T of the clips; None for still images.
+    """
+
+    name: str
+    value: float | None
+    n: int
+    m: int
+    sequences: int
+    estimator: str
+    interval: tuple[float, float] | None
+    note: str
+    extractor: str
+    digest: str
+    resize: str
+    background: str
+    crop: str
+    frames: int | None
+    fps: float | None

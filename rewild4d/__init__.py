@@ -14,7 +14,18 @@ if "torch" not in sys.modules:
 
 __version__ = "0.1.0"
 
-API = ("LoadedCase", "case_from_frames", "evaluate", "fit", "load_case", "plot", "records", "render", "with_settings")
+API = (
+    "LoadedCase",
+    "case_from_frames",
+    "evaluate",
+    "fit",
+    "items",
+    "load_case",
+    "plot",
+    "records",
+    "render",
+    "with_settings",
+)
 
 
 def __getattr__(name: str) -> Any:

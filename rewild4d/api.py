@@ -234,14 +234,25 @@ def evaluate(reconstruction: Reconstruction, case: LoadedCase, progress: bool = 
 
 
 def records(folder: str | Path) -> "pd.DataFrame":
-    """Read all run records below a folder as one long frame: a row for each run and metric.
+    """Read all run records below a folder as one long frame: a row for each run and metric; see `records_frame`.
 
     Raises:
-        UserError: no such folder, or a record that cannot be read.
+        UserError: no such folder, no record in it, or one that cannot be read.
     """
     from rewild4d.leaderboard.frame import records_frame
 
     return records_frame(Path(folder))
+
+
+def items(folder: str | Path) -> "pd.DataFrame":
+    """Read the values of single images below a folder: a row for each run, metric and image; see `items_frame`.
+
+    Raises:
+        UserError: no such folder, no record in it, or one that cannot be read.
+    """
+    from rewild4d.leaderboard.frame import items_frame
+
+    return items_frame(Path(folder))
 
 
 def plot(frame: "pd.DataFrame", metric: str = "psnr") -> "Figure":

@@ -15,8 +15,7 @@ from rewild4d.evaluation import geometry_scores, image_scores, novel_views
 from rewild4d.evaluation.networks import Networks, families_of, load_networks
 from rewild4d.evaluation.protocol import Protocol
 from rewild4d.metrics import names
-from rewild4d.metrics.samples import Distance
-from rewild4d.metrics.score import Score
+from rewild4d.metrics.score import Distance, Score
 from rewild4d.metrics.sets import FILE, Compared, write_features
 from rewild4d.types import Clip, Frame, Truth
 

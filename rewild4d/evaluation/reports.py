@@ -7,8 +7,7 @@ from typing import Literal
 
 import msgspec
 
-from rewild4d.metrics.samples import Distance
-from rewild4d.metrics.score import Score
+from rewild4d.metrics.score import Distance, Score
 
 SCHEMA = 1
 METRICS = {

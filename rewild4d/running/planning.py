@@ -120,6 +120,8 @@ def frame(name: str, spec: Spec) -> Frame:
 
 def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[Entrant], list[str]]:
     """The rows of a table with their records, then the floors of its protocols, and sentences on records left out."""
+    points = getattr(load_dataset(spec.dataset), "keypoint_use", "none")
+    records = [record for record in records if record.prior.get("keypoints", "none") == points]
     kept, remarks = latest([r for r in records if any(_is_under(r, condition, spec) for condition in spec.conditions)])
     kept = [_beside_equals(record) for record in kept]
     under = [tuple(r for r in kept if _is_under(r, condition, spec)) for condition in spec.conditions]
@@ -175,8 +177,7 @@ def _is_under(record: RunRecord, condition: Condition, spec: Spec) -> bool:
     known_cameras = record.protocol.get("selection", {}).get("cameras") != "unknown"
     asked = PriorChoice(condition.prior, PRIOR_PRESETS.get(spec.preset, STANDARD)).settings_under(known_cameras)
     same_effort = effort is None or _equals(effort, asked)
-    same_points = record.prior.get("keypoints", "none") == getattr(load_dataset(spec.dataset), "keypoint_use", "none")
-    return (record.dataset, record.protocol["name"], choice) == wanted and fits and same_effort and same_points
+    return (record.dataset, record.protocol["name"], choice) == wanted and fits and same_effort
 
 
 def _missing(spec: Spec, cases: Sequence[Collection[str]]) -> list[str]:
