@@ -45,20 +45,9 @@ def clusters(points: Tensor, reach: float = REACH, neighbours: int = NEIGHBOURS)
         reach: points at most this far apart are neighbours.
         neighbours: a point with at least as many, itself included, starts or spreads a cluster.
     """
-    near = torch.cdist(points, points) <= reach
-    dense = near.sum(1) >= neighbours
-    labels = torch.full((len(points),), -1)
-    count = 0
-    for seed in torch.nonzero(dense)[:, 0].tolist():
-        if labels[seed] >= 0:
-            continue
-        front = torch.zeros(len(points), dtype=torch.bool)
-        front[seed] = True
-        while front.any():
-            labels[front] = count
-            front = near[front & dense].any(0) & (labels < 0)
-        count += 1
-    return labels
+    from sklearn.cluster import DBSCAN  # takes a second to import, which no other command has to wait for
+
+    return torch.from_numpy(DBSCAN(eps=reach, min_samples=neighbours).fit_predict(points.numpy()))
 
 
 def steady(cameras: Sequence[Camera], times: Tensor) -> Tensor:
