@@ -157,16 +157,16 @@ def test_points_without_noise_end_at_the_truth_as_open3d_does() -> None:
     truth = Similarity(1.1, yaw(12), torch.tensor((0.1, 0.05, -0.1), dtype=torch.float64))
     source = inverse(truth).apply(target)[torch.randperm(800, generator=torch.Generator().manual_seed(1))]
     found = align(source, target, up=UP)
-    torch.testing.assert_close(found.transform.matrix, truth.matrix, atol=1e-6, rtol=0)
+    torch.testing.assert_close(found.matrix, truth.matrix, atol=1e-6, rtol=0)
     assert found.converged and not found.clamped and found.chamfer < 1e-6
     clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.numpy())) for points in (source, target)]
     oracle = o3d.pipelines.registration.registration_icp(
         *clouds,
         10.0,
-        found.transform.matrix.numpy(),
+        found.matrix.numpy(),
         o3d.pipelines.registration.TransformationEstimationPointToPoint(with_scaling=True),
     )
-    np.testing.assert_allclose(found.transform.matrix.numpy(), oracle.transformation, atol=1e-6)
+    np.testing.assert_allclose(found.matrix.numpy(), oracle.transformation, atol=1e-6)
 
 
 @pytest.mark.parametrize("degrees", [0, 30, 45, 90, 180, 270])
@@ -224,7 +224,7 @@ def test_the_clamp_is_kept_and_told() -> None:
 
 def test_the_same_call_gives_the_same_bits() -> None:
     one, other = (align(animal(5000, 1), animal(5000, 0), up=UP, seed=3) for _ in range(2))
-    assert torch.equal(one.transform.matrix, other.transform.matrix) and one.iterations == other.iterations
+    assert torch.equal(one.matrix, other.matrix) and one.iterations == other.iterations
 
 
 def walk(count: int, seed: int) -> list[Tensor]:
