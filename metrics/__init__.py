@@ -1,1 +1,1 @@
-"""What is measured: pure functions of tensors."""
+"""Metrics as pure functions of tensors."""

@@ -1,8 +1,8 @@
-"""Weights as others publish them, and the one form that this package keeps: named float32 tensors as safetensors.
+"""Read weights as others publish them, and name their tensors as this package does.
 
-Nothing here runs what a file says. Pickles are read by an unpickler that knows three names of NumPy, PyTorch's files
+Nothing here runs code from a file. Pickles are read by an unpickler that knows three names of NumPy, PyTorch's files
 with `weights_only`. A TorchScript file, which only PyTorch's own reader understands, is opened after its SHA-256 was
-found to be the published one (`rewild4d.metrics.weights` sees to that), and only its tensors are taken.
+checked (by `rewild4d.metrics.weights`), and only its tensors are read.
 """
 
 import io
@@ -21,7 +21,7 @@ Tensors = dict[str, Tensor]
 
 
 class ArraysOnly(pickle.Unpickler):
-    """An unpickler that can build NumPy arrays and plain containers, and refuses every other name."""
+    """Unpickler of NumPy arrays and plain containers that refuses every other name."""
 
     ADMITTED = {
         ("numpy.core.multiarray", "_reconstruct"): np.empty(0).__reduce__()[0],  # old files say so; NumPy 2 moved it
@@ -31,22 +31,14 @@ class ArraysOnly(pickle.Unpickler):
     }
 
     def find_class(self, module: str, name: str) -> Any:
-        """The class or function that a pickle asks for.
-
-        Raises:
-            pickle.UnpicklingError: it is not one of NumPy's that rebuild arrays.
-        """
+        """Return the class or function of a name; UnpicklingError unless NumPy needs it to rebuild arrays."""
         if (module, name) not in self.ADMITTED:
             raise pickle.UnpicklingError(f"it asks for {module}.{name}")
         return self.ADMITTED[module, name]
 
 
 def read_pickle(data: bytes, label: str) -> Tensors:
-    """Arrays of a pickled tree of dictionaries, by their path in it ("a/b/kernel").
-
-    Raises:
-        UserError: the pickle asks for anything but NumPy arrays, or is no pickle of them.
-    """
+    """Read arrays of a pickled tree of dictionaries, by their path in it ("a/b/kernel")."""
     flat: Tensors = {}
 
     def walk(node: Any, path: tuple[str, ...]) -> None:
@@ -68,11 +60,7 @@ def read_pickle(data: bytes, label: str) -> Tensors:
 
 
 def read_torch(data: bytes, label: str) -> Tensors:
-    """Tensors of a state dict that `torch.save` wrote.
-
-    Raises:
-        UserError: it holds more than tensors.
-    """
+    """Read the tensors of a state dict that `torch.save` wrote; UserError where it holds more."""
     try:
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
         return {str(name): value for name, value in state.items() if isinstance(value, Tensor)}
@@ -83,11 +71,7 @@ def read_torch(data: bytes, label: str) -> Tensors:
 
 
 def read_torchscript(data: bytes, label: str) -> Tensors:
-    """Tensors of a TorchScript file; none of its code is called. Only for files whose SHA-256 is known.
-
-    Raises:
-        UserError: it is no TorchScript file.
-    """
+    """Read the tensors of a TorchScript file without calling its code. Only for files whose SHA-256 is known."""
     try:
         module = torch.jit.load(io.BytesIO(data), map_location="cpu")
     except Exception as error:
@@ -96,7 +80,7 @@ def read_torchscript(data: bytes, label: str) -> Tensors:
 
 
 def from_flax_lpips(source: Tensors) -> Tensors:
-    """LPIPS with trunk and heads, kernels [h, w, in, out]."""
+    """Rename LPIPS with trunk and heads, kernels [h, w, in, out]."""
     made: Tensors = {}
     for path, value in source.items():
         block, layer, part = path.split("/")
@@ -111,7 +95,12 @@ def from_flax_lpips(source: Tensors) -> Tensors:
 
 
 def from_torchvision(source: Tensors) -> Tensors:
-    """The convolutions of a torchvision AlexNet or VGG-16, counted through; the classifier is left."""
+    """Rename the convolutions of a torchvision AlexNet or VGG-16 in order, without the classifier.
+
+    Example:
+        >>> list(from_torchvision({"features.0.weight": torch.ones(1), "features.0.bias": torch.ones(1)}))
+        ['trunk.0.weight', 'trunk.0.bias']
+    """
     layers = sorted({int(name.split(".")[1]) for name in source if name.startswith("features.")})
     return {
         f"trunk.{index}.{part}": source[f"features.{layer}.{part}"]
@@ -121,12 +110,17 @@ def from_torchvision(source: Tensors) -> Tensors:
 
 
 def from_lpips_heads(source: Tensors) -> Tensors:
-    """The learned weights of the stages, [1, channels, 1, 1] each."""
+    """Rename the learned weights of the stages, [1, channels, 1, 1] each.
+
+    Example:
+        >>> from_lpips_heads({"lin0.model.1.weight": torch.ones(1, 2, 1, 1)})
+        {'head.0': tensor([1., 1.])}
+    """
     return {f"head.{name[3]}": value.reshape(-1) for name, value in source.items() if re.match(r"lin\d\.", name)}
 
 
 def from_flax_i3d(source: Tensors) -> Tensors:
-    """I3D, kernels [t, h, w, in, out]."""
+    """Rename I3D, kernels [t, h, w, in, out]."""
     made: Tensors = {}
     for path, value in source.items():
         _, *unit, layer, part = path.split("/")
@@ -140,14 +134,14 @@ def from_flax_i3d(source: Tensors) -> Tensors:
 
 
 def _i3d_unit(path: list[str]) -> str:
-    """Ours for TensorFlow's: Mixed_3b/Branch_1/Conv3d_0a_1x1 -> Mixed_3b.1a."""
+    """Rename TensorFlow's unit: Mixed_3b/Branch_1/Conv3d_0a_1x1 -> Mixed_3b.1a."""
     if path[0].startswith("Mixed"):
         return f"{path[0]}.{path[1][-1]}{path[2][len('Conv3d_0')]}"
     return path[0]
 
 
 def from_ordered_i3d(source: Tensors) -> Tensors:
-    """I3D under any names, its units in the order of the forward pass; the one with 400 outputs is the last layer."""
+    """Rename I3D under any names by the order of its units; the one with 400 outputs is the last layer."""
     units: dict[str, Tensors] = {}
     for name, value in source.items():
         if value.ndim in (1, 5):
@@ -171,7 +165,7 @@ def _is_last(unit: Mapping[str, Tensor]) -> bool:
 
 
 def _role(name: str, value: Tensor, last: bool) -> str:
-    """What a tensor is in its unit; a normalisation's scale has to be one everywhere."""
+    """Return a tensor's part in its unit; a normalisation's scale has to be one everywhere."""
     if value.ndim == 5:
         return "weight"
     for word, role in (("mean", "mean"), ("var", "variance"), ("bias", "bias" if last else "beta")):
@@ -218,7 +212,12 @@ BLOCKS = {
 
 
 def tower_names() -> dict[str, str]:
-    """Units of the 2015 Inception: TensorFlow's name -> the usual PyTorch one."""
+    """Map TensorFlow's names of the 2015 Inception's units to the usual PyTorch ones.
+
+    Example:
+        >>> tower_names()["mixed_1.tower.conv"]
+        'Mixed_5c.branch5x5_1'
+    """
     names = {f"conv_{i}" if i else "conv": unit for i, unit in enumerate(STEM)}
     for i, (block, units) in enumerate(BLOCKS.items()):
         names |= {f"mixed{f'_{i}' if i else ''}.{tower}": f"Mixed_{block}.{unit}" for tower, unit in units.items()}
@@ -226,7 +225,7 @@ def tower_names() -> dict[str, str]:
 
 
 def from_inception_towers(source: Tensors) -> Tensors:
-    """The FID Inception under TensorFlow's names; a classifier is left."""
+    """Rename the FID Inception under TensorFlow's names, without a classifier."""
     names, parts = tower_names(), {"weight": "weight", "beta": "beta", "mean": "mean", "var": "variance"}
     made: Tensors = {}
     for name, value in source.items():
@@ -237,7 +236,7 @@ def from_inception_towers(source: Tensors) -> Tensors:
 
 
 def from_inception_branches(source: Tensors) -> Tensors:
-    """The FID Inception under the usual PyTorch names; the classifier is left."""
+    """Rename the FID Inception under the usual PyTorch names, without the classifier."""
     parts = {"conv.weight": "weight", "bn.bias": "beta", "bn.running_mean": "mean", "bn.running_var": "variance"}
     made: Tensors = {}
     for name, value in source.items():
@@ -273,7 +272,7 @@ def convert(data: bytes, form: str, layout: str, label: str) -> Tensors:
         data: the file's bytes, already known to be the published ones.
         form: a key of `READERS`.
         layout: a key of `LAYOUTS`.
-        label: how errors call the file.
+        label: name of the file in errors.
 
     Raises:
         UserError: the file does not hold what its layout says.

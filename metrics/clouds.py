@@ -1,4 +1,4 @@
-"""Point clouds: what is a usable one, seeded draws from it, exact nearest neighbours."""
+"""Check point clouds, draw from them by a seed, and find exact nearest neighbours."""
 
 from collections.abc import Sequence
 
@@ -13,19 +13,24 @@ Points = NDArray[np.float64]
 THREADED = 50_000
 """From this many queries on, two threads are worth their start."""
 LARGEST = 1e100
-"""Coordinate whose square, and whose products with others, are still numbers."""
+"""Largest coordinate; its square, and its products with others, are still finite."""
 
 
 def as_points(cloud: Tensor, name: str, empty: bool = False) -> Points:
-    """The points in double precision on the CPU, [n, 3].
+    """Convert a cloud to double precision on the CPU, [n, 3].
 
     Args:
         cloud: finite coordinates, [n, 3].
-        name: what it is, as it reads in a sentence ("prediction").
-        empty: whether a cloud without points will do.
+        name: of the cloud in an error ("prediction").
+        empty: whether a cloud without points is allowed.
 
     Raises:
         ValueError: another shape, a NaN, an infinite or a huge value, no points.
+
+    Example:
+        >>> as_points(torch.tensor([[1.0, 2.0, float("nan")]]), "truth")
+        Traceback (most recent call last):
+        ValueError: expected finite points in the truth, got 1 of 1 with a NaN or an infinity
     """
     if cloud.ndim != 2 or cloud.shape[1] != 3:
         raise ValueError(f"expected the {name} as points [n, 3], got {tuple(cloud.shape)}")
@@ -40,18 +45,19 @@ def as_points(cloud: Tensor, name: str, empty: bool = False) -> Points:
     return points
 
 
-def paired(predictions: Sequence[Tensor], truths: Sequence[Tensor]) -> None:
-    """Check that two sequences have the same length, and any.
-
-    Raises:
-        ValueError: they have not.
-    """
+def check_paired(predictions: Sequence[Tensor], truths: Sequence[Tensor]) -> None:
+    """Raise ValueError where two sequences have different lengths, or none."""
     if len(predictions) != len(truths) or not truths:
         raise ValueError(f"expected one prediction a truth, got {len(predictions)} and {len(truths)} clouds")
 
 
 def subsample(cloud: Tensor, count: int, seed: int) -> Tensor:
-    """At most ``count`` of the points, drawn without replacement, in their own order, [n, 3] -> [min(n, count), 3]."""
+    """Draw at most ``count`` points without replacement, in their own order, [n, 3] -> [min(n, count), 3].
+
+    Example:
+        >>> subsample(torch.arange(300.0).reshape(100, 3), count=5, seed=0).shape
+        torch.Size([5, 3])
+    """
     if len(cloud) <= count:
         return cloud
     rows = np.random.default_rng(seed).choice(len(cloud), count, replace=False)
@@ -59,14 +65,23 @@ def subsample(cloud: Tensor, count: int, seed: int) -> Tensor:
 
 
 def box_diagonal(points: Points) -> float:
-    """Length of the diagonal of the axis-aligned bounding box, [n, 3] -> a number in the points' unit."""
+    """Compute the diagonal of the axis-aligned bounding box, [n, 3] -> a length in the points' unit.
+
+    Example:
+        >>> box_diagonal(np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 2.0]]))
+        3.0
+    """
     return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
 def is_straight(points: Points) -> bool:
-    """Whether the points lie on one line (or are one point), so that a turn about it would change nothing.
+    """Return whether the points lie on one line (or are one point), so that no rotation about it is determined.
 
-    The second spread is then below 1e-5 of the first: single-precision coordinates are that good.
+    The second spread is then below 1e-5 of the first, the accuracy of single-precision coordinates.
+
+    Example:
+        >>> is_straight(np.array([[0.0, 0, 0], [1, 1, 1], [2, 2, 2]]))
+        True
     """
     if len(points) < 3:
         return True
@@ -83,18 +98,18 @@ class Cloud:
 
     def __init__(self, points: Points) -> None:
         self.points = points
-        self._places = _places(points)
-        self._tree = cKDTree(self._places)
+        self._distinct = _distinct(points)
+        self._tree = cKDTree(self._distinct)
 
     def nearest(self, queries: Points) -> tuple[Points, Points]:
-        """Euclidean distance to the nearest point, and where that is, [q, 3] -> [q] and [q, 3]."""
+        """Find the nearest point of each query, [q, 3] -> Euclidean distances [q] and points [q, 3]."""
         distances, rows = self._tree.query(queries, workers=2 if len(queries) >= THREADED else 1)
-        return distances, self._places[rows]
+        return distances, self._distinct[rows]
 
 
-def _places(points: Points) -> Points:
-    """The points, each place once: a tree cannot split equal points, and a collapsed cloud would take minutes."""
-    # Equal points have equal sums, and counting those is cheap; unequal ones rarely do.
+def _distinct(points: Points) -> Points:
+    """Drop duplicates where there are many: a tree cannot split equal points, and would take minutes."""
+    # Equal points have equal sums, and counting those is cheap; unequal points rarely do.
     if len(np.unique(points @ np.array((1.0, np.e, np.pi)))) > len(points) // 2:
         return points
     return np.unique(points, axis=0)

@@ -1,21 +1,19 @@
-"""Feature extractors and LPIPS: the original networks, and the door for one's own.
+"""Feature extractors and LPIPS on the original networks.
 
-An extractor is any object with the attributes of `Extractor` (images) or `VideoExtractor` (clips); nothing has to be
-registered or inherited. A score is stored with the extractor's name, digest and resize, so a network of one's own makes
-a metric of its own, in a column of its own:
+An extractor is any object with the attributes of `samples.ImageExtractor` or `samples.VideoExtractor`; nothing has to
+be registered or inherited. A score is stored with the extractor's name, digest and resize, so a network of one's own
+makes a metric of its own, in a column of its own:
 
     class Dino:
-        name, digest, dimension, resize = "dino-s14", "<SHA-256 of its weights>", 384, "square 224, bicubic"
+        name, digest, resize = "dino-s14", "<SHA-256 of its weights>", "square 224, bicubic"
 
         def __call__(self, images: Tensor) -> Tensor:     # [B, 3, H, W] in [0, 1] -> [B, 384]
             return self.network(self.preprocess(images))
 
-Images go in at their own size and in [0, 1]; resizing, scaling and the device are the extractor's business. Weights of
-the networks here come from `rewild4d.metrics.weights`, which checks every byte; without them a constructor raises
+Images have their own size and are in [0, 1]; the extractor resizes, scales and chooses the device. Weights of the
+networks here come from `rewild4d.metrics.weights`, which checks every byte; without them a constructor raises
 `WeightsMissing`. TF32 is off while a network runs.
 """
-
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -32,35 +30,12 @@ BATCH = 8
 """Images that pass Inception at once; more are not faster and take more memory."""
 
 
-class Extractor(Protocol):
-    """What a metric on sets of images needs; see the module on bringing one's own."""
-
-    name: str
-    digest: str
-    dimension: int
-    resize: str
-
-    def __call__(self, images: Tensor) -> Tensor:
-        """Features of images in [0, 1], [B, 3, H, W] -> [B, dimension]."""
-        ...
-
-
-class VideoExtractor(Protocol):
-    """What a metric on sets of clips needs; see the module on bringing one's own."""
-
-    name: str
-    digest: str
-    dimension: int
-    minimum_frames: int
-    resize: str
-
-    def __call__(self, videos: Tensor) -> Tensor:
-        """Features of clips in [0, 1], [B, T, 3, H, W] -> [B, dimension]."""
-        ...
-
-
 class InceptionFeatures:
-    """The FID Inception-v3 of December 2015, averaged over the pixels of a layer; see `inception`."""
+    """The FID Inception-v3 of December 2015, averaged over the pixels of a layer; see `inception`.
+
+    Images are rounded to 8 bits first, so that a rendering scores the same in memory as from a PNG file; then they are
+    resized in float, and the network reads (pixel - 128) / 128.
+    """
 
     def __init__(self, weights: LoadedWeights, tap: int, resize: str, device: torch.device) -> None:
         self.name = "inception-fid" if tap == 2048 else f"inception-fid-{tap}"
@@ -68,20 +43,7 @@ class InceptionFeatures:
         self._network = inception_network.Inception(_on(weights, device))
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Features of images.
-
-        A rendering is rounded to 8 bits first, so that it scores the same in memory as out of a PNG file. Then it is
-        resized in float, without rounding again, and the network reads (pixel - 128) / 128.
-
-        Args:
-            images: in [0, 1], [B, 3, H, W].
-
-        Returns:
-            Float32, on the images' device, [B, dimension].
-
-        Raises:
-            ValueError: another shape or range.
-        """
+        """Compute features of images in [0, 1], [B, 3, H, W] -> float32, [B, dimension]."""
         if images.ndim != 4 or images.shape[1] != 3:
             raise ValueError(f"expected images of shape [B, 3, H, W], got {tuple(images.shape)}")
         check_range(images)
@@ -95,7 +57,7 @@ class InceptionFeatures:
 
 
 class I3dFeatures:
-    """The Kinetics-400 I3D that FVD is defined on; see `i3d`."""
+    """The Kinetics-400 I3D that FVD is defined on; see `i3d`. Frames keep their rate and are not rounded to 8 bits."""
 
     def __init__(self, weights: LoadedWeights, resize: str, device: torch.device) -> None:
         self.name, self.digest, self.resize, self.device = "i3d-k400", weights.digest, resize, device
@@ -104,19 +66,7 @@ class I3dFeatures:
             self._network = i3d_network.I3d(_on(weights, device))
 
     def __call__(self, videos: Tensor) -> Tensor:
-        """Logits of clips, averaged over time.
-
-        Frames are taken as they are, at their own rate, without rounding to 8 bits.
-
-        Args:
-            videos: in [0, 1], at least 9 frames, [B, T, 3, H, W].
-
-        Returns:
-            Float32, on the videos' device, [B, 400].
-
-        Raises:
-            ValueError: another shape or range, or too few frames.
-        """
+        """Compute logits of clips in [0, 1] of at least 9 frames, [B, T, 3, H, W] -> float32, [B, 400]."""
         if videos.ndim != 5 or videos.shape[2] != 3:
             raise ValueError(f"expected clips of shape [B, T, 3, H, W], got {tuple(videos.shape)}")
         if videos.shape[1] < self.minimum_frames:
@@ -131,23 +81,21 @@ class I3dFeatures:
 
 
 class Lpips:
-    """LPIPS v0.1 on the AlexNet or the VGG-16 trunk (Zhang et al. 2018): 0 for equal images, and no upper bound.
+    """LPIPS v0.1 on the AlexNet or the VGG-16 trunk (Zhang et al. 2018): 0 for equal images, without an upper bound.
 
-    The two trunks make two metrics, LPIPS-alex and LPIPS-vgg, whose values do not compare. Nor do those of other sizes,
-    crops and backgrounds, for images are not resized.
+    LPIPS-alex and LPIPS-vgg are two metrics whose values do not compare. Images are not resized: values of other sizes,
+    crops and backgrounds do not compare either.
+
+    Args:
+        net: "alex" or "vgg".
+        device: to compute on.
+
+    Raises:
+        ValueError: another trunk.
+        WeightsMissing: the weights are not here.
     """
 
     def __init__(self, net: lpips_network.Net, device: torch.device | str = CPU) -> None:
-        """Load a trunk and its heads.
-
-        Args:
-            net: "alex" or "vgg".
-            device: to compute on.
-
-        Raises:
-            ValueError: another trunk.
-            WeightsMissing: the weights are not here.
-        """
         _one_of("trunk", net, ("alex", "vgg"))
         weights = load_weights(f"lpips-{net}")
         self.net, self.name, self.digest, self.device = net, f"lpips-{net}", weights.digest, torch.device(device)
@@ -155,17 +103,9 @@ class Lpips:
         self._tensors = _on(weights, self.device)
 
     def __call__(self, prediction: Tensor, target: Tensor) -> Tensor:
-        """Distance of each pair, one pair at a time, so that a pair's value does not depend on its batch.
+        """Compute the distance of each pair in [0, 1], not rounded to 8 bits, [B, 3, H, W] -> float64, [B].
 
-        Args:
-            prediction: in [0, 1], not rounded to 8 bits, [B, 3, H, W].
-            target: in [0, 1], [B, 3, H, W].
-
-        Returns:
-            Computed in float32, returned as float64 on the images' device, [B].
-
-        Raises:
-            ValueError: another shape or range, or images that are too small for the trunk.
+        Pairs are computed one at a time in float32, so that a value does not depend on its batch.
         """
         if prediction.shape != target.shape or target.ndim != 4 or target.shape[1] != 3:
             shapes = f"{tuple(prediction.shape)} and {tuple(target.shape)}"
@@ -182,7 +122,7 @@ class Lpips:
 
 
 def inception(resize: str = "clean", device: torch.device | str = CPU, tap: int = 2048) -> InceptionFeatures:
-    """The extractor of FID and KID (Heusel et al. 2017, Binkowski et al. 2018).
+    """Load the extractor of FID and KID (Heusel et al. 2017, Binkowski et al. 2018).
 
     Args:
         resize: to 299x299: "clean", "tf1" or "bilinear-antialias"; see `networks.resizing.resize_images`.
@@ -192,6 +132,11 @@ def inception(resize: str = "clean", device: torch.device | str = CPU, tap: int 
     Raises:
         ValueError: another resize or tap.
         WeightsMissing: the weights are not here.
+
+    Example:
+        >>> inception("nearest")
+        Traceback (most recent call last):
+        ValueError: expected a resize out of clean, tf1, bilinear-antialias, got nearest
     """
     _one_of("resize", resize, IMAGE_RESIZES)
     _one_of("tap", tap, inception_network.TAPS)
@@ -199,7 +144,7 @@ def inception(resize: str = "clean", device: torch.device | str = CPU, tap: int 
 
 
 def i3d(resize: str = "short-side-crop", device: torch.device | str = CPU) -> I3dFeatures:
-    """The extractor of FVD (Unterthiner et al. 2019): logits of I3D, averaged over time, without a softmax.
+    """Load the extractor of FVD (Unterthiner et al. 2019): logits of I3D, averaged over time, without a softmax.
 
     Args:
         resize: to 224x224: "short-side-crop" or "square"; see `networks.resizing.resize_clip`.
@@ -208,6 +153,11 @@ def i3d(resize: str = "short-side-crop", device: torch.device | str = CPU) -> I3
     Raises:
         ValueError: another resize.
         WeightsMissing: the weights are not here.
+
+    Example:
+        >>> i3d("clean")
+        Traceback (most recent call last):
+        ValueError: expected a resize out of short-side-crop, square, got clean
     """
     _one_of("resize", resize, VIDEO_RESIZES)
     return I3dFeatures(load_weights("i3d-k400"), resize, torch.device(device))

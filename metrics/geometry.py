@@ -1,59 +1,134 @@
-"""How far a cloud of points is from the truth: Chamfer distance and F-score, after one similarity for all moments.
+"""Compare point clouds: Chamfer distance and F-score, after one similarity for all times.
 
-Distances are Euclidean, not squared, between samples of the two surfaces. Two perfect samplings of one surface are not
-at distance zero, so each result carries its floor: the same number for a second sampling of the truth.
+Distances are Euclidean, not squared, between samples of the two surfaces. Two samplings of one surface are not at
+distance zero, so every score carries its sampling floor: the same score of a second sampling of the truth.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from rewild4d.metrics.alignment import Alignment, Undetermined, align_sequence
-from rewild4d.metrics.clouds import as_points, box_diagonal, paired, subsample
-from rewild4d.metrics.distances import Chamfer, Distances, chamfer, distances, fscore
-from rewild4d.metrics.names import ALIGNMENTS, THRESHOLDS, Fit
-
-__all__ = [
-    "Chamfer",
-    "Comparison",
-    "Distances",
-    "Measured",
-    "chamfer",
-    "compare",
-    "compare_sequence",
-    "distances",
-    "fscore",
-]
+from rewild4d.metrics.clouds import Cloud, Points, as_points, box_diagonal, check_paired, subsample
+from rewild4d.metrics.names import ALIGNMENTS, QUANTITIES, THRESHOLDS, Fit, geometry_unit
+from rewild4d.metrics.score import Score
 
 POINTS = 30_000
-"""Points of a cloud that a comparison looks at; more are drawn by the seed."""
+"""Points of a cloud that are compared; of a larger one so many are drawn by the seed."""
 
 
 @dataclass(frozen=True)
-class Measured:
-    """One quantity of a comparison.
+class Chamfer:
+    """Mean nearest-neighbour distances in the clouds' unit, not squared.
 
     Attributes:
-        value: mean over the moments; None where any of them has none, ``note`` then says why.
-        unit: "1" for a ratio, "world" for the clouds' own unit of length.
-        better: "higher" or "lower".
-        per_frame: the value at each moment, None where there is none.
-        floor: the same quantity for a second sampling of the truth in the prediction's place, which is what a perfect
-            shape gets; ``Comparison.note`` says of how many points. None where there is no second sampling.
-        note: why there is no value, or "".
+        to_truth: from the prediction to the truth (accuracy).
+        to_prediction: from the truth to the prediction (completeness).
     """
 
-    value: float | None
-    unit: str
-    better: str
-    per_frame: tuple[float | None, ...]
-    floor: float | None
-    note: str
+    to_truth: float
+    to_prediction: float
+
+    @property
+    def symmetric(self) -> float:
+        """Mean (not sum) of the two directions."""
+        return (self.to_truth + self.to_prediction) / 2
+
+
+@dataclass(frozen=True)
+class Distances:
+    """Nearest-neighbour distances between two clouds.
+
+    Attributes:
+        to_truth: from each point of the prediction, float64, [n].
+        to_prediction: from each point of the truth; infinite where the prediction is empty, float64, [m].
+    """
+
+    to_truth: Points
+    to_prediction: Points
+
+    @property
+    def chamfer(self) -> Chamfer:
+        """Means of the two directions; `to_truth` is NaN where the prediction is empty."""
+        forward = float(self.to_truth.mean()) if len(self.to_truth) else math.nan
+        return Chamfer(forward, float(self.to_prediction.mean()))
+
+    def fscore(self, threshold: float) -> float:
+        """See `fscore`."""
+        precision = float((self.to_truth < threshold).mean()) if len(self.to_truth) else 0.0
+        recall = float((self.to_prediction < threshold).mean())
+        return 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0
+
+
+def distances(prediction: Tensor, truth: Tensor) -> Distances:
+    """Compute exact nearest-neighbour distances in both directions.
+
+    Args:
+        prediction: finite, may be empty, [n, 3].
+        truth: finite, at least one point, [m, 3].
+
+    Raises:
+        ValueError: another shape, a NaN or an infinite value, an empty truth.
+
+    Example:
+        >>> found = distances(torch.tensor([[0.0, 0, 0], [3, 0, 0]]), torch.tensor([[0.0, 0, 0], [1, 0, 0]]))
+        >>> found.to_truth.tolist(), found.to_prediction.tolist()
+        ([0.0, 2.0], [0.0, 1.0])
+    """
+    source, target = as_points(prediction, "prediction", empty=True), as_points(truth, "truth")
+    if not len(source):
+        return Distances(np.empty(0), np.full(len(target), np.inf))
+    return Distances(Cloud(target).nearest(source)[0], Cloud(source).nearest(target)[0])
+
+
+def chamfer(prediction: Tensor, truth: Tensor) -> Chamfer:
+    """Compute the Chamfer distance: mean_p min_g |p - g| and mean_g min_p |p - g|, not squared.
+
+    Papers differ by the square and by a factor of two; `Chamfer.symmetric` is the mean of the two directions.
+
+    Args:
+        prediction: finite, at least one point, [n, 3].
+        truth: finite, at least one point, [m, 3].
+
+    Raises:
+        ValueError: another shape, a NaN or an infinite value, an empty cloud.
+
+    Example:
+        >>> found = chamfer(torch.tensor([[0.0, 0, 0], [3, 0, 0]]), torch.tensor([[0.0, 0, 0], [1, 0, 0]]))
+        >>> found, found.symmetric
+        (Chamfer(to_truth=1.0, to_prediction=0.5), 0.75)
+    """
+    as_points(prediction, "prediction")
+    return distances(prediction, truth).chamfer
+
+
+def fscore(prediction: Tensor, truth: Tensor, threshold: float) -> float:
+    """Compute the F-score (Knapitsch et al. 2017): harmonic mean of precision and recall at a distance.
+
+    Precision is the share of the prediction's points nearer to the truth than the threshold, recall the share of the
+    truth's points nearer to the prediction. Zero where both are zero, and for an empty prediction.
+
+    Args:
+        prediction: finite, [n, 3].
+        truth: finite, at least one point, [m, 3].
+        threshold: in the clouds' unit.
+
+    Returns:
+        In [0, 1].
+
+    Raises:
+        ValueError: another shape, a NaN or an infinite value, an empty truth.
+
+    Example:
+        >>> fscore(torch.tensor([[0.0, 0, 0], [3, 0, 0]]), torch.tensor([[0.0, 0, 0], [1, 0, 0]]), threshold=0.5)
+        0.5
+    """
+    return distances(prediction, truth).fscore(threshold)
 
 
 @dataclass(frozen=True)
@@ -61,41 +136,38 @@ class Comparison:
     """A prediction against the truth.
 
     Attributes:
-        scores: by name, in the order of printing.
-        alignments: what was applied to the predictions: one for all moments, or one a moment (None where the points do
-            not determine it), or none.
+        scores: by name; each score's ``per_item`` is its value at each time, its ``floor`` the same quantity for a
+            second sampling of the truth.
+        alignments: applied to the predictions: one for all times, or one a time (None where the points do not
+            determine it), or none.
         diagonal: length that 100 % stands for, in the clouds' unit.
-        note: how many points were compared, and what the floor is.
+        note: how many points were compared, and how the floor was made.
     """
 
-    scores: dict[str, Measured]
+    scores: dict[str, Score]
     alignments: tuple[Alignment | None, ...]
     diagonal: float
     note: str
 
 
-def compare(
-    prediction: Tensor,
-    truth: Tensor,
-    *,
-    fit: Literal["sequence", "none"] = "sequence",
-    diagonal: float | None = None,
-    up: Tensor | None = None,
-    second: Tensor | None = None,
-    points: int = POINTS,
-    seed: int = 0,
-) -> Comparison:
-    """Score one cloud: `compare_sequence` of one moment, with the same keywords.
+def compare(prediction: Tensor, truth: Tensor, *, second: Tensor | None = None, **settings: Any) -> Comparison:
+    """Score one cloud: `compare_sequence` of one time.
 
     Args:
         prediction: finite, may be empty, [n, 3].
         truth: finite, at least one point, [m, 3].
         second: another sampling of the truth, for the floor, [k, 3].
+        settings: further keywords of `compare_sequence`.
+
+    Example:
+        >>> cube = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
+        >>> shifted = cube + torch.tensor([0.25, 0.0, 0.0])
+        >>> compare(shifted, cube, fit="none").scores["chamfer_unaligned"].value
+        0.25
+        >>> round(compare(shifted, cube).scores["chamfer"].value, 4)
+        0.0
     """
-    seconds = None if second is None else [second]
-    return compare_sequence(
-        [prediction], [truth], fit=fit, diagonal=diagonal, up=up, seconds=seconds, points=points, seed=seed
-    )
+    return compare_sequence([prediction], [truth], seconds=None if second is None else [second], **settings)
 
 
 def compare_sequence(
@@ -109,34 +181,40 @@ def compare_sequence(
     points: int = POINTS,
     seed: int = 0,
 ) -> Comparison:
-    """Chamfer distance and F-score of a sequence, each the mean over all its moments.
+    """Compute Chamfer distance and F-score of a sequence, each the mean over all its times.
 
-    A moment without points has an F-score of 0 and no Chamfer distance, and then the sequence has none either: a mean
-    over the others would favour a method that leaves out its worst moments.
+    At a time without predicted points the F-score is 0. The Chamfer distance is undefined there, and so is the
+    sequence's: a mean over the other times would favour a method that leaves out its worst.
 
-    Scores: "chamfer" (mean of the directions) with "chamfer_to_truth" and "chamfer_to_prediction", in the clouds' unit;
+    Scores: "chamfer" (mean of the directions), "chamfer_to_truth" and "chamfer_to_prediction", in the clouds' unit;
     "chamfer_relative", over the diagonal; "fscore_1", "fscore_2", "fscore_5" at so many percent of the diagonal. Each
     name ends in `names.ALIGNMENTS` of the fit. The relative ones do not depend on the unit.
 
     Args:
-        predictions: one cloud a moment, each finite, may be empty, [n, 3].
-        truths: the same moments, each finite, at least one point, [m, 3].
-        fit: "sequence" lays all predictions on the truths by one similarity; "frame" by one a moment, which hides
-            global motion, drift and flicker of scale; "none" compares them as they stand.
+        predictions: one cloud a time, each finite, may be empty, [n, 3].
+        truths: the same times, each finite, at least one point, [m, 3].
+        fit: "sequence" aligns all predictions by one similarity; "frame" by one a time, which hides global motion,
+            drift and flicker of scale; "none" does not align.
         diagonal: of the truth's bounding box in its rest pose; of the first truth where None.
         up: direction that the two frames share, for the alignment's starts (see `align_sequence`), [3].
-        seconds: an independent sampling of each truth for the floor, at least as large as the prediction. Where it is
-            None, two disjoint draws from each truth stand in; from a truth of fewer than twice ``points`` these are
-            halves, and their floor is worse than one of all points, [k, 3].
+        seconds: an independent sampling of each truth for the floor, at least as large as the prediction, [k, 3].
+            Where None, the floor compares two disjoint draws from each truth; of a truth with fewer than twice
+            ``points`` these are halves, and their floor is worse than one of all points.
         points: a larger cloud is compared by so many of its points.
         seed: of all draws.
 
     Raises:
         ValueError: unequal lengths, another shape, a NaN or an infinite value, an empty truth.
+
+    Example:
+        >>> cube = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
+        >>> found = compare_sequence([cube, cube + 0.25], [cube, cube], fit="none")
+        >>> [round(value, 3) for value in found.scores["chamfer_unaligned"].per_item]
+        [0.0, 0.433]
     """
-    paired(predictions, truths)
+    check_paired(predictions, truths)
     if seconds is not None:
-        paired(seconds, truths)
+        check_paired(seconds, truths)
     for prediction, truth in zip(predictions, truths, strict=True):
         as_points(prediction, "prediction", empty=True)
         as_points(truth, "truth")
@@ -146,19 +224,21 @@ def compare_sequence(
     given = [subsample(cloud, points, seed) for cloud in predictions]
     targets = [subsample(cloud, points, seed + 1) for cloud in truths]
     moved, alignments, reason = _aligned(given, targets, fit, up, seed)
-    frames = [None if cloud is None else distances(cloud, truth) for cloud, truth in zip(moved, targets, strict=True)]
-    floors, floor_note = _floors(truths, seconds, targets, given, points, seed)
-    scores = {
-        name + ALIGNMENTS[fit]: _measured(quantity, unit, better, frames, floors, reason)
-        for name, (quantity, unit, better) in _quantities(length).items()
-    }
+    frames = [
+        {} if cloud is None else _values(distances(cloud, truth), length)
+        for cloud, truth in zip(moved, targets, strict=True)
+    ]
+    empty = [cloud is not None and not len(cloud) for cloud in moved]
+    pairs, floor_note = _floor_pairs(truths, seconds, targets, given, points, seed)
+    floors = [_values(distances(*pair), length) for pair in pairs]
+    scores = {name + ALIGNMENTS[fit]: _score(name, frames, floors, empty, reason) for name in QUANTITIES}
     return Comparison(scores, alignments, length, f"{_counts(predictions, truths, points, seed)}; {floor_note}")
 
 
 def _aligned(
     predictions: list[Tensor], truths: list[Tensor], fit: Fit, up: Tensor | None, seed: int
 ) -> tuple[list[Tensor | None], tuple[Alignment | None, ...], str]:
-    """The predictions where they are compared, None where no similarity is determined, and why it is not."""
+    """Align the predictions; None where no similarity is determined, and the reason."""
     if fit == "none":
         return list(predictions), (), ""
     groups = [range(len(truths))] if fit == "sequence" else [range(t, t + 1) for t in range(len(truths))]
@@ -174,70 +254,56 @@ def _aligned(
             moved += [cloud if not len(cloud) else None for cloud in clouds]
             alignments.append(None)
         else:
-            moved += [found.transform.apply(cloud) for cloud in clouds]
+            moved += [found.apply(cloud) for cloud in clouds]
             alignments.append(found)
     return moved, tuple(alignments), reason
 
 
-Quantity = Callable[[Distances], float | None]
-
-
-def _quantities(diagonal: float) -> dict[str, tuple[Quantity, str, str]]:
-    """Name -> how it follows from the distances, its unit, and which way is better."""
-
-    def relative(found: Distances) -> float | None:
-        return found.chamfer.symmetric / diagonal if diagonal > 0 else None
-
-    def score(percent: int) -> Quantity:
-        return lambda found: found.fscore(percent / 100 * diagonal) if diagonal > 0 else None
-
-    table: dict[str, tuple[Quantity, str, str]] = {
-        "chamfer": (lambda found: found.chamfer.symmetric, "world", "lower"),
-        "chamfer_to_truth": (lambda found: found.chamfer.to_truth, "world", "lower"),
-        "chamfer_to_prediction": (lambda found: found.chamfer.to_prediction, "world", "lower"),
-        "chamfer_relative": (relative, "1", "lower"),
+def _values(found: Distances, diagonal: float) -> dict[str, float]:
+    """Compute every quantity that is defined at one time."""
+    mean = found.chamfer
+    values = {
+        "chamfer": mean.symmetric,
+        "chamfer_to_truth": mean.to_truth,
+        "chamfer_to_prediction": mean.to_prediction,
     }
-    return table | {f"fscore_{percent}": (score(percent), "1", "higher") for percent in THRESHOLDS}
+    if diagonal > 0:
+        values["chamfer_relative"] = mean.symmetric / diagonal
+        values |= {f"fscore_{percent}": found.fscore(percent / 100 * diagonal) for percent in THRESHOLDS}
+    return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
-def _measured(
-    quantity: Quantity,
-    unit: str,
-    better: str,
-    frames: Sequence[Distances | None],
-    floors: Sequence[Distances],
-    reason: str,
-) -> Measured:
-    def finite(found: Distances | None) -> float | None:
-        value = None if found is None else quantity(found)
-        return value if value is not None and math.isfinite(value) else None
-
-    items = tuple(finite(found) for found in frames)
-    below = [item for item in map(finite, floors) if item is not None]
+def _score(
+    name: str, frames: Sequence[dict[str, float]], floors: Sequence[dict[str, float]], empty: list[bool], reason: str
+) -> Score:
+    """Average a quantity over the times, or say why it has no value."""
+    items = [values.get(name) for values in frames]
+    present = [item for item in items if item is not None]
+    below = [values[name] for values in floors if name in values]
     floor = math.fsum(below) / len(below) if below else None
-    missing = [found for item, found in zip(items, frames, strict=True) if item is None]
-    if missing:
-        if all(found is not None and not len(found.to_truth) for found in missing):
-            reason = "the prediction has no points"
-        where = f" at {len(missing)} of {len(items)} moments" if len(missing) < len(items) else ""
-        reason = reason or "the truth's diagonal is zero"
-        return Measured(None, unit, better, items, floor, f"not computed: {reason}{where}")
-    return Measured(math.fsum(filter(None, items)) / len(items), unit, better, items, floor, "")
+    unit, better = geometry_unit(name)
+    if len(present) == len(items):
+        return Score(math.fsum(present) / len(items), unit, better, len(items), items, "", floor)
+    if all(none for item, none in zip(items, empty, strict=True) if item is None):
+        reason = "the prediction has no points"
+    where = f" at {len(items) - len(present)} of {len(items)} moments" if present else ""
+    reason = reason or "the truth's diagonal is zero"
+    return Score(None, unit, better, len(present), items, f"not computed: {reason}{where}", floor)
 
 
-def _floors(
+def _floor_pairs(
     truths: Sequence[Tensor],
     seconds: Sequence[Tensor] | None,
     targets: Sequence[Tensor],
     given: Sequence[Tensor],
     points: int,
     seed: int,
-) -> tuple[list[Distances], str]:
-    """Distances of a second sampling from the truth at each moment, and one sentence on how it was made."""
+) -> tuple[list[tuple[Tensor, Tensor]], str]:
+    """Pair a second sampling with the truth at each time, and say in one sentence how it was made."""
     if seconds is not None:
         drawn = [subsample(cloud, len(other) or points, seed + 2) for cloud, other in zip(seconds, given, strict=True)]
         note = f"floor: an independent sampling of the truth with {_span(drawn)} points against the same truth"
-        return [distances(*pair) for pair in zip(drawn, targets, strict=True)], note
+        return list(zip(drawn, targets, strict=True)), note
     halves = []
     for truth in truths:
         count = min(len(truth) // 2, points)
@@ -246,12 +312,11 @@ def _floors(
             halves.append((truth[order[:count]], truth[order[count : 2 * count]]))
     if not halves:
         return [], "floor: not computed, the truth has one point"
-    note = f"floor: two disjoint samples of the truth with {_span([half for half, _ in halves])} points each"
-    return [distances(*pair) for pair in halves], note
+    return halves, f"floor: two disjoint samples of the truth with {_span([half for half, _ in halves])} points each"
 
 
 def _counts(predictions: Sequence[Tensor], truths: Sequence[Tensor], points: int, seed: int) -> str:
-    """Which points were compared, in words."""
+    """Say which points were compared."""
     words = []
     for clouds, name in ((predictions, "prediction"), (truths, "truth")):
         drawn = f", {points} of them drawn with seed {seed}" if max(map(len, clouds)) > points else ""

@@ -1,11 +1,11 @@
-"""Image similarity: PSNR and SSIM, each as a pure function that gives one value per image, and where they look.
+"""Compute PSNR and SSIM, one value per image, and the regions that they cover.
 
 All images are float tensors in [0, 1], [B, C, H, W]; predictions and truths share size and background.
 
-Four regions, because a small animal's full-frame score is mostly a figure of its coverage:
+A small animal's full-frame score mostly measures how much of the image it covers, so there are four regions:
   full    every pixel
-  fg      the true mask: what the animal looks like where it is
-  union   the true or the predicted mask: an animal that is too large is punished too
+  fg      the true mask
+  union   the true or the predicted mask: an animal that is too large is penalised too
   crop    the box of the true mask with a margin (`mask_box`, `crop_to_box`), for any metric
 """
 
@@ -18,11 +18,11 @@ from torch import Tensor
 WINDOW = 11
 """Side of the SSIM window in pixels."""
 PSNR_CAP = 100.0
-"""Identical images have an infinite PSNR; it is reported as this many dB so that a mean exists."""
+"""PSNR of identical images in dB, instead of infinity, so that a mean exists."""
 BOX_MARGIN = 0.1
-"""Free border on each side of a truth box, as a share of its longer side."""
+"""Border on each side of a truth box, as a share of its longer side."""
 LEAST_BOX = 32
-"""A truth box has at least this side in pixels (where the image has): less leaves LPIPS's last layer nothing to see."""
+"""Least side of a truth box in pixels (where the image has as many): LPIPS's last layer needs it."""
 
 
 class Box(NamedTuple):
@@ -35,7 +35,7 @@ class Box(NamedTuple):
 
 
 def mask_box(mask: Tensor, margin: float = BOX_MARGIN, least: int = LEAST_BOX) -> Box | None:
-    """The rectangle around a mask with a margin, cut at the image's border.
+    """Compute the rectangle around a mask with a margin, cut at the image's border.
 
     Args:
         mask: boolean, [1, H, W].
@@ -44,13 +44,19 @@ def mask_box(mask: Tensor, margin: float = BOX_MARGIN, least: int = LEAST_BOX) -
 
     Returns:
         The box, or None where the mask is empty.
+
+    Example:
+        >>> mask = torch.zeros(1, 64, 64, dtype=torch.bool)
+        >>> mask[0, 20:30, 10:50] = True
+        >>> mask_box(mask, least=1)
+        Box(top=16, bottom=34, left=6, right=54)
     """
     if mask.ndim != 3 or mask.shape[0] != 1:
         raise ValueError(f"expected a mask of shape [1, H, W], got {tuple(mask.shape)}")
     rows, columns = torch.nonzero(mask[0].any(1)), torch.nonzero(mask[0].any(0))
     if not len(rows):
         return None
-    spans = [(int(places[0]), int(places[-1]) + 1) for places in (rows, columns)]
+    spans = [(int(inside[0]), int(inside[-1]) + 1) for inside in (rows, columns)]
     border = math.ceil(margin * max(end - start for start, end in spans))
     (top, bottom), (left, right) = (
         _widened(start - border, end + border, least, size)
@@ -60,7 +66,12 @@ def mask_box(mask: Tensor, margin: float = BOX_MARGIN, least: int = LEAST_BOX) -
 
 
 def crop_to_box(images: Tensor, box: Box) -> Tensor:
-    """Cut the same box out of images or masks, [..., H, W] -> [..., bottom - top, right - left]."""
+    """Cut the same box out of images or masks, [..., H, W] -> [..., bottom - top, right - left].
+
+    Example:
+        >>> crop_to_box(torch.arange(9).reshape(3, 3), Box(top=0, bottom=2, left=1, right=3)).tolist()
+        [[1, 2], [4, 5]]
+    """
     height, width = images.shape[-2:]
     if not (0 <= box.top < box.bottom <= height and 0 <= box.left < box.right <= width):
         raise ValueError(f"expected a box inside {width}x{height} pixels, got {box}")
@@ -68,31 +79,38 @@ def crop_to_box(images: Tensor, box: Box) -> Tensor:
 
 
 def fill_outside(images: Tensor, mask: Tensor, background: float) -> Tensor:
-    """One colour wherever the mask is not: how a metric without a per-pixel value (LPIPS) is held to a region.
+    """Fill everything outside a mask with one grey level, for metrics without a value per pixel (LPIPS).
 
-    Prediction and truth are filled with the same mask and colour, so only what lies inside can differ. Filters that
-    reach over the mask's edge still see the colour, and a map averaged over the frame still knows the coverage: the
-    number compares methods on the same truths, not animals of different size.
+    With prediction and truth filled alike, only what lies inside can differ. Filters at the mask's edge still see the
+    grey level, and a mean over the frame still depends on the coverage: compare methods on the same truths, not animals
+    of different size.
 
     Args:
         images: [B, C, H, W].
         mask: boolean, [B, 1, H, W].
         background: grey level in [0, 1].
+
+    Example:
+        >>> fill_outside(torch.zeros(1, 1, 1, 2), torch.tensor([[[[True, False]]]]), background=0.5).tolist()
+        [[[[0.0, 0.5]]]]
     """
     return images.where(_require_mask(mask, images), torch.as_tensor(background, dtype=images.dtype))
 
 
 def psnr(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Peak signal-to-noise ratio, 10 log10(1 / MSE), peak 1, capped at `PSNR_CAP`.
+    """Compute peak signal-to-noise ratio, 10 log10(1 / MSE), peak 1, at most `PSNR_CAP`.
 
     Args:
         prediction: in [0, 1], [B, C, H, W].
         target: in [0, 1], [B, C, H, W].
-        mask: pixels to count, boolean, [B, 1, H, W]; all where None. The mean is over the counted pixels only,
-            so a larger empty background does not change it.
+        mask: pixels of the mean, boolean, [B, 1, H, W]; all where None.
 
     Returns:
-        Decibels per image, float64, [B]; NaN for an image with no counted pixel (the caller says "not computed").
+        Decibels per image, float64, [B]; NaN for an image without a pixel in the mask.
+
+    Example:
+        >>> psnr(torch.full((1, 3, 4, 4), 0.6), torch.full((1, 3, 4, 4), 0.5)).round(decimals=4).tolist()
+        [20.0]
     """
     _check_pair(prediction, target)
     squares = (prediction.double() - target.double()).square()
@@ -105,19 +123,23 @@ def psnr(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tens
 
 
 def ssim(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Structural similarity (Wang et al. 2004): 11x11 Gaussian window, sigma 1.5, population covariance, valid region.
+    """Compute structural similarity (Wang et al. 2004): 11x11 Gaussian window, sigma 1.5, valid region.
 
     Equals scikit-image with gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.
 
     Args:
         prediction: in [0, 1], [B, C, H, W], at least 11 pixels each way.
         target: in [0, 1], [B, C, H, W].
-        mask: boolean, [B, 1, H, W]: the mean is over the map where the window's centre is inside the mask. The
-            window itself reaches 5 pixels over the edge and sees the background there; mask pixels within 5 pixels of
-            the image's border have no window and are not counted.
+        mask: boolean, [B, 1, H, W]: the mean is over the windows whose centre is inside. A window extends 5 pixels over
+            the mask's edge; mask pixels within 5 pixels of the image's border have no window and do not count.
 
     Returns:
-        Mean over the map and the channels per image, float64, [B]; NaN for an image with no counted window.
+        Mean over the windows and the channels per image, float64, [B]; NaN for an image without a window in the mask.
+
+    Example:
+        >>> black, white = torch.zeros(1, 1, 16, 16), torch.ones(1, 1, 16, 16)
+        >>> ssim(white, white).tolist(), ssim(black, white).round(decimals=4).tolist()
+        ([1.0], [0.0001])
     """
     _check_pair(prediction, target)
     if min(target.shape[2:]) < WINDOW:
@@ -129,9 +151,9 @@ def ssim(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tens
 
 
 def _ssim_of_one(prediction: Tensor, target: Tensor, counted: Tensor) -> Tensor:
-    """SSIM of one image [C, H, W], the mean over the counted windows [H-10, W-10].
+    """Compute the SSIM of one image [C, H, W], the mean over the counted windows [H-10, W-10].
 
-    The map is exactly one wherever its window sees no difference, so only the rest is computed.
+    A window that sees no difference has exactly one, so only the others are computed.
     """
     height, width = target.shape[1:]
     windows = target.shape[0] * counted.sum(dtype=torch.float64)
@@ -150,20 +172,20 @@ def _ssim_of_one(prediction: Tensor, target: Tensor, counted: Tensor) -> Tensor:
 
 
 def _span(differs: Tensor, size: int) -> tuple[int, int]:
-    """Rows (or columns) that the windows over a difference read, as a slice of at least one window."""
-    places = torch.nonzero(differs)
-    first = min(max(0, int(places[0]) - WINDOW + 1), size - WINDOW)
-    return first, max(min(size, int(places[-1]) + WINDOW), first + WINDOW)
+    """Return rows (or columns) that the windows over a difference read, as a slice of at least one window."""
+    rows = torch.nonzero(differs)
+    first = min(max(0, int(rows[0]) - WINDOW + 1), size - WINDOW)
+    return first, max(min(size, int(rows[-1]) + WINDOW), first + WINDOW)
 
 
 def _blur(images: Tensor) -> Tensor:
-    """Separable Gaussian window over the valid region as two banded products, [..., H, W] -> [..., H-10, W-10]."""
+    """Blur over the valid region as two banded products, [..., H, W] -> [..., H-10, W-10]."""
     rows, columns = (_band(size, images) for size in images.shape[-2:])
     return rows @ images @ columns.T
 
 
 def _band(size: int, like: Tensor) -> Tensor:
-    """Each row holds the window, shifted by one, [size-10, size]."""
+    """Return the window shifted by one in each row, [size-10, size]."""
     offsets = torch.arange(WINDOW, dtype=like.dtype, device=like.device) - WINDOW // 2
     window = torch.exp(-(offsets**2) / (2 * 1.5**2))
     band = torch.zeros(size - WINDOW + 1, size, dtype=like.dtype, device=like.device)
@@ -186,7 +208,7 @@ def _require_mask(mask: Tensor, images: Tensor) -> Tensor:
 
 
 def _widened(start: int, end: int, least: int, size: int) -> tuple[int, int]:
-    """The part of a span inside [0, size), grown to at least ``least`` pixels where there are as many."""
+    """Cut a span to [0, size) and grow it to at least ``least`` pixels where there are as many."""
     start, end = max(0, start), min(size, end)
     lack = max(0, min(least, size) - (end - start))
     start = min(max(0, start - lack // 2), size - (end - start + lack))

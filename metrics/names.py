@@ -1,4 +1,4 @@
-"""The names of all scores that a protocol may ask for, with units. Nothing is computed here.
+"""Names of all scores that a protocol may ask for, with their units.
 
 The name of an image score is a metric and a region: "psnr", "ssim_fg", "lpips_alex_crop"; without a region it covers
 the full frame. The name of a geometry score is a quantity, an alignment and a number of points.
@@ -15,10 +15,10 @@ SILHOUETTES = ("iou", "dice", "boundary_f")
 IMAGES = (*(m if r == "full" else f"{m}_{r}" for m in COLOR_METRICS for r in REGIONS), *SILHOUETTES)
 
 THRESHOLDS = (1, 2, 5)
-"""F-scores, in per cent of the rest pose's diagonal."""
+"""F-scores, in percent of the rest pose's diagonal."""
 Fit = Literal["sequence", "frame", "none"]
 ALIGNMENTS: dict[Fit, str] = {"sequence": "", "frame": "_framewise", "none": "_unaligned"}
-"""How predictions are aligned to the truth (see `metrics.geometry`) -> end of the score's name."""
+"""Alignment of predictions to the truth (see `metrics.geometry`) -> end of the score's name."""
 DENSE = {"": None, "_30k": 30_000}
 """End of a name -> points of each cloud; None is the protocol's own number."""
 QUANTITIES = ("chamfer", "chamfer_to_truth", "chamfer_to_prediction", "chamfer_relative") + tuple(
@@ -31,13 +31,30 @@ KINDS = {
     "fvd_f": {"fvd_f": "FVD-F", "kvd_f": "KVD-F"},
     "fvd_diag": {"fvd_diag": "FVD-Diag", "kvd_diag": "KVD-Diag"},
 }
-"""Kind of sets -> its scores, in the order of `metrics.sets.distances`, and the name of each distance."""
+"""Kind of sets -> its scores, in the order of `metrics.sets.distances`, and the title of each distance."""
 SETS = tuple(name for scores in KINDS.values() for name in scores)
 
 ALL = (*IMAGES, *GEOMETRY, *SETS)
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """Split an image score's name into metric and region: "lpips_alex_fg" -> ("lpips_alex", "fg")."""
+    """Split an image score's name into metric and region.
+
+    Example:
+        >>> split_name("lpips_alex_fg"), split_name("psnr")
+        (('lpips_alex', 'fg'), ('psnr', 'full'))
+    """
     metric, _, region = name.rpartition("_")
     return (metric, region) if region in REGIONS else (name, "full")
+
+
+def geometry_unit(name: str) -> tuple[str, str]:
+    """Return a geometry score's unit ("world" is the clouds' own), and which way is better.
+
+    Example:
+        >>> geometry_unit("chamfer_relative_framewise"), geometry_unit("fscore_1")
+        (('1', 'lower'), ('1', 'higher'))
+    """
+    if name.startswith("fscore"):
+        return "1", "higher"
+    return ("1" if name.startswith("chamfer_relative") else "world"), "lower"

@@ -1,11 +1,12 @@
-"""Sets of images or clips as feature rows, and the result that a distance between two sets gives.
+"""Sets of images or clips as feature rows, and the distance between two sets.
 
-The hooks are open: any callable with a name, a digest and a resize rule is an extractor; its metrics carry its name.
+Any callable with a name, a digest and a resize rule is an extractor; metrics on its features carry its name.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from itertools import groupby, islice
+from typing import Any, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,11 +15,11 @@ from rewild4d.metrics.networks.layers import check_range
 from rewild4d.metrics.score import Distance
 
 ORIGINAL = ("inception-fid", "i3d-k400")
-"""Networks under which a metric has its plain name; under any other the network's name stands behind it."""
+"""Networks under which a metric keeps its plain name; under any other the network's name is added."""
 _BATCH = 16
-
+T = TypeVar("T")
 Progress = Callable[[int, int], None]
-"""Called with how many are done, of how many."""
+"""Function of (done, total)."""
 
 
 class Images(Protocol):
@@ -30,7 +31,7 @@ class Images(Protocol):
 
 
 class ImageExtractor(Protocol):
-    """What `rewild4d.metrics.features.Extractor` is, as far as it is needed here: bring your own."""
+    """Network of a metric on sets of images; see `rewild4d.metrics.features` on bringing one's own."""
 
     name: str
     digest: str
@@ -40,14 +41,41 @@ class ImageExtractor(Protocol):
         """[B, 3, H, W] in [0, 1] -> [B, D]."""
 
 
+class VideoExtractor(Protocol):
+    """Network of a metric on sets of clips; see `rewild4d.metrics.features` on bringing one's own."""
+
+    name: str
+    digest: str
+    resize: str
+    minimum_frames: int
+
+    def __call__(self, videos: Tensor, /) -> Tensor:
+        """[B, T, 3, H, W] in [0, 1] -> [B, D]."""
+
+
+class MeanColor:
+    """Toy extractor of images and clips for examples: the mean of each channel.
+
+    Example:
+        >>> MeanColor()(torch.ones(2, 3, 4, 4)).tolist()
+        [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
+    """
+
+    name, digest, resize, minimum_frames = "mean-color", "", "none", 1
+
+    def __call__(self, images: Tensor, /) -> Tensor:
+        """[B, 3, H, W] or [B, T, 3, H, W] -> [B, 3]."""
+        return images.mean((-2, -1)).reshape(len(images), -1, 3).mean(1)
+
+
 @dataclass(frozen=True)
 class Conditions:
-    """What both sets must share for a distance to mean anything; it is copied into the result.
+    """What both sets must share to be comparable; it is copied into the result.
 
     Attributes:
-        background: what lies behind the animal ("white", "as filmed", ...).
-        crop: which part of the frame was fed.
-        fps: frames a second of the clips; None for still images or where nobody knows it.
+        background: behind the animal ("white", "as filmed", ...).
+        crop: part of the frame that the network sees.
+        fps: frames a second of the clips; None for still images or where unknown.
     """
 
     background: str = "as given"
@@ -57,14 +85,14 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Features:
-    """What a network says of a set of images or clips.
+    """Feature rows of a set of images or clips.
 
     Attributes:
         values: one row an image or clip, float64 on the CPU, [n, D].
-        groups: which sequence each row belongs to, int64, [n].
+        groups: sequence of each row, int64, [n].
         extractor: the network's name.
         digest: SHA-256 of its weights.
-        resize: how images were brought to its input size.
+        resize: how images reach its input size.
         frames: T of the clips; None for still images.
     """
 
@@ -79,41 +107,55 @@ class Features:
 def image_features(
     sequences: Sequence[Images], extractor: ImageExtractor, progress: Progress | None = None
 ) -> Features:
-    """The features of every image, sequence by sequence.
+    """Compute the features of every image, sequence by sequence.
 
     Args:
-        sequences: one entry a sequence (an animal's clip, a turn around it); images [3, H, W] in [0, 1], of any size.
+        sequences: one entry a sequence (an animal's clip, an orbit of views); images [3, H, W] in [0, 1], of any size.
         extractor: [B, 3, H, W] in [0, 1] -> [B, D].
         progress: called after every batch.
 
     Raises:
         ValueError: an image is not [3, H, W], not float, or leaves [0, 1].
+
+    Example:
+        >>> found = image_features([torch.zeros(2, 3, 4, 4), torch.ones(1, 3, 8, 8)], MeanColor())
+        >>> found.values[:, 0].tolist(), found.groups.tolist()
+        ([0.0, 0.0, 1.0], [0, 0, 1])
     """
-    places = [(group, i) for group, images in enumerate(sequences) for i in range(len(images))]
+    indices = [(group, i) for group, images in enumerate(sequences) for i in range(len(images))]
+    images = (require_image(sequences[group][i]) for group, i in indices)
     rows: list[Tensor] = []
-    batch: list[Tensor] = []
-    for group, i in places:
-        image = require_image(sequences[group][i])
-        if batch and (len(batch) == _BATCH or image.shape != batch[0].shape):
-            rows.append(extractor(torch.stack(batch)).double().cpu())
-            batch = []
-            if progress is not None:
-                progress(sum(map(len, rows)), len(places))
-        batch.append(image)
-    if batch:
+    for batch in batches(images, _BATCH, lambda image: image.shape):
         rows.append(extractor(torch.stack(batch)).double().cpu())
         if progress is not None:
-            progress(len(places), len(places))
+            progress(sum(map(len, rows)), len(indices))
     values = torch.cat(rows) if rows else torch.zeros(0, 0, dtype=torch.float64)
-    groups = torch.tensor([group for group, _ in places], dtype=torch.int64)
+    groups = torch.tensor([group for group, _ in indices], dtype=torch.int64)
     return Features(values, groups, extractor.name, extractor.digest, extractor.resize)
 
 
+def batches(items: Iterable[T], size: int, key: Callable[[T], Any]) -> Iterator[list[T]]:
+    """Group neighbours with one key into lists of at most a size, in order.
+
+    Example:
+        >>> list(batches("aaabba", 2, str))
+        [['a', 'a'], ['a'], ['b', 'b'], ['a']]
+    """
+    for _, group in groupby(items, key):
+        while batch := list(islice(group, size)):
+            yield batch
+
+
 def require_image(image: Tensor) -> Tensor:
-    """The image itself, [3, H, W] in [0, 1]; 0..255 or another layout would give a plausible, wrong number.
+    """Check an image, [3, H, W] in [0, 1], and return it; 0..255 or another layout gives a plausible, wrong number.
 
     Raises:
-        ValueError: anything else.
+        ValueError: another shape, type or range.
+
+    Example:
+        >>> require_image(torch.full((3, 2, 2), 255.0))
+        Traceback (most recent call last):
+        ValueError: expected values in [0, 1], got 255 to 255
     """
     if image.ndim != 3 or image.shape[0] != 3 or not image.is_floating_point():
         raise ValueError(f"expected a float image of shape [3, H, W], got {image.dtype} {tuple(image.shape)}")
@@ -132,9 +174,9 @@ def describe(
     conditions: Conditions,
     interval: tuple[float, float] | None = None,
 ) -> Distance:
-    """A distance with what its two sets know of themselves."""
+    """Build a distance with what its two sets know of themselves."""
     return Distance(
-        name=plain_name(name, prediction.extractor),
+        name=name if prediction.extractor in ORIGINAL else f"{name} [{prediction.extractor}]",
         value=value,
         n=len(prediction.values),
         m=len(truth.values),
@@ -145,15 +187,18 @@ def describe(
         extractor=prediction.extractor,
         digest=prediction.digest,
         resize=prediction.resize,
-        background=conditions.background,
-        crop=conditions.crop,
         frames=prediction.frames,
-        fps=conditions.fps,
+        **vars(conditions),
     )
 
 
 def not_computed(prediction: Features, truth: Features, least: int = 2) -> str:
-    """Why no distance between two sets can be computed, or ""; an estimator needs at least so many rows a side.
+    """Return why no distance between two sets can be computed, or "".
+
+    Args:
+        prediction: one set.
+        truth: the other.
+        least: rows a side that the estimator needs.
 
     Raises:
         ValueError: the two sets come from different networks or resize rules.
@@ -165,8 +210,3 @@ def not_computed(prediction: Features, truth: Features, least: int = 2) -> str:
         return f"not computed: clips of {prediction.frames} and {truth.frames} frames, and only equal lengths compare"
     n, m = len(prediction.values), len(truth.values)
     return "" if min(n, m) >= least else f"not computed: at least {least} samples a side are needed, got {n} and {m}"
-
-
-def plain_name(name: str, extractor: str) -> str:
-    """A metric keeps its plain name under its original network only: "KID", but "KID [mine]"."""
-    return name if extractor in ORIGINAL else f"{name} [{extractor}]"

@@ -1,19 +1,18 @@
-"""Two sets as features, and every distance that is computed from them: kept beside a run, pooled over several.
+"""Pairs of feature sets and their distances: stored beside a run, pooled over several.
 
-A distance of one short video leans on few samples; the same features of many videos, put together, give one distance
-over all of them (METRICS, sections 4 and 5). Features are stored as float32, which is what the networks compute.
+A distance of one short video has few samples; the features of many videos together give one distance over all of
+them. Features are stored as float32, which is what the networks compute.
 """
 
 import json
 import zipfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from rewild4d.errors import UserError
 from rewild4d.files import atomic, digest
@@ -34,7 +33,7 @@ class Compared:
         kind: one of `metrics.names.KINDS`.
         prediction: features of the renders.
         truth: features of the reference.
-        conditions: that both share.
+        conditions: shared by both.
     """
 
     kind: str
@@ -44,7 +43,14 @@ class Compared:
 
 
 def distances(compared: Compared) -> list[Distance]:
-    """The distances of `KINDS` between two sets."""
+    """Compute the distances of `KINDS` between two sets.
+
+    Example:
+        >>> groups = torch.zeros(2, dtype=torch.int64)
+        >>> x, y = (Features(torch.full((2, 1), a).double(), groups, "i3d-k400", "", "", frames=9) for a in (0.0, 1.0))
+        >>> [(one.name, one.value) for one in distances(Compared("fvd_f", x, y, Conditions()))]
+        [('FVD-F', 1.0), ('KVD-F', 7.0)]
+    """
     x, y, conditions = compared.prediction, compared.truth, compared.conditions
     if compared.kind == "kid_v":
         return [kid(x, y, name="KID-V", conditions=conditions)]
@@ -52,18 +58,29 @@ def distances(compared: Compared) -> list[Distance]:
 
 
 def suffix_of(kind: str) -> str:
-    """ "-F" or "-Diag": what stands behind FVD and KVD."""
+    """Return the end of FVD's and KVD's name for a kind of clips.
+
+    Example:
+        >>> suffix_of("fvd_diag")
+        '-Diag'
+    """
     return KINDS[kind][kind].removeprefix("FVD")
 
 
 def pool(parts: Sequence[Compared]) -> Compared:
-    """The sets of several sequences as one, each part a sequence of its own.
+    """Join the sets of several sequences, each part a sequence of its own.
 
     Args:
         parts: of one kind, from one network and resize rule, clips of one length, on one background and crop.
 
     Raises:
-        ValueError: parts that do not belong together; the text says in what they differ.
+        ValueError: parts that differ; the text says in what.
+
+    Example:
+        >>> one = Features(torch.zeros(2, 1), torch.zeros(2, dtype=torch.int64), "toy", "", "")
+        >>> part = Compared("kid_v", one, one, Conditions())
+        >>> pool([part, part]).truth.groups.tolist()
+        [0, 0, 1, 1]
     """
     for name, values in (
         ("kinds", {part.kind for part in parts}),
@@ -74,22 +91,16 @@ def pool(parts: Sequence[Compared]) -> Compared:
         if len(values) != 1:
             raise ValueError(f"expected sets that can be pooled, got {len(values)} different {name}")
     rates = {part.conditions.fps for part in parts}
-    conditions = Conditions(
-        parts[0].conditions.background, parts[0].conditions.crop, rates.pop() if len(rates) == 1 else None
-    )
-    return Compared(
-        parts[0].kind,
-        _stack([part.prediction for part in parts]),
-        _stack([part.truth for part in parts]),
-        conditions,
-    )
+    conditions = replace(parts[0].conditions, fps=rates.pop() if len(rates) == 1 else None)
+    prediction, truth = (_stack([getattr(part, side) for part in parts]) for side in _SIDES)
+    return Compared(parts[0].kind, prediction, truth, conditions)
 
 
 def write_features(sets: Sequence[Compared], path: Path) -> str:
-    """Write sets atomically as an .npz: for each kind and side the rows, float32, and what they are, as JSON.
+    """Write sets atomically as an .npz: the rows of each kind and side, float32, and their description as JSON.
 
     Returns:
-        SHA-256 of all that the file holds.
+        SHA-256 of the file's arrays.
 
     Raises:
         UserError: the file cannot be written.
@@ -97,11 +108,12 @@ def write_features(sets: Sequence[Compared], path: Path) -> str:
     arrays: dict[str, np.ndarray] = {}
     about: dict[str, Any] = {}
     for compared in sets:
-        about[compared.kind] = {"conditions": asdict(compared.conditions)}
+        about[compared.kind] = {"conditions": vars(compared.conditions)}
         for side in _SIDES:
-            features: Features = getattr(compared, side)
-            arrays[f"{compared.kind}.{side}"] = features.values.numpy().astype(np.float32)
-            about[compared.kind][side] = _about(features)
+            fields = dict(vars(getattr(compared, side)))
+            arrays[f"{compared.kind}.{side}"] = fields.pop("values").numpy().astype(np.float32)
+            del fields["groups"]
+            about[compared.kind][side] = fields
     arrays["about"] = np.array(json.dumps(about, sort_keys=True))
     with atomic(path) as temporary, temporary.open("wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
@@ -109,11 +121,11 @@ def write_features(sets: Sequence[Compared], path: Path) -> str:
 
 
 def read_features(path: Path, expected: str | None = None) -> dict[str, Compared]:
-    """What `write_features` wrote, by kind; every part is one sequence.
+    """Read what `write_features` wrote, by kind; every part is one sequence.
 
     Args:
         path: of the file.
-        expected: what `write_features` returned; None takes what is there.
+        expected: digest that `write_features` returned; None accepts any.
 
     Raises:
         UserError: no such file, not one of ours, or not the one with that digest.
@@ -137,13 +149,6 @@ def _compared(kind: str, arrays: dict[str, np.ndarray], said: dict[str, Any]) ->
     return Compared(kind, prediction, truth, Conditions(**said["conditions"]))
 
 
-def _about(features: Features) -> dict[str, Any]:
-    return {
-        "extractor": features.extractor, "digest": features.digest, "resize": features.resize,
-        "frames": features.frames,
-    }  # fmt: skip
-
-
 def _features(values: np.ndarray, said: dict[str, Any]) -> Features:
     if values.ndim != 2:
         raise ValueError(f"rows of shape {values.shape}")
@@ -152,13 +157,11 @@ def _features(values: np.ndarray, said: dict[str, Any]) -> Features:
 
 
 def _stack(parts: Sequence[Features]) -> Features:
-    """All rows, and a group for each part."""
-    first = parts[0]
+    """Join all rows, with a group for each part."""
     groups = torch.cat([torch.full((len(part.values),), group) for group, part in enumerate(parts)])
-    values: Tensor = torch.cat([part.values for part in parts])
-    return Features(values, groups, first.extractor, first.digest, first.resize, first.frames)
+    return replace(parts[0], values=torch.cat([part.values for part in parts]), groups=groups)
 
 
 def _digest(arrays: dict[str, np.ndarray]) -> str:
-    """SHA-256 over names, shapes, types and bytes; the container's time stamps do not count."""
+    """Hash names, shapes, types and bytes, but not the container's time stamps."""
     return digest(*(part for name in sorted(arrays) for part in (name, arrays[name])))

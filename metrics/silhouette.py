@@ -1,6 +1,6 @@
-"""Agreement of silhouettes: regions (IoU, Dice) and contours (boundary F).
+"""Compare silhouettes by region (IoU, Dice) and by contour (boundary F).
 
-Every function cuts two mattes [B, 1, H, W] at a threshold and gives one value per image, NaN where both are empty.
+Every function cuts two mattes [B, 1, H, W] at a threshold and returns one value per image, NaN where both are empty.
 """
 
 import math
@@ -11,11 +11,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 BOUNDARY_TOLERANCE = 0.008
-"""How far two contours may lie apart and still match, as a share of the image's diagonal (DAVIS)."""
+"""Distance at which two contours still match, as a share of the image's diagonal (DAVIS)."""
 
 
 def mask_iou(prediction: Tensor, target: Tensor, threshold: float = 0.5) -> Tensor:
-    """Intersection over union of two mattes, both cut at a threshold.
+    """Compute the intersection over union of two mattes.
 
     Args:
         prediction: matte in [0, 1], [B, 1, H, W].
@@ -23,14 +23,23 @@ def mask_iou(prediction: Tensor, target: Tensor, threshold: float = 0.5) -> Tens
         threshold: a pixel is inside where the matte is at least this.
 
     Returns:
-        Per image in [0, 1], float64, [B]; NaN where both are empty (the caller reports it as not computed).
+        Per image in [0, 1], float64, [B]; NaN where both are empty.
+
+    Example:
+        >>> mask_iou(torch.tensor([[[[1.0, 1.0, 0.0]]]]), torch.tensor([[[[1.0, 0.0, 0.0]]]])).tolist()
+        [0.5]
     """
     a, b = (mask.flatten(1) for mask in _cut(prediction, target, threshold))
     return (a & b).sum(1).to(torch.float64) / (a | b).sum(1).to(torch.float64)
 
 
 def mask_dice(prediction: Tensor, target: Tensor, threshold: float = 0.5) -> Tensor:
-    """Dice coefficient 2 |A & B| / (|A| + |B|) (Dice 1945); arguments, range and NaN as `mask_iou`, [B]."""
+    """Compute the Dice coefficient 2 |A & B| / (|A| + |B|) (Dice 1945); arguments, range and NaN as `mask_iou`, [B].
+
+    Example:
+        >>> mask_dice(torch.tensor([[[[1.0, 1.0, 1.0]]]]), torch.tensor([[[[1.0, 0.0, 0.0]]]])).tolist()
+        [0.5]
+    """
     a, b = (mask.flatten(1) for mask in _cut(prediction, target, threshold))
     return 2 * (a & b).sum(1).to(torch.float64) / (a.sum(1) + b.sum(1)).to(torch.float64)
 
@@ -38,7 +47,7 @@ def mask_dice(prediction: Tensor, target: Tensor, threshold: float = 0.5) -> Ten
 def boundary_f(
     prediction: Tensor, target: Tensor, threshold: float = 0.5, tolerance: float = BOUNDARY_TOLERANCE
 ) -> Tensor:
-    """Contour accuracy F of the DAVIS benchmark (Perazzi et al. 2016).
+    """Compute the contour accuracy F of the DAVIS benchmark (Perazzi et al. 2016).
 
     A contour pixel differs from its right, lower or lower right neighbour. Precision is the share of predicted contour
     pixels with a true one within r pixels (centre to centre), recall the reverse, F = 2 P R / (P + R). The radius is
@@ -53,6 +62,13 @@ def boundary_f(
     Returns:
         Per image in [0, 1], float64, [B]; 0 where one contour is empty, NaN where neither image has one (both masks
         empty, or both full: the image's border is no contour).
+
+    Example:
+        >>> truth, prediction = torch.zeros(1, 1, 16, 16), torch.zeros(1, 1, 16, 16)
+        >>> truth[..., 4:12, 4:12] = 1
+        >>> prediction[..., 4:12, 5:13] = 1
+        >>> boundary_f(prediction, truth).tolist(), boundary_f(1 - truth * 0, truth).tolist()
+        ([1.0], [0.0])
     """
     radius = math.ceil(tolerance * math.hypot(*target.shape[-2:]))
     pairs = zip(*(_contour(mask) for mask in _cut(prediction, target, threshold)), strict=True)
@@ -61,7 +77,7 @@ def boundary_f(
 
 
 def _contour_f(prediction: Tensor, target: Tensor, radius: int) -> float:
-    """F of two contours, [H, W] each."""
+    """Compute F of two contours, [H, W] each."""
     ours, theirs = (np.argwhere(contour.numpy()) for contour in (prediction, target))
     if not len(ours) and not len(theirs):
         return math.nan
@@ -73,7 +89,7 @@ def _contour_f(prediction: Tensor, target: Tensor, radius: int) -> float:
 
 
 def _contour(mask: Tensor) -> Tensor:
-    """Pixels unlike a neighbour to the right, below or both, on the CPU, [B, 1, H, W] -> [B, H, W]."""
+    """Find pixels unlike a neighbour to the right, below or both, on the CPU, [B, 1, H, W] -> [B, H, W]."""
     mask = mask[:, 0].cpu()
     padded = torch.nn.functional.pad(mask.float()[:, None], (0, 1, 0, 1), mode="replicate")[:, 0] > 0
     return (mask ^ padded[:, :-1, 1:]) | (mask ^ padded[:, 1:, :-1]) | (mask ^ padded[:, 1:, 1:])

@@ -1,4 +1,4 @@
-"""The similarity (7 degrees of freedom) between matched points in closed form. A reflection is never one."""
+"""Compute the similarity (7 degrees of freedom) between matched points in closed form. A reflection is never one."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -16,7 +16,7 @@ class Undetermined(ValueError):
 
 @dataclass(frozen=True)
 class Similarity:
-    """x -> scale * rotation @ x + translation.
+    """The map x -> scale * rotation @ x + translation.
 
     Attributes:
         scale: above zero.
@@ -37,13 +37,13 @@ class Similarity:
         return matrix
 
     def apply(self, points: Tensor) -> Tensor:
-        """The mapped points, in the points' own precision and device, [..., 3] -> [..., 3]."""
+        """Map points in their own precision and on their device, [..., 3] -> [..., 3]."""
         moved = self.scale * points.double() @ self.rotation.to(points.device).T
         return (moved + self.translation.to(points.device)).to(points.dtype)
 
 
 def umeyama(source: Tensor, target: Tensor, weights: Tensor | None = None) -> Similarity:
-    """The similarity with the least (weighted) squared distance between matched points (Umeyama 1991, eqs. 40-43).
+    """Compute the similarity with the least (weighted) squared distance of matched points (Umeyama 1991, eqs. 40-43).
 
     Args:
         source: finite, [n, 3].
@@ -51,8 +51,14 @@ def umeyama(source: Tensor, target: Tensor, weights: Tensor | None = None) -> Si
         weights: not negative, not all zero, [n]; equal where None.
 
     Raises:
-        Undetermined: fewer than three points, or all in one place or on one line. Points in one plane are enough.
+        Undetermined: fewer than three points, or all at one position or on one line. Points in one plane are enough.
         ValueError: shapes that do not fit, or a NaN.
+
+    Example:
+        >>> source = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+        >>> found = umeyama(source, 2 * source + torch.tensor([0.0, 0, 3]))
+        >>> round(found.scale, 4), [round(x, 4) + 0.0 for x in found.translation.tolist()]
+        (2.0, [0.0, 0.0, 3.0])
     """
     x, y = as_points(source, "source"), as_points(target, "target")
     if x.shape != y.shape:
@@ -88,7 +94,7 @@ class Map(NamedTuple):
 
 
 def fit_matched(x: Points, y: Points, share: Points, bounds: tuple[float, float]) -> tuple[Map, Points]:
-    """Umeyama's closed form with the scale kept within bounds, and the covariance's singular values, [3].
+    """Compute Umeyama's closed form with the scale kept within bounds, and the covariance's singular values, [3].
 
     The best rotation does not depend on the scale, and the squared distance is a parabola in it: clamping is exact.
 

@@ -1,4 +1,4 @@
-"""Distances between two sets of clips by the features of a video network: FVD, FVD-F, FVD-Diag, KVD, I3D-dist.
+"""Compute distances between two sets of clips by the features of a video network: FVD, FVD-F, FVD-Diag, KVD, I3D-dist.
 
 An image matrix M[v][f] holds view v at frame f of one sequence. The names are SV4D's (Xie et al. 2025, sec. 4), who
 released no code for them; what the paper leaves open is fixed here:
@@ -22,6 +22,7 @@ from rewild4d.metrics.samples import (
     Features,
     Images,
     Progress,
+    VideoExtractor,
     describe,
     not_computed,
     require_image,
@@ -29,7 +30,7 @@ from rewild4d.metrics.samples import (
 
 I3D_DIST = "I3D-dist (paired, N=1)"
 FEW_CLIPS = 64
-"""Below this many clips a side the result warns of KVD's noise."""
+"""With fewer clips a side the note warns of KVD's noise."""
 
 
 class ImageMatrix(Protocol):
@@ -38,18 +39,6 @@ class ImageMatrix(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int, /) -> Images: ...
-
-
-class VideoExtractor(Protocol):
-    """What `rewild4d.metrics.features.VideoExtractor` is, as far as it is needed here: bring your own."""
-
-    name: str
-    digest: str
-    resize: str
-    minimum_frames: int
-
-    def __call__(self, videos: Tensor, /) -> Tensor:
-        """[B, T, 3, H, W] in [0, 1] -> [B, D]."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +56,23 @@ class MatrixClip:
 
 
 def frame_clips(matrix: ImageMatrix) -> list[MatrixClip]:
-    """The clips of FVD-F: every view over all frames, M[v, :]."""
+    """Return the clips of FVD-F: every view over all frames, M[v, :].
+
+    Example:
+        >>> [clip.views for clip in frame_clips(torch.zeros(2, 3, 3, 4, 4))]
+        [(0, 0, 0), (1, 1, 1)]
+    """
     views, frames = _matrix_size(matrix)
     return [MatrixClip(matrix, (view,) * frames) for view in range(views)]
 
 
 def diagonal_clips(matrix: ImageMatrix) -> list[MatrixClip]:
-    """The clips of FVD-Diag: from every view, one view further a frame, M[(v0 + i) mod V, i]; the orbit must close."""
+    """Return the clips of FVD-Diag: from every view, one view further a frame, M[(v0 + i) mod V, i].
+
+    Example:
+        >>> [clip.views for clip in diagonal_clips(torch.zeros(2, 3, 3, 4, 4))]
+        [(0, 1, 0), (1, 0, 1)]
+    """
     views, frames = _matrix_size(matrix)
     return [MatrixClip(matrix, tuple((start + i) % views for i in range(frames))) for start in range(views)]
 
@@ -81,7 +80,7 @@ def diagonal_clips(matrix: ImageMatrix) -> list[MatrixClip]:
 def video_features(
     sequences: Sequence[Sequence[Images]], extractor: VideoExtractor, progress: Progress | None = None
 ) -> Features:
-    """The features of every clip; one clip is in memory at a time.
+    """Compute the features of every clip; one clip is in memory at a time.
 
     Args:
         sequences: the clips of each sequence; every clip has T images [3, H, W] in [0, 1].
@@ -89,7 +88,13 @@ def video_features(
         progress: called after every clip.
 
     Raises:
-        ValueError: clips of differing or too small T, or what `require_image` refuses.
+        ValueError: clips of differing or too small T, or an image that `require_image` refuses.
+
+    Example:
+        >>> from rewild4d.metrics.samples import MeanColor
+        >>> found = video_features([[torch.zeros(5, 3, 4, 4)], [torch.ones(5, 3, 4, 4)]], MeanColor())
+        >>> found.values[:, 0].tolist(), found.frames
+        ([0.0, 1.0], 5)
     """
     if reason := unfit(sequences, sequences, extractor):
         raise ValueError(reason)
@@ -109,7 +114,7 @@ def video_features(
 
 
 def unfit(prediction: Sequence[Sequence[Images]], truth: Sequence[Sequence[Images]], extractor: VideoExtractor) -> str:
-    """Why a network cannot compare two sets of clips, or "": FVD changes wildly with T, so only equal T compare."""
+    """Return why a network cannot compare two sets of clips, or "": only clips of equal length compare."""
     lengths = sorted({len(clip) for side in (prediction, truth) for clips in side for clip in clips})
     if len(lengths) > 1:
         found = ", ".join(map(str, lengths))
@@ -130,17 +135,23 @@ def clip_distances(
     progress: Progress | None = None,
     seed: int = 0,
 ) -> list[Distance]:
-    """FVD and KVD of two sets of clips, and where they are paired KVD-u and I3D-dist; the network runs once a clip.
+    """Compute FVD and KVD of two sets of clips, and where they are paired KVD-u and I3D-dist.
 
     Args:
         prediction: the clips of each sequence, all of one length T.
         truth: the same; with ``paired``, clip by clip the truth of the prediction.
-        extractor: [B, T, 3, H, W] in [0, 1] -> [B, D].
-        paired: whether the clips belong together (same cameras, same moments).
-        suffix: "-F", "-Diag": behind FVD and KVD.
+        extractor: [B, T, 3, H, W] in [0, 1] -> [B, D]; it runs once a clip.
+        paired: whether the clips belong together (same cameras, same times).
+        suffix: added to FVD and KVD ("-F", "-Diag").
         conditions: background, crop and fps that both sets share.
         progress: called after every clip.
         seed: of the bootstrap over sequences.
+
+    Example:
+        >>> from rewild4d.metrics.samples import MeanColor
+        >>> black, white = torch.zeros(9, 3, 4, 4), torch.ones(9, 3, 4, 4)
+        >>> [one.value for one in clip_distances([[black, black]], [[white, white]], MeanColor(), paired=False)]
+        [3.0, 7.0]
     """
     names = [f"FVD{suffix}", f"KVD{suffix}", *([f"KVD{suffix}-u", I3D_DIST] if paired else [])]
     if reason := unfit(prediction, truth, extractor):
@@ -161,7 +172,7 @@ def feature_distances(
     conditions: Conditions = Conditions(),
     seed: int = 0,
 ) -> list[Distance]:
-    """What `clip_distances` gives, from features that are there already.
+    """Compute what `clip_distances` does from features.
 
     Args:
         prediction: of the clips, [n, D].
@@ -182,9 +193,15 @@ def feature_distances(
 def fvd_f(
     prediction: Sequence[ImageMatrix], truth: Sequence[ImageMatrix], extractor: VideoExtractor, **settings: Any
 ) -> list[Distance]:
-    """FVD-F and its companions over every view of every image matrix, one matrix a sequence.
+    """Compute FVD-F and its companions over every view of every image matrix, one matrix a sequence.
 
-    Settings are the keywords of `clip_distances`, but for the suffix.
+    Settings are the keywords of `clip_distances` except the suffix.
+
+    Example:
+        >>> from rewild4d.metrics.samples import MeanColor
+        >>> found = fvd_f([torch.zeros(2, 9, 3, 4, 4)], [torch.ones(2, 9, 3, 4, 4)], MeanColor(), paired=False)
+        >>> [(one.name, one.value) for one in found]
+        [('FVD-F [mean-color]', 3.0), ('KVD-F [mean-color]', 7.0)]
     """
     predicted, true = ([frame_clips(matrix) for matrix in side] for side in (prediction, truth))
     return clip_distances(predicted, true, extractor, suffix="-F", **settings)
@@ -193,16 +210,16 @@ def fvd_f(
 def fvd_diag(
     prediction: Sequence[ImageMatrix], truth: Sequence[ImageMatrix], extractor: VideoExtractor, **settings: Any
 ) -> list[Distance]:
-    """FVD-Diag and its companions over every diagonal; the views must be a closed, uniform orbit.
+    """Compute FVD-Diag and its companions over every diagonal; the views must be a closed, uniform orbit.
 
-    Settings are the keywords of `clip_distances`, but for the suffix.
+    Settings are the keywords of `clip_distances` except the suffix.
     """
     predicted, true = ([diagonal_clips(matrix) for matrix in side] for side in (prediction, truth))
     return clip_distances(predicted, true, extractor, suffix="-Diag", **settings)
 
 
 def i3d_dist(prediction: Features, truth: Features, *, conditions: Conditions = Conditions()) -> Distance:
-    """What Consistent4D's script (Jiang et al. 2024) prints as "FVD": one clip a set, clip by clip, then the mean.
+    """Compute what Consistent4D's script (Jiang et al. 2024) prints as "FVD": one clip a set, then the mean.
 
     |f - g|^2 + (s_f - s_g)^2 for the features f, g of one pair of clips, s the standard deviation over the features
     themselves (N-1). It is no Fréchet distance of distributions and is not comparable with FVD.
@@ -211,6 +228,12 @@ def i3d_dist(prediction: Features, truth: Features, *, conditions: Conditions = 
         prediction: features of the clips, [n, D].
         truth: row i belongs to row i of the prediction, [n, D].
         conditions: background, crop and fps that both sets share.
+
+    Example:
+        >>> groups = torch.zeros(1, dtype=torch.int64)
+        >>> x, y = (Features(torch.full((1, 2), a).double(), groups, "i3d-k400", "", "", 9) for a in (0.0, 1.0))
+        >>> i3d_dist(x, y).value
+        2.0
     """
     x, y, value = prediction.values, truth.values, None
     if len(x) != len(y):
@@ -229,7 +252,7 @@ def i3d_dist(prediction: Features, truth: Features, *, conditions: Conditions = 
 
 
 def _nothing(sequences: Sequence[Sequence[Images]], extractor: VideoExtractor) -> Features:
-    """As many rows as there are clips, and no feature in them: for a result without a value."""
+    """Return as many empty rows as there are clips, for a result without a value."""
     groups = torch.tensor([group for group, clips in enumerate(sequences) for _ in clips], dtype=torch.int64)
     lengths = {len(clip) for clips in sequences for clip in clips}
     frames = lengths.pop() if len(lengths) == 1 else None
@@ -238,16 +261,12 @@ def _nothing(sequences: Sequence[Sequence[Images]], extractor: VideoExtractor) -
 
 
 def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """The progress of a part as progress of the whole."""
+    """Return the progress of a part as progress of the whole."""
     return None if progress is None else lambda done, _: progress(before + done, total)
 
 
 def _matrix_size(matrix: ImageMatrix) -> tuple[int, int]:
-    """Views and frames.
-
-    Raises:
-        ValueError: no view, or views of differing numbers of frames.
-    """
+    """Count views and frames; ValueError without views, or with views of differing numbers of frames."""
     frames = {len(matrix[view]) for view in range(len(matrix))}
     if len(frames) != 1:
         raise ValueError(f"expected an image matrix with as many frames in every view, got {sorted(frames)}")

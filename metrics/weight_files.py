@@ -1,4 +1,4 @@
-"""Networks from files that a person has, recognised by their SHA-256, converted once and kept; and what is there."""
+"""Recognise a user's weight files by their SHA-256, convert them once, and list what is there."""
 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator
@@ -6,16 +6,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from rewild4d.errors import UserError
-from rewild4d.metrics.weights import Copy, Pinned, by_name, keep, make, network, places, read_pinned, table
+from rewild4d.metrics.weights import Copy, Pinned, by_name, keep, make, network, read_pinned, search_folders, table
 
 LISTED = "`rewild4d-bench weights --help` lists"
 
 
 @dataclass(frozen=True)
 class Found:
-    """A file that belongs to a network, in one of the folders that are searched.
+    """A file of a network in one of the searched folders.
 
-    `ready` tells a network as it is kept from a published file that can be converted; `fault` is why it is refused.
+    Attributes:
+        network: name of the network.
+        path: of the file.
+        ready: whether it is the kept network itself, and not a published file to convert.
+        fault: why it is refused.
     """
 
     network: str
@@ -26,14 +30,14 @@ class Found:
 
 @dataclass
 class Recognised:
-    """What a person's files are: networks as they are kept, and copies of published files."""
+    """A user's files: kept networks, and copies of published files."""
 
     networks: dict[str, Path] = field(default_factory=dict)
     files: dict[str, Copy] = field(default_factory=dict)
 
 
 def inspect(names: Iterable[str] | None = None) -> list[Found]:
-    """Every file of the networks in the searched folders, read and hashed, in the order in which it would be taken.
+    """List every file of the networks in the searched folders, read and hashed, in the order of preference.
 
     Args:
         names: of networks; all where None.
@@ -41,7 +45,7 @@ def inspect(names: Iterable[str] | None = None) -> list[Found]:
     found = []
     for name in names if names is not None else table().networks:
         known = network(name)
-        for folder in places():
+        for folder in search_folders():
             kept = folder / f"{name}.safetensors"
             if kept.is_file():
                 found.append(Found(name, kept, True, _fault(kept, known, name)))
@@ -63,16 +67,16 @@ def import_weights(paths: Iterable[Path], say: Callable[[str], None], names: Ite
     """Make every network that some files suffice for, and keep it.
 
     Args:
-        paths: files under any name, or folders that are searched with all that is in them.
-        say: told of each network before it is converted.
+        paths: files under any name, or folders that are searched recursively.
+        say: called with a line before each conversion.
         names: of the networks to make; all where None.
 
     Returns:
         The files that were written.
 
     Raises:
-        UserError: no such path, a file is not what its name says, none is known, or none suffices; nothing is written
-            then.
+        UserError: no such path, a file has other bytes than its name implies, none is known, or none suffices; nothing
+            is written then.
     """
     given = list(paths)
     recognised = _recognise(given)
@@ -101,7 +105,7 @@ def _recognise(paths: list[Path]) -> Recognised:
 
 
 def _candidates(folder: Path) -> Iterator[Path]:
-    """Files whose size or name is that of a known one; only these are hashed."""
+    """List files whose size or name is that of a known one; only these are hashed."""
     sizes = {known.bytes for known in _all_known().values()}
     for path in folder.rglob("*"):
         if path.is_file() and (path.name in _all_known() or path.stat().st_size in sizes):
@@ -109,7 +113,7 @@ def _candidates(folder: Path) -> Iterator[Path]:
 
 
 def _all_known() -> dict[str, Pinned]:
-    """Everything that is accepted, by each name that it goes by."""
+    """Return every accepted file by each of its names."""
     known: dict[str, Pinned] = {f"{name}.safetensors": network for name, network in table().networks.items()}
     known |= table().archives
     for name, file in table().files.items():
@@ -118,11 +122,7 @@ def _all_known() -> dict[str, Pinned]:
 
 
 def _recognise_file(path: Path, result: Recognised) -> None:
-    """Put a file where it belongs; an unknown one is passed over.
-
-    Raises:
-        UserError: it has the name of a known file and other bytes, or cannot be read.
-    """
+    """Register a file; unknown ones are skipped, one with a known name and other bytes raises UserError."""
     try:
         with path.open("rb") as stream:
             sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
@@ -146,7 +146,7 @@ def _recognise_file(path: Path, result: Recognised) -> None:
 
 
 def _nothing_made(paths: list[Path], recognised: Recognised) -> str:
-    """Why no network could be made, in one sentence."""
+    """Say in one sentence why no network could be made."""
     given = ", ".join(map(str, paths))
     for file in recognised.files:
         for known in table().networks.values():

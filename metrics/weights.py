@@ -1,13 +1,13 @@
-"""The weights of the metric networks: where they lie, that every byte is right, and how they get there.
+"""Find, check and convert the weights of the metric networks.
 
-A network is kept as one safetensors file, `<name>.safetensors`, whose SHA-256 stands in `weights.toml`. The file is
-read once, hashed, and only then parsed, at every load; torch.hub looks at eight digits, once, when it loads. Networks:
+A network is kept as one safetensors file, `<name>.safetensors`, whose SHA-256 stands in `weights.toml`; it is hashed
+before it is parsed, at every load. Networks:
 
     lpips-alex, lpips-vgg    LPIPS v0.1, trunk and heads
     inception-fid            the Inception-v3 of December 2015, without its classifier
     i3d-k400                 I3D trained on Kinetics-400, TF-hub's i3d-kinetics-400/1
 
-Nothing downloads by itself. A network that lies nowhere is `WeightsMissing`, with the command that fetches it.
+Nothing is downloaded unasked. A network that is found nowhere raises `WeightsMissing`, which names the command to run.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ FETCH = "rewild4d-bench weights fetch"
 
 
 class WeightsMissing(UserError):
-    """A network's weights lie nowhere; the text tells the command that fetches them."""
+    """A network's weights were found nowhere; the text names the command that fetches them."""
 
     def __init__(self) -> None:
         super().__init__(f"weights missing, run: {FETCH}")
@@ -53,7 +53,7 @@ class Pinned(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Network(Pinned, frozen=True, kw_only=True):
-    """A network as this package keeps it; `made_from` lists the sets of published files that each suffice."""
+    """A kept network; each of the lists in `made_from` names published files that suffice to make it."""
 
     used_by: str
     licence: str
@@ -61,14 +61,14 @@ class Network(Pinned, frozen=True, kw_only=True):
 
 
 class Archive(Pinned, frozen=True, kw_only=True):
-    """A package on PyPI that carries published files: name of the file -> path in the archive."""
+    """A package on PyPI with published files: name of the file -> path in the archive."""
 
     requirement: str
     members: dict[str, str]
 
 
 class PublishedFile(Pinned, frozen=True, kw_only=True):
-    """A published file, how it is read, and other names that it goes by."""
+    """A published file, its form and layout (`carriers`), and other names of it."""
 
     form: str
     layout: str
@@ -76,7 +76,7 @@ class PublishedFile(Pinned, frozen=True, kw_only=True):
 
 
 class Table(msgspec.Struct, frozen=True):
-    """What `weights.toml` says."""
+    """Contents of `weights.toml`."""
 
     networks: dict[str, Network]
     archives: dict[str, Archive]
@@ -85,7 +85,7 @@ class Table(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class LoadedWeights:
-    """A network's tensors by name, float32, and the SHA-256 of the file they came from."""
+    """A network's tensors by name, float32, and the SHA-256 of their file."""
 
     tensors: dict[str, Tensor]
     digest: str
@@ -93,7 +93,7 @@ class LoadedWeights:
 
 @dataclass(frozen=True)
 class Copy:
-    """Where the bytes of a published file lie: a file, or a member of an archive."""
+    """Location of a published file's bytes: a file, or a member of an archive."""
 
     path: Path
     member: str | None = None
@@ -101,30 +101,26 @@ class Copy:
 
 @cache
 def table() -> Table:
-    """The known networks, archives and files."""
+    """Read the known networks, archives and files."""
     text = (resources.files("rewild4d.metrics") / "weights.toml").read_text(encoding="utf-8")
     return msgspec.convert(tomllib.loads(text), Table)
 
 
 def network(name: str) -> Network:
-    """What is known of a network.
-
-    Raises:
-        UserError: there is none of that name.
-    """
+    """Return a network's entry; UserError where there is none of that name."""
     if name not in table().networks:
         raise unknown_name("network", name, table().networks)
     return table().networks[name]
 
 
 def home() -> Path:
-    """Where `fetch` and `import` put networks: $REWILD4D_WEIGHTS, or `weights` in the toolkit's cache."""
+    """Return the folder of fetched and imported networks: $REWILD4D_WEIGHTS, or `weights` in the toolkit's cache."""
     chosen = os.environ.get("REWILD4D_WEIGHTS")
     return Path(chosen).expanduser() if chosen else cache_folder() / "weights"
 
 
-def places() -> list[Path]:
-    """Folders that are searched, in order: $REWILD4D_WEIGHTS, the toolkit's cache, torch.hub's checkpoints."""
+def search_folders() -> list[Path]:
+    """Return the folders to search, in order: $REWILD4D_WEIGHTS, the toolkit's cache, torch.hub's checkpoints."""
     import torch.hub
 
     folders = (home(), cache_folder() / "weights", Path(torch.hub.get_dir()) / "checkpoints")
@@ -134,22 +130,22 @@ def places() -> list[Path]:
 def load_weights(name: str, path: Path | None = None) -> LoadedWeights:
     """Find a network, check it byte for byte, and read it.
 
-    Published files in a searched folder are converted, and the result is kept where that is possible.
+    Published files in a searched folder are converted, and the result is kept where possible.
 
     Args:
         name: "lpips-alex", "lpips-vgg", "inception-fid" or "i3d-k400".
-        path: a safetensors file, or a folder to search instead of `places`.
+        path: a safetensors file, or a folder to search instead of `search_folders`.
 
     Raises:
-        WeightsMissing: it lies nowhere.
-        UserError: unknown name, no such path, or a file is not what it should be; nothing is loaded then.
+        WeightsMissing: it is found nowhere.
+        UserError: unknown name, no such path, or a file with other bytes; nothing is loaded then.
     """
     known = network(name)
     if path is not None and not path.exists():
         raise UserError(f"{path}: expected the weights of '{name}', found no such file or folder.")
     if path is not None and path.is_file():
         return _parse(read_pinned(path, known, name), known)
-    for folder in [path] if path is not None else places():
+    for folder in [path] if path is not None else search_folders():
         file = folder / f"{name}.safetensors"
         if file.is_file():
             return _parse(read_pinned(file, known, name), known)
@@ -163,12 +159,8 @@ def load_weights(name: str, path: Path | None = None) -> LoadedWeights:
 
 
 def is_here(name: str) -> bool:
-    """Whether `load_weights` would find a network or the files that it is made from; nothing is read.
-
-    Raises:
-        UserError: unknown name.
-    """
-    return any((place / f"{name}.safetensors").is_file() or published_copies(place, name) for place in places())
+    """Return whether `load_weights` would find a network or its published files, without reading them."""
+    return any((at / f"{name}.safetensors").is_file() or published_copies(at, name) for at in search_folders())
 
 
 def _parse(data: bytes, known: Network) -> LoadedWeights:
@@ -178,11 +170,7 @@ def _parse(data: bytes, known: Network) -> LoadedWeights:
 
 
 def read_pinned(path: Path, known: Pinned, what: str) -> bytes:
-    """A file's bytes, once they are known to be right.
-
-    Raises:
-        UserError: they are not, or cannot be read.
-    """
+    """Read a file; UserError unless its bytes are the known ones."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -202,7 +190,7 @@ def _check_pinned(data: bytes, known: Pinned, what: str, path: Path) -> None:
 
 
 def published_copies(folder: Path, name: str) -> dict[str, Copy]:
-    """Copies in a folder, by their usual names, of one set of files that a network can be made from."""
+    """Find, by their usual names, one set of files in a folder that a network can be made from."""
     for wanted in network(name).made_from:
         copies = {file: Copy(path) for file in wanted for path in by_name(folder, file)}
         if len(copies) == len(wanted):
@@ -211,22 +199,14 @@ def published_copies(folder: Path, name: str) -> dict[str, Copy]:
 
 
 def by_name(folder: Path, file: str) -> Iterator[Path]:
-    """Where a published file lies in a folder under one of its names."""
+    """Find a published file in a folder under any of its names."""
     for name in (file, *table().files[file].also):
         if (folder / name).is_file():
             yield folder / name
 
 
 def make(name: str, copies: dict[str, Copy]) -> bytes:
-    """A network as the bytes of its safetensors file, from published files.
-
-    Args:
-        name: of the network.
-        copies: where each of the files of one of its sets lies.
-
-    Raises:
-        UserError: a file's bytes are not the published ones, or their tensors not the network's.
-    """
+    """Make a network's safetensors file from published files; UserError unless all bytes are the known ones."""
     import safetensors.torch
 
     from rewild4d.metrics.carriers import convert
@@ -261,11 +241,7 @@ def _bytes_of(copy: Copy, file: str) -> bytes:
 
 
 def keep(name: str, data: bytes) -> Path:
-    """Write a network where `load_weights` looks for it, atomically.
-
-    Raises:
-        UserError: the folder cannot be written, or the disk is full.
-    """
+    """Write a network where `load_weights` finds it, atomically."""
     path = home() / f"{name}.safetensors"
     with atomic(path) as temporary:
         temporary.write_bytes(data)

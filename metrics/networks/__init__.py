@@ -1,1 +1,1 @@
-"""The networks that metrics read images and videos with, in plain torch, as functions of their weights."""
+"""Networks of the metrics in plain torch, as functions of their weights."""

@@ -1,6 +1,6 @@
 """I3D trained on Kinetics-400 (Carreira & Zisserman 2017), which FVD is defined on (Unterthiner et al. 2019).
 
-TensorFlow's "same" padding, which puts the odd pixel behind; a head that averages over 2 moments and 7x7 places.
+Padding is TensorFlow's "same", with the odd pixel at the end; the head averages over 2 times and 7x7 positions.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from rewild4d.metrics.networks.layers import NORMALISATION_EPSILON
 SIZE = 224
 """Side of the square input in pixels."""
 MINIMUM_FRAMES = 9
-"""Fewer leave the head's window of two without a second moment: 9 -> 5 -> 3 -> 2."""
+"""With fewer, the head's window of two has one time only: 9 -> 5 -> 3 -> 2."""
 CLASSES = 400
 BLOCKS = (("3b", "3c"), ("4b", "4c", "4d", "4e", "4f"), ("5b", "5c"))
 POOLS = (((1, 3, 3), (1, 2, 2)), ((3, 3, 3), (2, 2, 2)), ((2, 2, 2), (2, 2, 2)))
@@ -22,25 +22,21 @@ POOLS = (((1, 3, 3), (1, 2, 2)), ((3, 3, 3), (2, 2, 2)), ((2, 2, 2), (2, 2, 2)))
 
 
 class I3d:
-    """The forward pass."""
+    """Forward pass of I3D.
+
+    Args:
+        tensors: `<unit>.weight` [out, in, t, h, w] and `.mean`, `.variance`, `.beta` [out]; of the last, "Logits",
+            `.weight` and `.bias`.
+    """
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
-        """Keep the weights.
-
-        Args:
-            tensors: `<unit>.weight` [out, in, t, h, w] and `.mean`, `.variance`, `.beta` [out]; of the last, "Logits",
-                `.weight` and `.bias`.
-        """
         self.tensors = _fold_normalisation(tensors)
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Logits of the classes, averaged over time.
+        """.
 
-        Args:
-            x: in [-1, 1], [B, 3, T, 224, 224], T at least 9.
-
-        Returns:
-            Float32, [B, 400].
+        Ompute logits averaged over time, [B, 3, T, 224, 224] in [-1, 1] with T of at least 9 -> float32, [B,
+        400].
         """
         x = _pool(self._unit("Conv3d_1a_7x7", x, 2), (1, 3, 3), (1, 2, 2))
         x = self._unit("Conv3d_2c_3x3", self._unit("Conv3d_2b_1x1", x))
@@ -68,9 +64,9 @@ class I3d:
 
 
 def _fold_normalisation(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """One convolution with a bias for convolution, (y - mean) / sqrt(variance + 1e-3) and + beta.
+    """Replace convolution, (y - mean) / sqrt(variance + 1e-3) and + beta by one convolution with a bias.
 
-    Rounded once, from float64. A fifth of the time is saved, and the distances stay within 2e-6 of float64's.
+    Computed in float64 and rounded once. It saves a fifth of the time; distances stay within 2e-6 of float64's.
     """
     folded = {name: tensors[name] for name in ("Logits.weight", "Logits.bias")}
     for name in tensors:
@@ -83,21 +79,21 @@ def _fold_normalisation(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _pool(x: Tensor, window: tuple[int, ...], stride: tuple[int, ...]) -> Tensor:
-    """Maximum, one axis after the other; zeros may pad because everything pooled here is behind a ReLU.
+    """Pool by maximum along one axis after the other; zeros may pad because every input is behind a ReLU.
 
-    `max_pool3d` gives the same bits, and on a CPU takes 6 to 90 times as long: a quarter of the whole network.
+    `max_pool3d` returns the same bits, and on a CPU takes 6 to 90 times as long: a quarter of the whole network.
     """
     x = _pad(x, window, stride)
     for axis, (length, step) in enumerate(zip(window, stride, strict=True), 2):
         windows = x.unfold(axis, length, step)
         x = windows.select(-1, 0)
-        for place in range(1, length):
-            x = torch.maximum(x, windows.select(-1, place))
+        for i in range(1, length):
+            x = torch.maximum(x, windows.select(-1, i))
     return x
 
 
 def _pad(x: Tensor, window: tuple[int, ...], stride: tuple[int, ...]) -> Tensor:
-    """TensorFlow's "same": the output has ceil(size / stride) places, and the odd zero goes behind."""
+    """Pad as TensorFlow's "same": the output has ceil(size / stride) positions, the odd zero is at the end."""
     padding: list[int] = []
     for size, length, step in zip(reversed(x.shape[2:]), reversed(window), reversed(stride), strict=True):
         total = max((-(-size // step) - 1) * step + length - size, 0)

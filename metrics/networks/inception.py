@@ -1,7 +1,7 @@
 """The Inception-v3 of December 2015 that FID and KID are defined on (Szegedy et al. 2015; Heusel et al. 2017).
 
-It is not the one of model zoos: average pools leave the padding out, the last block pools by maximum, and its weights
-are another training's. Names are those of the usual PyTorch conversions.
+It differs from that of model zoos: average pools leave out the padding, the last block pools by maximum, and its
+weights are from another training. Names are those of the usual PyTorch conversions.
 """
 
 from collections.abc import Mapping
@@ -15,31 +15,27 @@ from rewild4d.metrics.networks.layers import normalise
 SIZE = 299
 """Side of the square input in pixels."""
 TAPS = (64, 192, 768, 2048)
-"""Where features can be taken; each number is their dimension. 2048 is "pool3"."""
+"""Layers whose features can be returned, by their dimension; 2048 is "pool3"."""
 STEM = (("Conv2d_1a_3x3", 2, 0), ("Conv2d_2a_3x3", 1, 0), ("Conv2d_2b_3x3", 1, 1))
 """First convolutions: name, stride, padding."""
 
 
 class Inception:
-    """The forward pass."""
+    """Forward pass of Inception-v3.
+
+    Args:
+        tensors: `<unit>.weight` [out, in, h, w]; `<unit>.mean`, `.variance`, `.beta` [out].
+    """
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
-        """Keep the weights.
-
-        Args:
-            tensors: `<unit>.weight` [out, in, h, w]; `<unit>.mean`, `.variance`, `.beta` [out].
-        """
         self.tensors = tensors
 
     def __call__(self, x: Tensor, tap: int = 2048) -> Tensor:
-        """Features averaged over the pixels of the tap's layer; what lies behind it is not computed.
+        """Average features over the pixels of the tap's layer; later layers are not computed.
 
         Args:
             x: (pixel - 128) / 128 of pixels in 0..255, [B, 3, 299, 299].
             tap: one of `TAPS`.
-
-        Returns:
-            Float32, [B, tap].
         """
         for name, stride, padding in STEM:
             x = self._unit(name, x, stride, padding)
@@ -67,7 +63,7 @@ class Inception:
         return normalise(self.tensors, name, x)
 
     def _chain(self, name: str, x: Tensor, *units: str) -> Tensor:
-        """Units one behind the other, each padded so that it keeps the size."""
+        """Apply units in order, each padded so that it keeps the size."""
         for unit in units:
             height, width = self.tensors[f"{name}.{unit}.weight"].shape[2:]
             x = self._unit(f"{name}.{unit}", x, 1, (height // 2, width // 2))
@@ -125,5 +121,5 @@ class Inception:
 
 
 def _average(x: Tensor) -> Tensor:
-    """3x3 mean of the pixels that exist."""
+    """Average 3x3 pixels, without the padding."""
     return F.avg_pool2d(x, 3, 1, 1, count_include_pad=False)

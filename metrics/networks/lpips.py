@@ -1,8 +1,7 @@
 """LPIPS v0.1 (Zhang et al. 2018): a weighted distance between the features of a classifier.
 
 d = sum over five stages of the mean over pixels of w . (f - g)^2, where f and g are the stage's features of the two
-images after ReLU, each pixel's divided by its length over the channels, and w are the stage's learned, non-negative
-weights.
+images after ReLU, divided by their length over the channels, and w are the stage's learned, non-negative weights.
 """
 
 from collections.abc import Mapping
@@ -24,16 +23,11 @@ MINIMUM_SIZE: dict[Net, int] = {"alex": 31, "vgg": 16}
 
 
 def lpips(net: Net, tensors: Mapping[str, Tensor], first: Tensor, second: Tensor) -> Tensor:
-    """Distance of each pair at its own resolution; no resizing.
+    """Compute the distance of each pair of images in [0, 1] at their own resolution, [B, 3, H, W] -> float64, [B].
 
     Args:
         net: the trunk; "alex" and "vgg" are two metrics, not two settings of one.
         tensors: `trunk.<i>.weight` [out, in, k, k] and `.bias` [out] of convolution i; `head.<stage>` [channels].
-        first: in [0, 1], [B, 3, H, W].
-        second: in [0, 1], [B, 3, H, W].
-
-    Returns:
-        Computed in float32, returned as float64, [B].
     """
     images = torch.cat((first, second)) * 2 - 1
     shift, scale = (images.new_tensor(x).reshape(1, 3, 1, 1) for x in (SHIFT, SCALE))

@@ -1,4 +1,4 @@
-"""How images and clips reach the size that a network reads. The choice moves FID and KID, so a score names it."""
+"""Resize images and clips to a network's input. The method changes FID and KID, so a score names it."""
 
 import math
 
@@ -11,19 +11,11 @@ VIDEO_RESIZES = ("short-side-crop", "square")
 
 
 def resize_images(images: Tensor, size: int, how: str) -> Tensor:
-    """Stretch images to a square; those that have the size stay as they are.
+    """Stretch images [B, C, H, W] of any range to a square of a size in pixels; bicubic may leave their range.
 
     "clean" is the antialiased bicubic of clean-fid (Parmar et al. 2022), which is Pillow's on floats; "tf1" is the
     bilinear of TensorFlow 1, without half-pixel centres and antialiasing, of the first FID and torch-fidelity;
     "bilinear-antialias" is that of torchmetrics 1.9.
-
-    Args:
-        images: floats of any range, [B, C, H, W].
-        size: in pixels.
-        how: one of `IMAGE_RESIZES`.
-
-    Returns:
-        Bicubic may overshoot the input's range, [B, C, size, size].
     """
     if images.shape[2:] == (size, size):
         return images
@@ -34,7 +26,7 @@ def resize_images(images: Tensor, size: int, how: str) -> Tensor:
 
 
 def _bilinear_tf1(images: Tensor, size: int) -> Tensor:
-    """Along the last axis: output i reads position i * length / size."""
+    """Interpolate along the last axis: output i reads position i * length / size."""
     length = images.shape[-1]
     position = torch.arange(size, dtype=images.dtype, device=images.device) * (length / size)
     low = position.long().clamp_max(length - 1)
@@ -43,17 +35,9 @@ def _bilinear_tf1(images: Tensor, size: int) -> Tensor:
 
 
 def resize_clip(frames: Tensor, size: int, how: str) -> Tensor:
-    """Bring a clip's frames to a square, bilinear without antialiasing, half-pixel centres.
+    """Resize frames [T, C, H, W] to a square of a size in pixels, bilinear without antialiasing, half-pixel centres.
 
     "short-side-crop" scales the shorter side to the size and crops the centre (StyleGAN-V); "square" stretches (TATS).
-
-    Args:
-        frames: [T, C, H, W].
-        size: in pixels.
-        how: one of `VIDEO_RESIZES`.
-
-    Returns:
-        [T, C, size, size].
     """
     height, width = frames.shape[2:]
     if how == "square":

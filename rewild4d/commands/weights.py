@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.metrics.weight_files import Found, import_weights, inspect
-from rewild4d.metrics.weights import FETCH, Archive, home, network, places, table
+from rewild4d.metrics.weights import FETCH, Archive, home, network, search_folders, table
 
 USAGE = """usage: rewild4d-bench weights list                 what each network is for, where it lies, is it right
        rewild4d-bench weights fetch [NAME ...]     download what is missing (200 MB in all), check and convert it
@@ -48,7 +48,7 @@ def main(arguments: list[str]) -> int:
 def usage() -> str:
     """What `--help` prints, with the folders of this machine."""
     files = "\n  ".join((*table().archives, *table().files, "<network>.safetensors"))
-    searched = ", ".join(map(str, places()))
+    searched = ", ".join(map(str, search_folders()))
     return USAGE.format(names=", ".join(table().networks), files=files, home=home(), places=searched)
 
 

@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 from typing import Literal
 
+import msgspec
 import torch
 
 from rewild4d.errors import UserError
@@ -12,7 +13,6 @@ from rewild4d.evaluation.reports import SCHEMA, Report
 from rewild4d.io.ply import is_mesh, read_surface
 from rewild4d.machine import code_version, machine
 from rewild4d.metrics.geometry import POINTS, compare
-from rewild4d.metrics.score import Score
 
 UP = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -54,12 +54,7 @@ def score_clouds(
         kind="geometry",
         inputs={"prediction": str(prediction), "truth": str(truth)},
         settings={"up": up or "unknown", "points": str(points), "seed": str(seed), "diagonal": f"{found.diagonal:.6g}"},
-        scores={
-            name: Score(
-                item.value, item.unit, item.better, int(item.value is not None), list(item.per_frame), item.note
-            )
-            for name, item in found.scores.items()
-        },
+        scores={name: msgspec.structs.replace(item, floor=None) for name, item in found.scores.items()},
         distances=[],
         networks={},
         items=[str(prediction)],

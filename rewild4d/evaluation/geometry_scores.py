@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
+import msgspec
+
 from rewild4d.contracts import Reconstruction
 from rewild4d.io.sampling import sample_gaussians
-from rewild4d.metrics.geometry import Comparison, Fit, compare_sequence
-from rewild4d.metrics.names import ALIGNMENTS, DENSE
+from rewild4d.metrics.geometry import Comparison, compare_sequence
+from rewild4d.metrics.names import ALIGNMENTS, DENSE, Fit, geometry_unit
 from rewild4d.metrics.score import Score
 from rewild4d.types import Truth
 
@@ -30,7 +32,7 @@ def score_geometry(
         return {}, []
     if truth.sample is None:
         reason = "not computed: the data set has no geometry"
-        return {name: Score(None, *_kind(name), 0, [], reason) for name in names}, []
+        return {name: Score(None, *geometry_unit(name), 0, [], reason) for name in names}, []
     scores: dict[str, Score] = {}
     alignments: list[dict[str, Any]] = []
     for dense, count in DENSE.items():
@@ -59,25 +61,16 @@ def _parts(name: str) -> tuple[str, str]:
     return next((suffix for suffix in ALIGNMENTS.values() if suffix and short.endswith(suffix)), ""), dense
 
 
-def _kind(name: str) -> tuple[str, str]:
-    """Unit, and which way is better."""
-    if name.startswith("fscore"):
-        return "1", "higher"
-    return ("1" if name.startswith("chamfer_relative") else "world"), "lower"
-
-
 def _score(found: Comparison, name: str) -> Score:
-    item = found.scores[name.removesuffix(_parts(name)[1])]
-    parts = [part for part in (item.note, found.note if item.value is not None else "") if part]
-    present = sum(value is not None for value in item.per_frame)
-    return Score(item.value, item.unit, item.better, present, list(item.per_frame), "; ".join(parts), item.floor)
+    score = found.scores[name.removesuffix(_parts(name)[1])]
+    return score if score.value is None else msgspec.structs.replace(score, note=found.note)
 
 
 def _describe(found: Comparison, fit: Fit, points: int) -> list[dict[str, Any]]:
     return [
         {
-            "fit": fit, "points": points, "moment": index if fit == "frame" else None, "scale": one.transform.scale,
-            "matrix": one.transform.matrix.tolist(), "start": one.start, "iterations": one.iterations,
+            "fit": fit, "points": points, "moment": index if fit == "frame" else None, "scale": one.scale,
+            "matrix": one.matrix.tolist(), "start": one.start, "iterations": one.iterations,
             "converged": one.converged, "clamped": one.clamped,
         }
         for index, one in enumerate(found.alignments) if one is not None

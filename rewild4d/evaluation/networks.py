@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from rewild4d.metrics import names
-from rewild4d.metrics.samples import ImageExtractor
+from rewild4d.metrics.samples import ImageExtractor, VideoExtractor
 from rewild4d.metrics.score import Score
-from rewild4d.metrics.video import VideoExtractor
 from rewild4d.metrics.weights import WeightsMissing, is_here
 
 FAMILIES = ("psnr", "ssim", "lpips-alex", "lpips-vgg", "silhouette", "kid", "fvd")

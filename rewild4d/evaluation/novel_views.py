@@ -18,13 +18,13 @@ from rewild4d.cameras.orbit import first_across, orbit_cameras
 from rewild4d.contracts import Log, Reconstruction
 from rewild4d.errors import UserError
 from rewild4d.evaluation.protocol import NovelViews
+from rewild4d.metrics.caching import CachedNetwork, cached_features
 from rewild4d.metrics.distribution import VIEWS
 from rewild4d.metrics.names import KINDS
-from rewild4d.metrics.remembering import Remembering, kept
-from rewild4d.metrics.samples import Conditions, Distance, ImageExtractor, Images, image_features
+from rewild4d.metrics.samples import Conditions, Distance, ImageExtractor, Images, VideoExtractor, image_features
 from rewild4d.metrics.score import Score
 from rewild4d.metrics.sets import Compared, distances, suffix_of
-from rewild4d.metrics.video import VideoExtractor, clip_distances, diagonal_clips, frame_clips, unfit, video_features
+from rewild4d.metrics.video import clip_distances, diagonal_clips, frame_clips, unfit, video_features
 from rewild4d.types import Camera, Clip, Frame, Splats
 
 TITLES = {title: name for scores in KINDS.values() for name, title in scores.items()}
@@ -83,8 +83,8 @@ def novel_view_distances(
     if "kid_v" in names and images is not None:
         chosen = _spread(len(clip.frames), settings.frames)
         shown = _Lazy(len(chosen) * VIEWS, lambda i: orbit.image(i % VIEWS, chosen[i // VIEWS]))
-        truth = kept(images, reference, lambda network: image_features([reference], network))
-        sets.append(Compared("kid_v", image_features([shown], Remembering(images)), truth, conditions))
+        truth = cached_features(images, reference, lambda network: image_features([reference], network))
+        sets.append(Compared("kid_v", image_features([shown], CachedNetwork(images)), truth, conditions))
     windows = _windows(len(clip.frames), settings)
     truths = [[reference[i] for i in window] for window in windows]
     for kind, cut in (("fvd_f", frame_clips), ("fvd_diag", diagonal_clips)):
@@ -95,8 +95,8 @@ def novel_view_distances(
             suffix = suffix_of(kind)
             found += clip_distances([clips], [truths], videos, paired=False, suffix=suffix, conditions=conditions)
             continue
-        truth = kept(videos, reference, lambda network: video_features([truths], network), windows)
-        made = video_features([clips], Remembering(videos), progress)
+        truth = cached_features(videos, reference, lambda network: video_features([truths], network), windows)
+        made = video_features([clips], CachedNetwork(videos), progress)
         sets.append(Compared(kind, made, truth, conditions))
     found += [distance for compared in sets for distance in distances(compared)]
     return [distance for distance in found if TITLES.get(distance.name.split(" [")[0]) in names], sets

@@ -151,14 +151,14 @@ def test_per_frame_alignment_hides_drift_and_has_its_own_name() -> None:
     assert list(framewise.scores) == [name + "_framewise" for name in headline.scores]
     one, other = headline.scores["chamfer"], framewise.scores["chamfer_framewise"]
     assert other.value == pytest.approx(other.floor, rel=0.05) and one.value > 1.2 * other.value
-    assert one.value == math.fsum(one.per_frame) / 4
+    assert one.value == math.fsum(one.per_item) / 4
 
 
 def test_a_sequence_is_the_mean_of_its_moments() -> None:
     shift = torch.tensor((1.0, 0, 0), dtype=torch.float64)
     truths = [grid(6), grid(6) + 40 * shift]
     found = compare_sequence([truths[0], truths[1] + 0.2 * shift], truths, fit="none").scores["chamfer_unaligned"]
-    assert found.per_frame == pytest.approx((0.0, 0.2)) and found.value == pytest.approx((0 + 0.2) / 2)
+    assert found.per_item == pytest.approx((0.0, 0.2)) and found.value == pytest.approx((0 + 0.2) / 2)
 
 
 @pytest.mark.parametrize("cloud", [torch.zeros(1, 3), torch.arange(9.0)[:, None] * torch.ones(1, 3)])
@@ -184,7 +184,7 @@ def test_an_empty_prediction_recalls_nothing() -> None:
     assert found["fscore_5"].value == 0 and found["chamfer"].value is None
     assert found["chamfer"].note == "not computed: the prediction has no points"
     half = compare_sequence([torch.zeros(0, 3), animal(500, 1)], [animal(500, 0)] * 2, up=UP).scores
-    first, second = half["chamfer"].per_frame
+    first, second = half["chamfer"].per_item
     assert first is None and second > 0 and half["chamfer"].value is None, "the moment that is there is not the mean"
     assert half["chamfer"].note == "not computed: the prediction has no points at 1 of 2 moments"
     assert half["fscore_5"].value == pytest.approx((0 + 1) / 2)

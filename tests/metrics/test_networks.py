@@ -16,11 +16,12 @@ from PIL import Image
 from torch import Tensor
 
 from rewild4d.metrics import features
-from rewild4d.metrics.features import Extractor, Lpips, VideoExtractor, i3d, inception
+from rewild4d.metrics.features import Lpips, i3d, inception
 from rewild4d.metrics.networks import i3d as i3d_network
 from rewild4d.metrics.networks.inception import Inception
 from rewild4d.metrics.networks.layers import check_range, exact_float32, normalise
 from rewild4d.metrics.networks.resizing import resize_clip, resize_images
+from rewild4d.metrics.samples import ImageExtractor, VideoExtractor
 from rewild4d.metrics.weights import LoadedWeights, WeightsMissing, load_weights
 
 
@@ -308,7 +309,7 @@ class Brightness:
 
 
 def test_an_extractor_of_ones_own_fits() -> None:
-    image: Extractor = Brightness()
+    image: ImageExtractor = Brightness()
     video: VideoExtractor = Brightness()
     assert image(torch.full((2, 3, 4, 4), 0.25)).tolist() == [[0.25], [0.25]]
     assert video(torch.ones(1, 2, 3, 4, 4)).shape == (1, video.dimension)

@@ -20,8 +20,8 @@ from rewild4d.leaderboard.pooled import pooled_table, pooled_tables
 from rewild4d.leaderboard.records import RunRecord, write_record
 from rewild4d.leaderboard.tables import Entrant, Frame
 from rewild4d.metrics import names
+from rewild4d.metrics.caching import CachedNetwork, cached_features
 from rewild4d.metrics.distribution import frechet, kid, mmd2_unbiased
-from rewild4d.metrics.remembering import Remembering, kept
 from rewild4d.metrics.samples import Conditions, Features, image_features
 from rewild4d.metrics.score import Score
 from rewild4d.metrics.sets import FILE, Compared, distances, pool, read_features, write_features
@@ -244,7 +244,7 @@ class Counting:
 def test_the_same_input_is_computed_once() -> None:
     counting = Counting(LinearNetwork())
     images = torch.rand(3, 3, 8, 8, generator=torch.Generator().manual_seed(0))
-    network = Remembering(counting)
+    network = CachedNetwork(counting)
     assert torch.equal(network(images), counting.network(images)) and torch.equal(
         network(images), network(images.clone())
     )
@@ -263,7 +263,7 @@ def test_a_reference_is_computed_once_a_machine_and_kept_exactly(cache: Path) ->
     counting = Counting(LinearNetwork())
 
     def reference(shown: list[torch.Tensor], *choice: object) -> Features:
-        return kept(counting, shown, lambda network: image_features([shown], network), *choice)
+        return cached_features(counting, shown, lambda network: image_features([shown], network), *choice)
 
     first, again = reference(images), reference(images)
     assert counting.calls == 1 and torch.equal(first.values, again.values) and torch.equal(first.groups, again.groups)
