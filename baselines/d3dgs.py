@@ -55,12 +55,12 @@ class D3dgsModel(nn.Module):
         self.gaussians, self.network = gaussians, DeformationNetwork(config, generator)
 
     def still(self) -> Shape:
-        """The Gaussians as they are."""
+        """Return the Gaussians as they are."""
         own = self.gaussians
         return Shape(own.means, nn.functional.normalize(own.quats, dim=-1), own.scales(own.scales_log()))
 
     def moved(self, time: Tensor) -> Shape:
-        """The Gaussians at a time in [-1, 1]: offsets are added to activated values, as in the original."""
+        """Return the Gaussians at a time in [-1, 1]: offsets are added to activated values, as in the original."""
         own = self.gaussians
         move, turn, grow = self.network(own.means / REACH, time.to(own.means))
         quats = nn.functional.normalize(own.quats, dim=-1) + turn
@@ -108,17 +108,17 @@ class D3dgsReconstruction:
 
     @torch.no_grad()
     def at(self, time: float) -> Splats:
-        """The Gaussians at a time in seconds in the world; the network interpolates between frames."""
+        """Return the Gaussians at a time in seconds in the world; the network interpolates between frames."""
         position = self.root.position(time)
         shape = self.model.moved(torch.tensor((position + 1) / len(self.root.times)))
         return self.root.in_world(splats_of(self.model.gaussians, *shape), position)
 
     def camera(self, time: float) -> Camera | None:
-        """The input camera of the frame nearest to a time."""
+        """Return the input camera of the frame nearest to a time."""
         return self.root.camera(time)
 
     def diagnostics(self) -> dict[str, float]:
-        """How many Gaussians there are and how opaque."""
+        """Return how many Gaussians there are and how opaque."""
         own = self.model.gaussians
         return {"gaussians": float(len(own)), "opacity_mean": float(own.opacities().mean())}
 
@@ -145,7 +145,7 @@ class D3dgs:
         log: Log,
         workdir: Path | None,
     ) -> D3dgsReconstruction:
-        """Reconstruct from the clip; see contracts.Method."""
+        """Return the reconstruct from the clip; see contracts.Method."""
         config = for_clip(config, len(clip.frames))
         generator = torch.Generator().manual_seed(seed)
         frame, values = self._start(clip, prior, config, generator)
@@ -166,7 +166,7 @@ class D3dgs:
     def _start(
         self, clip: Clip, prior: Prior, config: D3dgsConfig, generator: torch.Generator
     ) -> tuple[Prior, dict[str, Tensor]]:
-        """The frame of reference (as a prior that stands still) and the first Gaussians."""
+        """Return the frame of reference (as a prior that stands still) and the first Gaussians."""
         scene = scene_frame(clip, prior)
         cameras = [scene.cameras[row] for row in match_times(clip, prior)]
         return (

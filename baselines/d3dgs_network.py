@@ -39,7 +39,7 @@ class DeformationNetwork(nn.Module):
         nn.init.zeros_(self.heads.weight)
 
     def forward(self, points: Tensor, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Changes at one time.
+        """Return changes at one time.
 
         Args:
             points: places scaled to about [-1, 1], no gradient flows to them, [n, 3].
@@ -56,7 +56,7 @@ class DeformationNetwork(nn.Module):
         return move, turn, grow
 
     def _hidden(self, place: Tensor, moment: Tensor) -> Tensor:
-        """Codes of place [n, .] and of the one moment [.] -> what the heads read, [n, width]."""
+        """Return codes of place [n, .] and of the one moment [.] -> what the heads read, [n, width]."""
         hidden = torch.relu(_together(self.first, place, moment))
         for index, layer in enumerate(self.layers):
             hidden = layer(hidden)
@@ -67,7 +67,7 @@ class DeformationNetwork(nn.Module):
 
 
 def _together(layer: nn.Linear, place: Tensor, moment: Tensor) -> Tensor:
-    """A layer on [place, moment] where the moment is the same for all rows: its share becomes a bias."""
+    """Return a layer on [place, moment] where the moment is the same for all rows: its share becomes a bias."""
     columns = place.shape[1]
     bias = linear(moment, layer.weight[:, columns:], layer.bias)
     return linear(place, layer.weight[:, :columns], bias)

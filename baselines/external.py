@@ -65,16 +65,16 @@ class ExternalReconstruction:
     notes: dict[str, Any]
 
     def at(self, time: float) -> Splats:
-        """The moment nearest to a time: nothing is known of what lies between."""
+        """Return the moment nearest to a time: nothing is known of what lies between."""
         return self.moments[min(range(len(self.times)), key=lambda i: abs(self.times[i] - time))]
 
     def camera(self, time: float) -> Camera | None:
-        """The input camera at a time, in the world; between frames it interpolates."""
+        """Return the input camera at a time, in the world; between frames it interpolates."""
         times = torch.tensor(tuple(self.cameras), dtype=torch.float64)
         return camera_between(tuple(self.cameras.values()), frame_position(times, time))
 
     def diagnostics(self) -> dict[str, Any]:
-        """How it was placed, and how many Gaussians there are."""
+        """Return how it was placed, and how many Gaussians there are."""
         return {**self.notes, "gaussians": sum(map(len, self.moments)) / len(self.moments)}
 
     def save(self, folder: Path) -> None:
@@ -143,7 +143,7 @@ class External:
 
 
 def _profile(config: ExternalConfig) -> Profile:
-    """The profile with the settings that override it."""
+    """Return the profile with the settings that override it."""
     if config.profile not in PROFILES:
         raise unknown_name("profile", config.profile, PROFILES)
     profile = PROFILES[config.profile]
@@ -178,7 +178,7 @@ def _run(work: Path, clip: Clip, prior: Prior, profile: Profile, config: Externa
 def _read(
     folder: Path, clip: Clip, prior: Prior, profile: Profile, config: ExternalConfig, seed: int, log: Log
 ) -> ExternalReconstruction:
-    """Files to Gaussians in the world."""
+    """Return files to Gaussians in the world."""
     paths = find_outputs(folder, profile, len(clip.frames))
     moments = read_moments(paths, clip.times, config.points, seed)
     times = _times(clip, len(moments), profile.spread)
@@ -242,7 +242,7 @@ def _moved(moment: Moment, matrix: Tensor) -> Moment:
 
 
 def _colored(moments: Sequence[Moment], shots: Shots) -> list[Splats]:
-    """Gaussians of all moments; a mesh without colour is painted from the frames."""
+    """Return Gaussians of all moments; a mesh without colour is painted from the frames."""
     bare = [moment for moment in moments if isinstance(moment, Discs) and moment.colors is None]
     if bare:
         if len(bare) < len(moments):
@@ -252,7 +252,7 @@ def _colored(moments: Sequence[Moment], shots: Shots) -> list[Splats]:
 
 
 def _camera(frame: Frame, prior: Prior) -> Camera:
-    """The frame's camera in the world; where nobody knows it, the prior's."""
+    """Return the frame's camera in the world; where nobody knows it, the prior's."""
     if frame.camera is not None:
         return frame.camera
     row = int((prior.times - frame.time).abs().argmin())
@@ -264,7 +264,7 @@ def _camera(frame: Frame, prior: Prior) -> Camera:
 
 
 def _depth(prior: Prior, frame: Frame, camera: Camera) -> float:
-    """Depth of the prior's middle before a camera."""
+    """Return the depth of the prior's middle before a camera."""
     object_to_world, transforms = pose_at(prior, frame.time)
     posed = skin_points(prior.vertices, prior.weights, transforms).double()
     middle = object_to_world[:3, :3] @ posed.median(0).values + object_to_world[:3, 3]

@@ -117,7 +117,7 @@ class _Search:
         self.moves = float((centers - centers[0]).norm(dim=1).max()) > 0.05 * depth
 
     def start(self, azimuth: float, elevation: float) -> np.ndarray:
-        """The candidate whose first silhouette has the area and the centre of the animal's."""
+        """Return the candidate whose first silhouette has the area and the centre of the animal's."""
         shot = self.shots[0]
         radius = math.sqrt(float(shot.mask.sum()) / math.pi) / float(shot.camera.intrinsics[0, 0])
         candidate = np.array([azimuth, elevation, math.log(radius * self.depth / self.spread), 0.0, 0.0, 0.0])
@@ -130,7 +130,7 @@ class _Search:
         return candidate
 
     def psnr(self, candidate: np.ndarray) -> float:
-        """Mean over the frames, dB."""
+        """Return the mean over the frames, dB."""
         matrix = self.matrix(candidate)
         errors = []
         for index, shot in enumerate(self.shots):
@@ -139,7 +139,7 @@ class _Search:
         return float(np.mean([-10 * math.log10(max(error, 1e-10)) for error in errors]))
 
     def refined(self, candidate: np.ndarray) -> tuple[float, np.ndarray]:
-        """The best near a candidate, by the simplex method."""
+        """Return the best near a candidate, by the simplex method."""
         free = [0, 1, 2, 3, 4, *([5] if self.moves else [])]
         steps = np.array([8.0, 8.0, 0.08, 0.03, 0.03, 0.08])
 
@@ -154,7 +154,7 @@ class _Search:
         return -float(found.fun), full(found.x)
 
     def matrix(self, candidate: np.ndarray) -> Tensor:
-        """Object -> world, [4, 4]."""
+        """Return the object -> world, [4, 4]."""
         azimuth, elevation, scale, column, row, deeper = (float(value) for value in candidate)
         angle, height = math.radians(azimuth), math.radians(max(-89.0, min(89.0, elevation)))
         side = torch.linalg.cross(self.up, self.ahead)
@@ -221,7 +221,7 @@ def place_fauna(pose: Path, box: tuple[float, float, float], camera: Camera, dep
 
 
 def _between(start: Tensor, end: Tensor) -> Tensor:
-    """The smallest rotation that turns one direction into another, [3, 3]; they are never opposite."""
+    """Return the smallest rotation that turns one direction into another, [3, 3]; they are never opposite."""
     a, b = normalize(start, dim=0), normalize(end, dim=0)
     axis, cosine = torch.linalg.cross(a, b), a @ b
     zero = torch.zeros((), dtype=a.dtype)
@@ -238,7 +238,7 @@ def _reduced(frame: Frame, camera: Camera) -> Shot:
 
 
 def _thinned(splats: Splats) -> Splats:
-    """A fixed choice of the Gaussians, made larger so that they still close the surface."""
+    """Return a fixed choice of the Gaussians, made larger so that they still close the surface."""
     if len(splats) <= GAUSSIANS:
         return splats
     keep = torch.randperm(len(splats), generator=torch.Generator().manual_seed(0))[:GAUSSIANS]
@@ -258,7 +258,7 @@ def _middle(mask: Tensor) -> Tensor:
 
 
 def _render(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Premultiplied colour [3, h, w] and alpha [1, h, w]."""
+    """Return the premultiplied colour [3, h, w] and alpha [1, h, w]."""
     with torch.no_grad():
         color, alpha, _ = rasterize(
             splats.means, splats.quats, splats.scales, splats.opacities, seen_colors(splats, camera.center),

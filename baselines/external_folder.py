@@ -76,7 +76,7 @@ def write_clip(folder: Path, clip: Clip, prior: Prior, crops: bool) -> None:
 
 
 def crop_box(mask: Tensor) -> tuple[float, float, float]:
-    """Left, top and side of the square around the animal, in pixels; it may reach beyond the image.
+    """Return the left, top and side of the square around the animal, in pixels; it may reach beyond the image.
 
     Raises:
         UserError: the mask is empty.
@@ -183,7 +183,7 @@ def _words(command: str, given: Mapping[str, str]) -> list[str]:
 
 
 def find_outputs(folder: Path, profile: Profile, frames: int) -> list[Path]:
-    """A program's files in the order of time, by the last number in their names.
+    """Return a program's files in the order of time, by the last number in their names.
 
     Raises:
         UserError: the folder is not there, no file fits, or they are not numbered one after another from 0 or from 1
@@ -209,7 +209,7 @@ def find_outputs(folder: Path, profile: Profile, frames: int) -> list[Path]:
 
 
 def _wanted(profile: Profile, frames: int, found: int) -> tuple[tuple[int, ...], str]:
-    """How many files a program may leave, the usual number first, and what to call them."""
+    """Return how many files a program may leave, the usual number first, and what to call them."""
     if not profile.spread:
         return (frames,), f"{frames} files {{}}, one a frame"
     if profile.moments:
@@ -220,7 +220,7 @@ def _wanted(profile: Profile, frames: int, found: int) -> tuple[tuple[int, ...],
 
 
 def _fault(numbers: list[int], count: int) -> str | None:
-    """What keeps ascending numbers from being ``count``, from 0 or from 1 on; None where nothing does."""
+    """Return what keeps ascending numbers from being ``count``, from 0 or from 1 on; None where nothing does."""
     first = 1 if numbers[0] == 1 else 0
     twice = next((one for one, other in pairwise(numbers) if one == other), None)
     missing = next((wanted for wanted in range(first, first + count) if wanted not in numbers), None)
@@ -234,7 +234,7 @@ def _fault(numbers: list[int], count: int) -> str | None:
 
 
 def number(path: Path) -> int:
-    """The last number in a file's name, -1 where there is none."""
+    """Return the last number in a file's name, -1 where there is none."""
     digits = re.findall(r"\d+", path.stem)
     return int(digits[-1]) if digits else -1
 

@@ -51,7 +51,7 @@ def _moments(document: Document, path: Path, clip: str, shares: Floats) -> list[
 
 
 def _parts(document: Document, index: int, times: Floats, world: Floats) -> list[list[Mesh]]:
-    """The triangle primitives of one node, each as its meshes over time; world holds all nodes' matrices."""
+    """Return the triangle primitives of one node, each as its meshes over time; world holds all nodes' matrices."""
     node = document.tree.nodes[index]
     if node.mesh is None:
         return []
@@ -72,12 +72,12 @@ def _parts(document: Document, index: int, times: Floats, world: Floats) -> list
 
 
 def _bones(document: Document, skin: int, world: Floats) -> Floats:
-    """Skinning matrices of a skin, mesh space -> world, [T, joints, 4, 4]."""
+    """Return the skinning matrices of a skin, mesh space -> world, [T, joints, 4, 4]."""
     return world[:, document.tree.skins[skin].joints] @ inverse_binds(document, skin)
 
 
 def _mesh(surface: Surface, points: Floats) -> Mesh:
-    """A surface of the rig reader at one moment; its texture coordinates begin at the upper left corner."""
+    """Return a surface of the rig reader at one moment; its texture coordinates begin at the upper left corner."""
     uv: Tensor | None = None
     texture: Tensor | None = None
     if surface.uv is not None and surface.texture is not None:

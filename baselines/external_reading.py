@@ -44,14 +44,14 @@ def read_moments(paths: Sequence[Path], times: Sequence[float], count: int, seed
 
 
 def moved_discs(found: Discs, matrix: Tensor) -> Discs:
-    """Points on a mesh under a proper similarity [4, 4]."""
+    """Return points on a mesh under a proper similarity [4, 4]."""
     scale, turn, shift = split_similarity(matrix.double())
     points = found.points.double() @ (scale * turn).T + shift
     return Discs(points.float(), (found.normals.double() @ turn.T).float(), found.radius * float(scale), found.colors)
 
 
 def painted(moments: Sequence[Discs], shots: Sequence[tuple[Frame, Camera]]) -> list[Splats]:
-    """Gaussians of meshes without colour: what the input frame of the same moment shows where a point is seen.
+    """Return Gaussians of meshes without colour: what the input frame of the same moment shows where a point is seen.
 
     Points that move from moment to moment keep the mean of what the frames show of them. A point that no frame shows
     has the colour of the nearest one that is shown.
@@ -69,7 +69,7 @@ def painted(moments: Sequence[Discs], shots: Sequence[tuple[Frame, Camera]]) -> 
 
 
 def _look(found: Discs, frame: Frame, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Colour of each point in a frame, [n, 3], and how squarely it is seen, zero where it is not, [n]."""
+    """Return the colour of each point in a frame, [n, 3], and how squarely it is seen, zero where it is not, [n]."""
     pixels, depth = camera.project(found.points)
     grid = pixels / pixels.new_tensor((camera.width, camera.height)) * 2 - 1
     image = torch.cat((frame.rgb, frame.mask))[None]
@@ -82,7 +82,7 @@ def _look(found: Discs, frame: Frame, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def _nearest(pixels: Tensor, depth: Tensor, camera: Camera, radius: float) -> Tensor:
-    """Which points lie at the front of a depth buffer whose cells are as large as the discs, boolean [n]."""
+    """Return which points lie at the front of a depth buffer whose cells are as large as the discs, boolean [n]."""
     cell = max(1.0, 3 * radius * float(camera.intrinsics[0, 0]) / float(depth.median().clamp_min(1e-6)))
     columns, rows = math.ceil(camera.width / cell), math.ceil(camera.height / cell)
     place = (pixels / cell).floor().clamp(-1, max(columns, rows)).long()
@@ -103,7 +103,7 @@ def _filled(points: Tensor, colors: Tensor, seen: Tensor) -> Tensor:
 
 
 def _joined(path: Path, moments: Sequence[Sequence[Mesh]], count: int, seed: int) -> list[Discs]:
-    """Points on all parts of each moment, as many on each as its share of the first moment's area."""
+    """Return points on all parts of each moment, as many on each as its share of the first moment's area."""
     areas = [_area(part) for part in moments[0]]
     kept = [index for index, area in enumerate(areas) if area > 0]
     if not kept:
@@ -125,7 +125,7 @@ def _area(mesh: Mesh) -> float:
 
 
 def _holds_splats(path: Path) -> bool:
-    """Whether a PLY file's header names the properties of Gaussians."""
+    """Tell whether a PLY file's header names the properties of Gaussians."""
     try:
         with path.open("rb") as file:
             return b"f_dc_0" in file.read(1 << 14).split(b"end_header")[0]

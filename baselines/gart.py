@@ -114,7 +114,7 @@ class GartTraining(SplatTraining):
         return losses, info, target
 
     def _alike(self) -> dict[str, Tensor]:
-        """Neighbours alike, and no Gaussian large."""
+        """Return neighbours alike, and no Gaussian large."""
         own, config = self.model.gaussians, self.config.regularisers
         if self.near is None:
             others = neighbours(own.means, min(config.neighbours, len(own)) - 1).to(own.means.device)
@@ -133,7 +133,7 @@ class GartTraining(SplatTraining):
         return {"alike": total}
 
     def _refine_step(self, done: int) -> dict[str, float]:
-        """One step of SGD on the pose of one frame; white background, as the original's."""
+        """Return one step of SGD on the pose of one frame; white background, as the original's."""
         assert isinstance(self.config, GartStarConfig)
         frame, step = divmod(done, self.config.refine.steps)
         model = self.model
@@ -145,7 +145,7 @@ class GartTraining(SplatTraining):
 
 
 def spread(values: Tensor, near: Tensor) -> Tensor:
-    """Mean standard deviation (unbiased) of attributes among neighbours, [n, c] and [n, k] -> scalar."""
+    """Return the mean standard deviation (unbiased) of attributes among neighbours, [n, c] and [n, k] -> scalar."""
     groups = values[near]
     apart = groups - groups.mean(dim=1, keepdim=True)
     return (apart.square().sum(dim=1) / max(1, near.shape[1] - 1) + 1e-12).sqrt().mean()
@@ -170,7 +170,7 @@ class Gart:
         log: Log,
         workdir: Path | None,
     ) -> GartReconstruction:
-        """Reconstruct from the clip and the prior; see contracts.Method."""
+        """Return the reconstruct from the clip and the prior; see contracts.Method."""
         config = for_clip(config, len(clip.frames))
         generator = torch.Generator().manual_seed(seed)
         supervision = Supervision(clip, prior, config.image_size, device)

@@ -33,21 +33,21 @@ class GartReconstruction:
 
     @torch.no_grad()
     def at(self, time: float) -> Splats:
-        """The Gaussians at a time in seconds in the world; between frames the joints' rotations slerp."""
+        """Return the Gaussians at a time in seconds in the world; between frames the joints' rotations slerp."""
         position = self.root.position(time)
         shape = posed(self.gaussians, self.weights, *self.poses.between(position))
         return self.root.in_world(splats_of(self.gaussians, *shape), position)
 
     def camera(self, time: float) -> Camera | None:
-        """The input camera of the frame nearest to a time."""
+        """Return the input camera of the frame nearest to a time."""
         return self.root.camera(time)
 
     def canonical(self) -> Splats:
-        """The Gaussians at rest, in the object frame; `weights` belong to the same rows."""
+        """Return the Gaussians at rest, in the object frame; `weights` belong to the same rows."""
         return self.gaussians.splats()
 
     def diagnostics(self) -> dict[str, float]:
-        """How many Gaussians there are, how opaque, and how far poses went from the prior's."""
+        """Return how many Gaussians there are, how opaque, and how far poses went from the prior's."""
         return {
             "gaussians": float(len(self.gaussians)),
             "opacity_mean": float(self.gaussians.opacities().mean()),

@@ -21,7 +21,7 @@ from rewild4d.types import Frame
 def refine_step(
     own: Gaussians, weights: Tensor, poses: PoseTable, frame: int, target: Target, step: int, config: GartStarConfig
 ) -> float:
-    """One step; white background, as the original's.
+    """Return one step; white background, as the original's.
 
     Args:
         own: canonical Gaussians.

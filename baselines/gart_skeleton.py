@@ -35,11 +35,11 @@ class PoseTable(nn.Module):
         self.shifts = nn.Parameter(torch.zeros_like(offsets[:, 0]))
 
     def forward(self, frame: int) -> tuple[Tensor, Tensor]:
-        """The pose of a frame: rotation of each joint [J, 4] and rest -> posed transforms [J, 4, 4]."""
+        """Return the pose of a frame: rotation of each joint [J, 4] and rest -> posed transforms [J, 4, 4]."""
         return self._chained(self._local(frame), self.offsets[frame], self.shifts[frame])
 
     def between(self, position: float) -> tuple[Tensor, Tensor]:
-        """The pose at a place between frames (1.5: half-way from the second to the third): joints slerp."""
+        """Return the pose at a place between frames (1.5: half-way from the second to the third): joints slerp."""
         return self._chained(*self._at(position))
 
     @torch.no_grad()
@@ -56,7 +56,7 @@ class PoseTable(nn.Module):
         return table.to(local.device)
 
     def _at(self, position: float) -> tuple[Tensor, Tensor, Tensor]:
-        """What `_chained` takes, at a place between frames."""
+        """Return what `_chained` takes, at a place between frames."""
         low = int(position)
         part = position - low
         if part == 0:
@@ -71,7 +71,7 @@ class PoseTable(nn.Module):
         return quat_multiply(self.quats[frame], exponential_quats(self.turns[frame]))
 
     def _chained(self, local: Tensor, offsets: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
-        """P_j = P_parent T(c + d) R T(-c): root to leaf, level by level."""
+        """Return P_j = P_parent T(c + d) R T(-c): root to leaf, level by level."""
         rotation = quat_to_matrix(local)
         moves = self.pivots + offsets - (rotation @ self.pivots[..., None])[..., 0]
         quats, turns, places = local, rotation, moves
@@ -85,7 +85,7 @@ class PoseTable(nn.Module):
 
 
 def pose_table(transforms: Tensor, pivots: Tensor, parents: Tensor) -> PoseTable:
-    """The table that starts at given poses.
+    """Return the table that starts at given poses.
 
     Args:
         transforms: rest -> posed, rigid, [T, J, 4, 4].
@@ -103,12 +103,12 @@ def pose_table(transforms: Tensor, pivots: Tensor, parents: Tensor) -> PoseTable
 
 
 def prior_poses(prior: Prior, rows: list[int]) -> PoseTable:
-    """The prior's poses at some of its frames."""
+    """Return the prior's poses at some of its frames."""
     return pose_table(prior.transforms[rows], prior.bones[:, 0], prior.parents)
 
 
 def exponential_quats(turns: Tensor) -> Tensor:
-    """Unit quaternions of axis-angle vectors, smooth at zero, [..., 3] -> [..., 4]."""
+    """Return the unit quaternions of axis-angle vectors, smooth at zero, [..., 3] -> [..., 4]."""
     angle = (turns.square().sum(-1, keepdim=True) + 1e-16).sqrt()
     return torch.cat(((angle / 2).cos(), turns / angle * (angle / 2).sin()), dim=-1)
 

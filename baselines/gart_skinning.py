@@ -36,7 +36,7 @@ class ResidualField(nn.Module):
         self.residual = nn.Parameter(torch.zeros_like(self.base))
 
     def forward(self, points: Tensor, variation: bool) -> tuple[Tensor, Tensor]:
-        """Weights of points [n, 3], no gradient flows to them: [n, J]; and the residual's total variation.
+        """Return weights of points [n, 3], no gradient flows to them: [n, J]; and the residual's total variation.
 
         Args:
             points: in the object frame.
@@ -51,12 +51,12 @@ class ResidualField(nn.Module):
         return base + added, total / BEND
 
     def still(self, points: Tensor) -> Tensor:
-        """Weights without a gradient, [n, 3] -> [n, J]."""
+        """Return weights without a gradient, [n, 3] -> [n, J]."""
         with torch.no_grad():
             return self.field.sample(self.base, points) + self.field.sample(self.residual, points)
 
     def norm(self) -> Tensor:
-        """Mean over the voxels of the residual's length, scalar."""
+        """Return the mean over the voxels of the residual's length, scalar."""
         return (self.residual.square().sum(-1) + 1e-16).sqrt().mean()
 
     def _variation(self) -> Tensor:
@@ -64,7 +64,7 @@ class ResidualField(nn.Module):
 
 
 def posed(own: Gaussians, weights: Tensor, quats: Tensor, transforms: Tensor) -> Shape:
-    """Skinned Gaussians.
+    """Return the skinned Gaussians.
 
     Args:
         own: canonical.

@@ -42,7 +42,7 @@ LEAST_MASS = 3.0
 
 
 def template_prior(path: Path, prior: Prior) -> Prior:
-    """The prior with the file's surface, bones and weights, and with poses that follow the prior's.
+    """Return the prior with the file's surface, bones and weights, and with poses that follow the prior's.
 
     Args:
         path: npz or SMAL pickle.
@@ -111,7 +111,7 @@ def follow(points: Tensor, moved: Tensor, weights: Tensor, joints: Tensor, paren
 
 
 def _turn(start: Tensor, end: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Best rotation [T, 3, 3] of weighted points (Kabsch), their centre before [3] and after [T, 3]."""
+    """Return the best rotation [T, 3, 3] of weighted points (Kabsch), their centre before [3] and after [T, 3]."""
     part = share / share.sum().clamp_min(1e-12)
     center, place = part @ start, torch.einsum("n,tna->ta", part, end)
     cross = torch.einsum("n,tna,nb->tab", part, end - place[:, None], start - center)
@@ -129,7 +129,7 @@ def _laid_on(prior: Prior, vertices: Tensor, joints: Tensor) -> tuple[Tensor, Te
 
 
 def _mirror(joints: Tensor) -> Tensor:
-    """The joint nearest to each one's mirror image where that is mutual, itself otherwise, [J]."""
+    """Return the joint nearest to each one's mirror image where that is mutual, itself otherwise, [J]."""
     nearest = torch.cdist(mirror_points(joints), joints).argmin(-1)
     own = torch.arange(len(joints))
     return torch.where(nearest[nearest] == own, nearest, own)
@@ -179,7 +179,7 @@ class _Careful(pickle.Unpickler):
 
 
 def _read(path: Path) -> Mapping[str, Any]:
-    """The arrays of a file under the npz's names.
+    """Return the arrays of a file under the npz's names.
 
     Raises:
         UserError: no such file, or neither kind.
@@ -214,7 +214,7 @@ def _array(value: Any) -> np.ndarray:
 
 
 def _checked(path: Path, raw: Mapping[str, Any]) -> dict[str, Tensor]:
-    """The five arrays with the shapes that the module's text gives.
+    """Return the five arrays with the shapes that the module's text gives.
 
     Raises:
         UserError: naming the first array that is not as it should be.

@@ -45,11 +45,11 @@ class PriorOnlyReconstruction:
         )
 
     def camera(self, time: float) -> Camera | None:
-        """The input camera; at a time without an input frame the prior's."""
+        """Return the input camera; at a time without an input frame the prior's."""
         return self.cameras.get(time) or world_camera(self.prior, time)
 
     def canonical(self) -> Splats:
-        """The Gaussians at rest, in the object frame."""
+        """Return the Gaussians at rest, in the object frame."""
         rest = torch.eye(4).expand(self.prior.bones.shape[0], 4, 4)
         return pose_gaussians(self.sample, self.quats, self.scales, self.colors, rest)
 
@@ -69,7 +69,7 @@ class PriorOnlyReconstruction:
         return self.prior.parents
 
     def articulation(self, time: float) -> tuple[Tensor, Tensor]:
-        """Rest -> posed transforms, [J, 4, 4], and object_to_world, [4, 4]."""
+        """Return the rest -> posed transforms, [J, 4, 4], and object_to_world, [4, 4]."""
         object_to_world, transforms = pose_at(self.prior, time)
         return transforms, object_to_world
 

@@ -53,7 +53,7 @@ class Window:
     height: int
 
     def camera(self, camera: Camera, width: int, height: int) -> Camera:
-        """The camera of the window once resized to width x height."""
+        """Return the camera of the window once resized to width x height."""
         return camera.shifted(self.left, self.top, self.width, self.height).resized(width, height)
 
 
@@ -73,7 +73,7 @@ class Decoded:
 
 
 def read_rgb(path: Path, upright: bool = False) -> np.ndarray:
-    """Colour image, uint8 [h, w, 3]; an alpha channel inside the file is ignored.
+    """Return the colour image, uint8 [h, w, 3]; an alpha channel inside the file is ignored.
 
     Args:
         path: PNG or JPEG.
@@ -120,7 +120,7 @@ def read_picture(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def read_pair(pair: ImagePair, source: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Colour and matte of one view.
+    """Return the colour and matte of one view.
 
     Args:
         pair: the files.
@@ -137,7 +137,7 @@ def read_pair(pair: ImagePair, source: tuple[int, int] | None = None) -> tuple[n
 
 
 def target_size(source: tuple[int, int], selection: Selection) -> tuple[int, int]:
-    """Width and height of the images that a selection asks for."""
+    """Return the width and height of the images that a selection asks for."""
     if selection.framing != "full":
         return selection.size, selection.size
     scale = selection.size / max(source)
@@ -208,7 +208,7 @@ def _fill_cache(
 def _windows(
     pairs: Sequence[Sequence[ImagePair]], selection: Selection, source: tuple[int, int], title: str
 ) -> list[Window]:
-    """The window of each view."""
+    """Return the window of each view."""
     views = list(zip(*pairs, strict=True))
     whole = Window(0, 0, *source)
     if selection.framing == "full":
@@ -227,12 +227,12 @@ def _padded(box: Window) -> Window:
 
 
 def _square(box: Window, side: int) -> Window:
-    """The square of a given side around the centre of a box."""
+    """Return the square of a given side around the centre of a box."""
     return Window(box.left + (box.width - side) // 2, box.top + (box.height - side) // 2, side, side)
 
 
 def _box(mattes: Iterable[np.ndarray]) -> Window | None:
-    """The rectangle that holds the animal in all mattes, or None where there is no animal."""
+    """Return the rectangle that holds the animal in all mattes, or None where there is no animal."""
     corners = []
     for matte in mattes:
         left, top, width, height = cv2.boundingRect((matte > BOX_ALPHA).astype(np.uint8))
@@ -245,7 +245,7 @@ def _box(mattes: Iterable[np.ndarray]) -> Window | None:
 
 
 def _key(pairs: Sequence[Sequence[ImagePair]], selection: Selection) -> str:
-    """Digest of the source files (path, size, time of change), the framing and the size."""
+    """Return the digest of the source files (path, size, time of change), the framing and the size."""
     parts = [_CACHE_VERSION, selection.framing, str(selection.size), str(len(pairs))]
     for frame in pairs:
         for pair in frame:
@@ -291,7 +291,7 @@ def _upright(path: Path, image: np.ndarray) -> np.ndarray:
 
 
 def _png_fault(data: bytes) -> str:
-    """What is wrong with a PNG file, or "": OpenCV returns half an image where a file is cut off."""
+    """Return what is wrong with a PNG file, or "": OpenCV returns half an image where a file is cut off."""
     position = len(_PNG)
     while position + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, position)

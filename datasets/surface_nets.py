@@ -28,7 +28,7 @@ def surface_nets(field: np.ndarray, origin: np.ndarray, cell: float) -> tuple[np
 
 
 def _quads(inside: np.ndarray, index: np.ndarray, axis: int) -> np.ndarray:
-    """Two triangles around each crossed grid edge along one axis, [f, 3]."""
+    """Return two triangles around each crossed grid edge along one axis, [f, 3]."""
     step, u, v = np.eye(3, dtype=int)[[axis, (axis + 1) % 3, (axis + 2) % 3]]
     ahead = np.moveaxis(np.diff(np.moveaxis(inside.astype(np.int8), axis, 0), axis=0), 0, axis)
     edges = np.argwhere(ahead != 0)
@@ -39,7 +39,7 @@ def _quads(inside: np.ndarray, index: np.ndarray, axis: int) -> np.ndarray:
 
 
 def normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit outward normals at the vertices (area-weighted), [n, 3]."""
+    """Return the unit outward normals at the vertices (area-weighted), [n, 3]."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     summed = np.zeros_like(vertices)
     for k in range(3):

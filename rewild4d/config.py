@@ -20,7 +20,7 @@ PRESETS = ("default", "quick", "standard", "paper")
 
 
 def preset_names(method: str) -> list[str]:
-    """Names of a method's presets, as its file orders them."""
+    """Return names of a method's presets, as its file orders them."""
     return list(_preset_file(method))
 
 
@@ -51,7 +51,7 @@ def load_preset(method: str, config_type: type[T], preset: str) -> T:
 
 
 def _over(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """Nested values with others in their place."""
+    """Return the nested values with others in their place."""
     made = dict(base)
     for key, value in own.items():
         nested = isinstance(value, dict) and isinstance(base.get(key), dict)
@@ -118,7 +118,7 @@ def parse_flags(
 
 
 def _floats(node: Any, place: str = "") -> Iterator[tuple[str, float]]:
-    """Every float among parsed flags, with the flag that gave it ("rates.means[0]")."""
+    """Yield every float among parsed flags, with the flag that gave it ("rates.means[0]")."""
     if isinstance(node, float):
         yield place, node
     elif isinstance(node, tuple | list):
@@ -144,7 +144,7 @@ def _require_ranges(config: msgspec.Struct, prog: str) -> None:
 
 
 def _first_words(box: str) -> str:
-    """What the parser complains of, out of the frame that it draws around it."""
+    """Return what the parser complains of, out of the frame that it draws around it."""
     plain = re.sub(r"\x1b\[[0-9;]*m", "", box)
     sections = re.split(r"^.*(?:──|-----).*$", plain, flags=re.MULTILINE)
     sentences = [" ".join(section.replace("│", " ").split()) for section in sections]
@@ -166,7 +166,7 @@ def _with_settings(options_type: type, config: msgspec.Struct) -> type:
 
 
 def _flags(node: Any, prefix: str = "") -> Iterator[str]:
-    """Every flag that a dataclass or Struct type gives, nested ones with dots."""
+    """Yield every flag that a dataclass or Struct type gives, nested ones with dots."""
     for name, hint in typing.get_type_hints(node).items():
         if name.startswith("_"):
             continue

@@ -30,11 +30,11 @@ class Reconstruction(Protocol):
     """
 
     def at(self, time: float) -> Splats:
-        """The Gaussians at a time in seconds, in the world frame."""
+        """Return the Gaussians at a time in seconds, in the world frame."""
         ...
 
     def camera(self, time: float) -> Camera | None:
-        """The input camera at a time, in the world frame, or None where the method does not know it.
+        """Return the input camera at a time, in the world frame, or None where the method does not know it.
 
         Where the data set has no cameras (`Frame.camera` is None) the evaluation renders held-out frames of the input
         view with it. It must then answer between the clip's frames too, for the image that the clip would hold at that
@@ -65,7 +65,7 @@ class Articulated(Reconstruction, Protocol):
     def parents(self) -> torch.Tensor: ...
 
     def canonical(self) -> Splats:
-        """The Gaussians at rest, in the object frame."""
+        """Return the Gaussians at rest, in the object frame."""
         ...
 
     def articulation(self, time: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -116,7 +116,7 @@ class Method(Protocol):
         log: Log,
         workdir: Path | None,
     ) -> Reconstruction:
-        """Reconstruct from the clip and the prior, and nothing else.
+        """Return the reconstruct from the clip and the prior, and nothing else.
 
         Args:
             clip: the frames that the method may see.
@@ -184,7 +184,7 @@ class DatasetReader(Protocol):
     licence: str
 
     def cases(self, selection: Selection) -> list[str]:
-        """Names of all cases, "<animal>/<motion>" (with "@<placement>" under a fixed camera), cheaply."""
+        """Return names of all cases, "<animal>/<motion>" (with "@<placement>" under a fixed camera), cheaply."""
         ...
 
     def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:

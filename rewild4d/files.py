@@ -147,7 +147,7 @@ def save_tensors(state: Any, path: Path) -> None:
 
 
 def digest(*parts: bytes | str | np.ndarray | torch.Tensor) -> str:
-    """SHA-256 over text, bytes and arrays (with their shape and type), as hex."""
+    """Return SHA-256 over text, bytes and arrays (with their shape and type), as hex."""
     sha = hashlib.sha256()
     for part in parts:
         if isinstance(part, str):
@@ -162,7 +162,7 @@ def digest(*parts: bytes | str | np.ndarray | torch.Tensor) -> str:
 
 
 def file_state(path: Path) -> str:
-    """Path, size and time of change of a file, as text.
+    """Return the path, size and time of change of a file, as text.
 
     Raises:
         UserError: there is no such file, or only a link to nothing.
@@ -188,12 +188,12 @@ def command_words(command: str) -> list[str]:
 
 
 def natural(path: Path) -> list[str | int]:
-    """Sorts files by name so that 2 comes before 10."""
+    """Return sorts files by name so that 2 comes before 10."""
     return [int(part) if index % 2 else part for index, part in enumerate(re.split(r"([0-9]+)", path.name))]
 
 
 def load_tensors(path: Path, kind: str = "saved reconstruction") -> Any:
-    """What torch saved, on the CPU.
+    """Return what torch saved, on the CPU.
 
     Args:
         path: the file.

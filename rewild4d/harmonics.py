@@ -15,7 +15,7 @@ from rewild4d.types import Splats
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """Values of the basis functions for unit directions, [..., 3] -> [..., (degree + 1)^2], degree 0 to 3."""
+    """Return values of the basis functions for unit directions, [..., 3] -> [..., (degree + 1)^2], degree 0 to 3."""
     powers = [torch.ones_like(directions[..., :1])]
     for _ in range(degree):
         powers.append(products(powers[-1], directions))
@@ -24,7 +24,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def _band(directions: Tensor, level: int) -> Tensor:
-    """Values of the functions of one degree, [..., 3] -> [..., 2 level + 1]."""
+    """Return values of the functions of one degree, [..., 3] -> [..., 2 level + 1]."""
     power = torch.ones_like(directions[..., :1])
     for _ in range(level):
         power = products(power, directions)
@@ -65,7 +65,7 @@ def _table(level: int, device: torch.device, dtype: torch.dtype) -> Tensor:
 
 
 def rotated(coefficients: Tensor, rotations: Tensor) -> Tensor:
-    """Coefficients of the same colours on a sphere that turns: rotated(c, R) seen along R d is c seen along d.
+    """Return coefficients of the same colours on a sphere that turns: rotated(c, R) seen along R d is c seen along d.
 
     The functions of one degree are closed under rotation, so matching them at enough directions is exact.
 
@@ -95,7 +95,7 @@ def rotated(coefficients: Tensor, rotations: Tensor) -> Tensor:
 
 
 def _for_kernels(*tensors: Tensor) -> bool:
-    """Whether the kernels take them: they give no gradients."""
+    """Tell whether the kernels take them: they give no gradients."""
     wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
     return not wanted and HARMONICS.takes(*tensors)
 
@@ -112,7 +112,7 @@ def _matching(level: int) -> tuple[Tensor, Tensor]:
 
 
 def _spiral(count: int) -> Tensor:
-    """Unit directions spread over the sphere, [count, 3]."""
+    """Return the unit directions spread over the sphere, [count, 3]."""
     order = torch.arange(count, dtype=torch.float64)
     height, angle = 1 - (2 * order + 1) / count, order * (math.pi * (3 - 5**0.5))
     ring = (1 - height.square()).sqrt()
@@ -120,7 +120,7 @@ def _spiral(count: int) -> Tensor:
 
 
 def seen_colors(splats: Splats, eye: Tensor) -> Tensor:
-    """RGB of each Gaussian from a camera centre.
+    """Return RGB of each Gaussian from a camera centre.
 
     Args:
         splats: colours [n, k, 3]; k = 1 is RGB itself, k = 4, 9, 16 are coefficients, 0.5 standing for their zero.

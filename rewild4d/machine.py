@@ -54,7 +54,7 @@ def code_of(method: str) -> dict[str, str]:
 
 @cache
 def _sources(package: str) -> str:
-    """Digest of a loaded package's sources, or of the one file of a module."""
+    """Return the digest of a loaded package's sources, or of the one file of a module."""
     module = sys.modules[package]
     folders = [Path(folder) for folder in getattr(module, "__path__", ())]
     files = [(folder, file) for folder in folders for file in folder.rglob("*") if file.suffix in (".py", ".toml")]
@@ -65,7 +65,7 @@ def _sources(package: str) -> str:
 
 
 def machine(device: torch.device, rasterizer: str) -> dict[str, str]:
-    """Processor, system, threads, what renders, and the versions that decide the last digit."""
+    """Return the processor, system, threads, what renders, and the versions that decide the last digit."""
     packages = ["numpy", "numba"]
     if rasterizer in ("triton", "gsplat"):
         packages.append(rasterizer)
@@ -95,7 +95,7 @@ def peak_memory_mib() -> float:
 
 
 def pick_device(name: str) -> torch.device:
-    """The torch device of a name ("auto" is the CPU unless a CUDA GPU is there).
+    """Return the torch device of a name ("auto" is the CPU unless a CUDA GPU is there).
 
     Raises:
         UserError: no such device here.

@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def products(a: Tensor, b: Tensor) -> Tensor:
-    """All a_i b_j, i the slower index, [..., n] and [..., m] -> [..., n m].
+    """Return all a_i b_j, i the slower index, [..., n] and [..., m] -> [..., n m].
 
     The components are spread by matrices of zeros and ones: the gradient of a broadcast product would be a sum along
     short axes, which takes a CPU twice as long.

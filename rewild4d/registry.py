@@ -55,12 +55,12 @@ BUILTIN = {"artemis": "rewild4d.datasets.builtin.synthetic:ensure"}
 
 
 def names(kind: str) -> list[str]:
-    """Every known name of a kind ("methods" or "datasets"), ours first; imports nothing."""
+    """Return every known name of a kind ("methods" or "datasets"), ours first; imports nothing."""
     return list(_table(kind))
 
 
 def load_method(name: str) -> Any:
-    """An instance of the method called ``name`` (contracts.Method).
+    """Return an instance of the method called ``name`` (contracts.Method).
 
     Raises:
         UserError: no such method, with the nearest name; one of another package that cannot be imported.
@@ -112,7 +112,7 @@ def require_name(kind: str, name: str) -> None:
 
 
 def load_dataset(name: str) -> Any:
-    """The reader class of the data set called ``name``: reader(root) -> contracts.DatasetReader.
+    """Return the reader class of the data set called ``name``: reader(root) -> contracts.DatasetReader.
 
     Raises:
         UserError: no such data set, with the nearest name; one of another package that cannot be imported.
@@ -121,7 +121,7 @@ def load_dataset(name: str) -> Any:
 
 
 def load_builtin(name: str) -> Any:
-    """The function that makes a data set's built-in folder, or None where there is none."""
+    """Return the function that makes a data set's built-in folder, or None where there is none."""
     target = BUILTIN.get(name)
     return _resolve(target) if target else None
 

@@ -17,12 +17,12 @@ from rewild4d.types import Camera, Splats
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product a ⊗ b of wxyz quaternions, [..., 4]."""
+    """Return the hamilton product a ⊗ b of wxyz quaternions, [..., 4]."""
     return products(a, b) @ _table(HAMILTON, a.device, a.dtype)
 
 
 def quat_to_matrix(quats: Tensor) -> Tensor:
-    """Rotation matrices of quaternions (normalised here), [..., 4] -> [..., 3, 3]."""
+    """Return the rotation matrices of quaternions (normalised here), [..., 4] -> [..., 3, 3]."""
     unit = torch.nn.functional.normalize(quats, dim=-1)
     return (products(unit, unit) @ _table(ROTATION, unit.device, unit.dtype)).unflatten(-1, (3, 3))
 
@@ -39,7 +39,7 @@ ROTATION = (
 
 @cache
 def _table(sums: tuple[str, ...], device: torch.device, dtype: torch.dtype) -> Tensor:
-    """Signs of the products in each sum, [16, sums]."""
+    """Return signs of the products in each sum, [16, sums]."""
     table = torch.zeros(16, len(sums))
     for column, terms in enumerate(sums):
         for sign, first, second in re.findall("([+-]?)([wxyz])([wxyz])", terms):
@@ -48,7 +48,7 @@ def _table(sums: tuple[str, ...], device: torch.device, dtype: torch.dtype) -> T
 
 
 def matrix_to_quat(matrix: Tensor) -> Tensor:
-    """Unit quaternions (w >= 0) of rotation matrices, [..., 3, 3] -> [..., 4].
+    """Return the unit quaternions (w >= 0) of rotation matrices, [..., 3, 3] -> [..., 4].
 
     Takes the best conditioned of the four classical branches, so it is exact near 180 degrees too.
     """
@@ -73,21 +73,21 @@ def matrix_to_quat(matrix: Tensor) -> Tensor:
 
 
 def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
-    """Rotation matrices of axis-angle vectors in radians (Rodrigues), [..., 3] -> [..., 3, 3]."""
+    """Return the rotation matrices of axis-angle vectors in radians (Rodrigues), [..., 3] -> [..., 3, 3]."""
     angle = (axis_angle.square().sum(-1) + 1e-20).sqrt()[..., None]
     quats = torch.cat(((angle / 2).cos(), axis_angle / angle * (angle / 2).sin()), dim=-1)
     return quat_to_matrix(quats)
 
 
 def rigid(rotation: Tensor, translation: Tensor) -> Tensor:
-    """4x4 matrices from a linear part and a translation, [..., 3, 3] and [..., 3] -> [..., 4, 4]."""
+    """Return 4x4 matrices from a linear part and a translation, [..., 3, 3] and [..., 3] -> [..., 4, 4]."""
     top = torch.cat((rotation, translation[..., None]), dim=-1)
     bottom = top.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(*top.shape[:-2], 1, 4)
     return torch.cat((top, bottom), dim=-2)
 
 
 def similarity(scale: Tensor | float, rotation: Tensor, translation: Tensor) -> Tensor:
-    """4x4 similarity x -> scale * rotation x + translation, [..., 4, 4]."""
+    """Return 4x4 similarity x -> scale * rotation x + translation, [..., 4, 4]."""
     scale = torch.as_tensor(scale, dtype=rotation.dtype, device=rotation.device)
     return rigid(scale[..., None, None] * rotation, translation)
 
@@ -100,7 +100,7 @@ def split_similarity(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def nearest_rotation(matrix: Tensor) -> Tensor:
-    """The rotation closest to a matrix in the sum of squares (Kabsch), a reflection never, [..., 3, 3]."""
+    """Return the rotation closest to a matrix in the sum of squares (Kabsch), a reflection never, [..., 3, 3]."""
     u, _, vh = torch.linalg.svd(matrix)
     sign = torch.ones_like(matrix[..., 0, :])
     sign[..., 2] = torch.linalg.det(u @ vh).sign()
@@ -117,28 +117,28 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
 
 
 def mirror_points(points: Tensor) -> Tensor:
-    """S x: points in the object frame reflected in x = 0, [..., 3]."""
+    """Return S x: points in the object frame reflected in x = 0, [..., 3]."""
     return points * points.new_tensor((-1.0, 1.0, 1.0))
 
 
 def mirror_quats(quats: Tensor) -> Tensor:
-    """Orientation of a reflected Gaussian: S R S, (w, x, y, z) -> (w, x, -y, -z), [..., 4]."""
+    """Return the orientation of a reflected Gaussian: S R S, (w, x, y, z) -> (w, x, -y, -z), [..., 4]."""
     return quats * quats.new_tensor((1.0, 1.0, -1.0, -1.0))
 
 
 def mirror_matrix(matrix: Tensor) -> Tensor:
-    """S4 P S4: a transform as the mirrored animal performs it, [..., 4, 4]."""
+    """Return S4 P S4: a transform as the mirrored animal performs it, [..., 4, 4]."""
     sign = matrix.new_tensor((-1.0, 1.0, 1.0, 1.0))
     return matrix * sign[:, None] * sign[None, :]
 
 
 def mirror_transforms(transforms: Tensor, mirror: Tensor) -> Tensor:
-    """P_mirror[j] = S4 P[mirror[j]] S4: a pose with left and right exchanged, [..., J, 4, 4] and [J]."""
+    """Return P_mirror[j] = S4 P[mirror[j]] S4: a pose with left and right exchanged, [..., J, 4, 4] and [J]."""
     return mirror_matrix(transforms[..., mirror, :, :])
 
 
 def between_intrinsics(first: Tensor, second: Tensor, part: float) -> Tensor:
-    """Intrinsics of a crop on the straight line between two crops of one film, [3, 3] each.
+    """Return intrinsics of a crop on the straight line between two crops of one film, [3, 3] each.
 
     A crop's centre and side move evenly; in pixels of the crop that is a line between the inverses, not the matrices.
     """
@@ -146,7 +146,7 @@ def between_intrinsics(first: Tensor, second: Tensor, part: float) -> Tensor:
 
 
 def mirror_camera(camera: Camera) -> Camera:
-    """The proper camera whose image of the reflected scene is the horizontally flipped image.
+    """Return the proper camera whose image of the reflected scene is the horizontally flipped image.
 
     R' = S R S, t' = S t, cx' = W - cx (pixel centres at +0.5); det R' = +1. A bare reflection of the camera would be
     improper and must not reach a rasterizer.
@@ -158,7 +158,7 @@ def mirror_camera(camera: Camera) -> Camera:
 
 
 def camera_in_object(camera: Camera, object_to_world: Tensor) -> Camera:
-    """The same view of the object frame: rigid, with the similarity's scale divided out of depth, [4, 4].
+    """Return the same view of the object frame: rigid, with the similarity's scale divided out of depth, [4, 4].
 
     Pixels are unchanged because projection does not see a common scale.
     """
@@ -170,7 +170,7 @@ def camera_in_object(camera: Camera, object_to_world: Tensor) -> Camera:
 
 
 def transform_splats(splats: Splats, matrix: Tensor) -> Splats:
-    """Gaussians moved by a proper similarity, [4, 4]; colours that depend on the view turn with them."""
+    """Return Gaussians moved by a proper similarity, [4, 4]; colours that depend on the view turn with them."""
     scale, rotation, translation = split_similarity(matrix.double())
     turn = matrix_to_quat(rotation).to(splats.quats)
     moved = splats.means.double() @ matrix.double()[:3, :3].T + translation
@@ -187,7 +187,7 @@ def transform_splats(splats: Splats, matrix: Tensor) -> Splats:
 
 
 def skin_points(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
-    """Linear blend skinning: x -> sum_j w_j P_j x.
+    """Return the linear blend skinning: x -> sum_j w_j P_j x.
 
     Args:
         points: rest positions, [n, 3].

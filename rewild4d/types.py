@@ -49,12 +49,12 @@ class Camera:
         return image[..., :2] / image[..., 2:].clamp_min(1e-9), local[..., 2]
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The same view at another image size (the two axes scale on their own)."""
+        """Return the same view at another image size (the two axes scale on their own)."""
         scale = torch.tensor([width / self.width, height / self.height, 1.0], dtype=self.intrinsics.dtype)
         return replace(self, intrinsics=scale[:, None] * self.intrinsics, width=width, height=height)
 
     def shifted(self, left: float, top: float, width: int, height: int) -> "Camera":
-        """The view of a window whose upper left corner is at (left, top); negative values pad."""
+        """Return the view of a window whose upper left corner is at (left, top); negative values pad."""
         moved = self.intrinsics.clone()
         moved[0, 2] -= left
         moved[1, 2] -= top
@@ -80,21 +80,21 @@ class Crop:
     height: int
 
     def to_original(self, points: Tensor, size: int) -> Tensor:
-        """Pixels of the image (``size`` wide and high) to pixels of the original frame, [..., 2] -> [..., 2]."""
+        """Convert pixels of the image (``size`` wide and high) to pixels of the original frame, [..., 2]."""
         return points * (self.side / size) + points.new_tensor((self.left, self.top))
 
     def from_original(self, points: Tensor, size: int) -> Tensor:
-        """Pixels of the original frame to pixels of the image (``size`` wide and high), [..., 2] -> [..., 2]."""
+        """Convert pixels of the original frame to pixels of the image (``size`` wide and high), [..., 2]."""
         return (points - points.new_tensor((self.left, self.top))) * (size / self.side)
 
     def original_camera(self, camera: Camera) -> Camera:
-        """The camera of the whole original frame, from the camera of the image."""
+        """Return the camera of the whole original frame, from the camera of the image."""
         scale = self.side / camera.width
         placed = torch.tensor(((scale, 0, self.left), (0, scale, self.top), (0, 0, 1)), dtype=camera.intrinsics.dtype)
         return replace(camera, intrinsics=placed @ camera.intrinsics, width=self.width, height=self.height)
 
     def cropped_camera(self, camera: Camera, size: int) -> Camera:
-        """The camera of the image (``size`` wide and high), from the camera of the whole original frame."""
+        """Return the camera of the image (``size`` wide and high), from the camera of the whole original frame."""
         moved = camera.intrinsics.clone()
         moved[0, 2] -= self.left
         moved[1, 2] -= self.top
@@ -140,7 +140,7 @@ class Frame:
     keypoints: Keypoints | None = None
 
     def over(self, background: float | Tensor) -> Tensor:
-        """The frame composited on a background colour (a number or a tensor that broadcasts), [3, h, w]."""
+        """Return the frame composited on a background colour (a number or a tensor that broadcasts), [3, h, w]."""
         return self.rgb + (1.0 - self.mask) * background
 
 
@@ -178,7 +178,7 @@ class Clip:
         return tuple(frame.time for frame in self.frames)
 
     def only(self, rows: Sequence[int]) -> "Clip":
-        """The clip without its other frames; the digest stays that of the whole."""
+        """Return the clip without its other frames; the digest stays that of the whole."""
         travel = self.travel
         if travel is not None:
             travel = torch.cat((travel.new_zeros(1, 2), travel.cumsum(0)))[list(rows)].diff(dim=0)

@@ -36,26 +36,26 @@ class Root:
 
     @classmethod
     def of(cls, clip: Clip, prior: Prior) -> "Root":
-        """The prior's root at the clip's frames."""
+        """Return the prior's root at the clip's frames."""
         rows = match_times(clip, prior)
         times = torch.tensor(clip.times, dtype=torch.float64)
         return cls(times, prior.object_to_world[rows].double(), tuple(frame.camera for frame in clip.frames))
 
     def position(self, time: float) -> float:
-        """Where a time lies among the frames: 1.5 is half-way between the second and the third."""
+        """Return where a time lies among the frames: 1.5 is half-way between the second and the third."""
         return frame_position(self.times, time)
 
     def in_world(self, splats: Splats, position: float) -> Splats:
-        """Gaussians moved from the method's frame into the world."""
+        """Return Gaussians moved from the method's frame into the world."""
         matrix = interpolate_similarity(self.object_to_world, position)
         return transform_splats(splats, matrix.to(splats.means.device))
 
     def camera(self, time: float) -> Camera | None:
-        """The input camera at a time, in the world; between frames it interpolates."""
+        """Return the input camera at a time, in the world; between frames it interpolates."""
         return camera_between(self.cameras, self.position(time))
 
     def with_frame(self, row: int, time: float) -> "Root":
-        """The same motion with one frame more, which is row ``row`` then."""
+        """Return the same motion with one frame more, which is row ``row`` then."""
         between = interpolate_similarity(self.object_to_world, self.position(time))
         return Root(
             torch.cat((self.times[:row], self.times.new_tensor((time,)), self.times[row:])),
@@ -79,13 +79,13 @@ class Root:
 
 
 def splats_of(own: Gaussians, means: Tensor, quats: Tensor, scales: Tensor) -> Splats:
-    """Gaussians of one moment with the canonical opacities and colours."""
+    """Return Gaussians of one moment with the canonical opacities and colours."""
     quats = nn.functional.normalize(quats, dim=-1)
     return Splats(means, quats, scales, own.opacities(), own.splat_colors(quats))
 
 
 def gaussians_from_state(state: dict[str, Tensor], max_scale: float) -> Gaussians:
-    """Gaussians of the shapes in a model's state; their blur is loaded with the model."""
+    """Return Gaussians of the shapes in a model's state; their blur is loaded with the model."""
     return Gaussians({name: state[f"gaussians.{name}"] for name in NAMES}, max_scale)
 
 

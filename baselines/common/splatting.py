@@ -38,7 +38,7 @@ class Shape(NamedTuple):
 
 
 def render(own: Gaussians, shape: Shape, camera: Camera, degree: int) -> tuple[Tensor, Tensor, RasterInfo]:
-    """One view of posed Gaussians.
+    """Return one view of posed Gaussians.
 
     Args:
         own: opacities and colours.
@@ -59,7 +59,7 @@ def render(own: Gaussians, shape: Shape, camera: Camera, degree: int) -> tuple[T
 def image_losses(
     rgb: Tensor, alpha: Tensor, target: Target, background: Tensor, weights: ImageLoss
 ) -> dict[str, Tensor]:
-    """Weighted losses of a render.
+    """Return the weighted losses of a render.
 
     Args:
         rgb: colour premultiplied, [3, h, w].
@@ -116,14 +116,14 @@ class SplatTraining(ABC):
 
     @abstractmethod
     def losses(self, index: int) -> tuple[dict[str, Tensor], RasterInfo, Target]:
-        """Weighted losses of one drawn view, the render's info and the view."""
+        """Return the weighted losses of one drawn view, the render's info and the view."""
 
     @abstractmethod
     def rate(self, name: str, progress: float) -> float:
-        """Learning rate of a group that is not the Gaussians'."""
+        """Return the learning rate of a group that is not the Gaussians'."""
 
     def step(self, index: int) -> dict[str, float]:
-        """One iteration; gives the figures for the log."""
+        """Return one iteration; gives the figures for the log."""
         progress = index / self.settings.iterations
         self.optimizer.param_groups[NAMES.index("means")]["lr"] = exponential(*self.settings.rates.means, progress)
         for name, group in zip(self.groups, self.others.param_groups, strict=True):
@@ -147,13 +147,13 @@ class SplatTraining(ABC):
         }
 
     def render(self, shape: Shape, target: Target, progress: float) -> tuple[Tensor, Tensor, RasterInfo]:
-        """Colour premultiplied [3, h, w], matte [1, h, w] and the info of one view."""
+        """Return the colour premultiplied [3, h, w], matte [1, h, w] and the info of one view."""
         canonical = self.settings.canonical
         degree = min(canonical.sh_degree, int(progress / canonical.sh_every))
         return render(self.gaussians, shape, target.camera, degree)
 
     def image_losses(self, rgb: Tensor, alpha: Tensor, target: Target) -> dict[str, Tensor]:
-        """Weighted losses of a render."""
+        """Return the weighted losses of a render."""
         drawn = self.settings.loss.random_background
         background = torch.rand(3, generator=self.generator).to(rgb) if drawn else rgb.new_ones(3)
         return image_losses(rgb, alpha, target, background, self.settings.loss)
@@ -181,7 +181,7 @@ class SplatTraining(ABC):
             reset_opacities(self.gaussians, self.optimizer, resets.opacity)
 
     def state(self) -> dict[str, Any]:
-        """Everything that a resumed fit needs."""
+        """Return the everything that a resumed fit needs."""
         return {
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),

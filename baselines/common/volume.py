@@ -20,7 +20,7 @@ DRAWS = 8
 
 
 def scene_frame(clip: Clip, prior: Prior) -> Prior:
-    """A "prior" whose root stands still: the shared volume's frame, with the clip's cameras in it.
+    """Return a "prior" whose root stands still: the shared volume's frame, with the clip's cameras in it.
 
     Args:
         clip: its cameras decide; the prior's are taken for frames without one.
@@ -52,7 +52,7 @@ def scene_frame(clip: Clip, prior: Prior) -> Prior:
 
 
 def common_volume(cameras: Sequence[Camera]) -> tuple[Tensor, float]:
-    """The point nearest to all lines of sight through the image centres, and half the side of a cube around it.
+    """Return the point nearest to all lines of sight through the image centres, and half the side of a cube around it.
 
     The cube is as wide as the longer side of the narrowest view there.
 
@@ -97,7 +97,7 @@ def random_points(count: int, cameras: Sequence[Camera], generator: torch.Genera
 
 
 def _sight(camera: Camera) -> Tensor:
-    """Unit direction through the middle of the image, in the world, [3]."""
+    """Return the unit direction through the middle of the image, in the world, [3]."""
     middle = torch.tensor((camera.width / 2, camera.height / 2, 1.0), dtype=torch.float64)
     local = torch.linalg.solve(camera.intrinsics.double(), middle)
     return torch.nn.functional.normalize(camera.world_to_camera[:3, :3].double().T @ local, dim=0)

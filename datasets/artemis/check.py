@@ -42,7 +42,7 @@ _Result = TypeVar("_Result")
 
 
 def check_animal(animal: Path) -> list[Finding]:
-    """All faults of one animal's folder; every image is decoded.
+    """Return all faults of one animal's folder; every image is decoded.
 
     Returns:
         Errors (the data cannot be used), warnings (it can, but look), and a last "ok" line where there was no error.
@@ -112,7 +112,7 @@ class _Check:
             self._add("warning", self.animal / "img" / motion, "images are JPEG: expect compression at the silhouette")
 
     def _studies(self, motion: str, pairs: list[ImagePair], source: tuple[int, int] | None) -> list["_Study | None"]:
-        """What each pair of images holds, None where it cannot be read."""
+        """Return what each pair of images holds, None where it cannot be read."""
         title = f"checking {self.animal.name}/{motion}"
         with ThreadPoolExecutor(2) as pool:
             results = pool.map(_study, pairs, [source] * len(pairs))
@@ -196,7 +196,7 @@ class _Check:
         *args: _Arguments.args,
         **kwargs: _Arguments.kwargs,
     ) -> _Result | None:
-        """What an action returns, or None and a finding where it fails."""
+        """Return what an action returns, or None and a finding where it fails."""
         try:
             return action(*args, **kwargs)
         except UserError as error:
@@ -222,7 +222,7 @@ class _Study:
 
 
 def _study(pair: ImagePair, source: tuple[int, int] | None) -> _Study | UserError:
-    """What a pair of images holds, or what is wrong with it."""
+    """Return what a pair of images holds, or what is wrong with it."""
     try:
         rgb, alpha = read_pair(pair, source)
     except UserError as error:

@@ -22,7 +22,7 @@ _COLUMNS = (2, 0, 1, 3)
 
 
 def read_matrices(path: Path, what: str) -> np.ndarray:
-    """Matrices of a CamPose or Bones file, float64, [n, 4, 4].
+    """Return matrices of a CamPose or Bones file, float64, [n, 4, 4].
 
     Args:
         path: the file.
@@ -50,7 +50,7 @@ def write_matrices(path: Path, matrices: np.ndarray) -> None:
 
 
 def read_cameras(path: Path) -> np.ndarray:
-    """Camera-to-world matrices of CamPose.inf, [V, 4, 4].
+    """Return camera-to-world matrices of CamPose.inf, [V, 4, 4].
 
     Raises:
         UserError: as `read_matrices`, or a rotation that is not one (orthonormal to 1e-3 with determinant +1).
@@ -68,7 +68,7 @@ def read_cameras(path: Path) -> np.ndarray:
 
 
 def read_intrinsics(path: Path, views: int) -> np.ndarray:
-    """Intrinsics of every view with pixel centres at +0.5, float64, [V, 3, 3].
+    """Return intrinsics of every view with pixel centres at +0.5, float64, [V, 3, 3].
 
     Raises:
         UserError: no such file, a block that is not a pinhole matrix, or not one block a view.
@@ -145,7 +145,7 @@ def _expect_tree(path: Path, parents: np.ndarray) -> None:
 
 
 def read_sequences(path: Path) -> dict[str, int]:
-    """Motions and their frame counts, from lines "<motion> <n_frames>".
+    """Return motions and their frame counts, from lines "<motion> <n_frames>".
 
     Raises:
         UserError: a line of another form.
@@ -191,14 +191,14 @@ def list_motions(animal: Path) -> dict[str, int]:
 
 
 def motion_folders(animal: Path) -> list[Path]:
-    """Folders under img/ but those that a program hid there with a dot; none where there is no img/."""
+    """Return folders under img/ but those that a program hid there with a dot; none where there is no img/."""
     images = animal / "img"
     found = images.iterdir() if images.is_dir() else ()
     return sorted(path for path in found if path.is_dir() and not path.name.startswith("."))
 
 
 def list_frames(motion: Path) -> list[Path]:
-    """Frame folders of a motion in the order of their numbers 0, 1, 2, ...
+    """Return the frame folders of a motion in the order of their numbers 0, 1, 2, ...
 
     Raises:
         UserError: no frame folders, one is missing, or two have one number.
@@ -222,7 +222,7 @@ def list_frames(motion: Path) -> list[Path]:
 
 
 def list_images(frame: Path, views: int) -> list[ImagePair]:
-    """The image and matte files of every view of one frame folder.
+    """Return the image and matte files of every view of one frame folder.
 
     Raises:
         UserError: a view or a matte is missing, or there are images of more views than cameras.
@@ -245,13 +245,13 @@ def list_images(frame: Path, views: int) -> list[ImagePair]:
 
 
 def frames_per_second(motion: str) -> float:
-    """Artemis motions play at 30 frames a second, or as a name such as "s1_24fps" says."""
+    """Return artemis motions play at 30 frames a second, or as a name such as "s1_24fps" says."""
     match = re.search(r"_(\d+(?:\.\d+)?)fps$", motion, re.IGNORECASE)
     return float(match[1]) if match and float(match[1]) > 0 else 30.0
 
 
 def read_licence(animal: Path) -> str:
-    """First line of the animal's licence file, or a sentence that says there is none."""
+    """Return the first line of the animal's licence file, or a sentence that says there is none."""
     for name in LICENCE_FILES:
         if (animal / name).is_file():
             lines = (line.strip() for line in _lines(animal / name))
@@ -267,7 +267,7 @@ def _lines(path: Path) -> Sequence[str]:
 
 
 def _numbers(line: str, where: str) -> list[float]:
-    """The finite numbers of a line."""
+    """Return the finite numbers of a line."""
     values = []
     for token in line.split():
         try:

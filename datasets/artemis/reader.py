@@ -99,7 +99,7 @@ class Artemis:
         return read_recipe(self._animals[case.partition("/")[0]])
 
     def _table(self, selection: Selection) -> dict[str, tuple[str, str, str]]:
-        """Case name -> animal, motion, placement ("" for none)."""
+        """Return the case name -> animal, motion, placement ("" for none)."""
         placements = selection.placements if selection.cameras == "fixed" else ()
         table: dict[str, tuple[str, str, str]] = {}
         for animal, folder in self._animals.items():
@@ -131,7 +131,7 @@ class _Motion:
         return frames_per_second(self.motion) / self.selection.stride
 
     def split(self, case: str, species: str, placement: str) -> tuple[Clip, Truth]:
-        """The clip and the truth of a case."""
+        """Return the clip and the truth of a case."""
         views = len(self.camera_to_world)
         surface, poses = self._geometry()
         fixed_view = self._fixed_view(placement, surface, poses)
@@ -155,7 +155,7 @@ class _Motion:
         return clip, Truth(hidden, moving.at, key, moving.sample, surface.diagonal, up, rig)
 
     def _geometry(self) -> tuple[Surface | None, list[np.ndarray]]:
-        """Surface points at rest and the bones of each kept frame."""
+        """Return the surface points at rest and the bones of each kept frame."""
         surface = read_surface(self.folder)
         if surface is None:
             return None, []
@@ -180,7 +180,7 @@ class _Motion:
             raise UserError(strayed_sentence(self.folder, self.motion, wrong, shown))
 
     def _notes(self, decoded: Decoded, selected: list[int]) -> Iterator[str]:
-        """What a person should know of this motion before its scores."""
+        """Yield what a person should know of this motion before its scores."""
         looks = [look(decoded.rgba[index, view, ..., 3]) for index, view in enumerate(selected)]
         framed = sum(found is not None and found.framed > FRAMED for found in looks)
         if framed and self.selection.framing == "full":
@@ -192,7 +192,7 @@ class _Motion:
             yield "one view: none is held out, so that no novel view can be scored"
 
     def _cameras(self, decoded: Decoded) -> list[Camera]:
-        """World camera of each view for the decoded images."""
+        """Return the world camera of each view for the decoded images."""
         intrinsics = read_intrinsics(self.folder / "Intrinsic.inf", len(self.camera_to_world))
         height, width = decoded.rgba.shape[2:4]
         cameras = []
@@ -226,7 +226,7 @@ class _Frames(Sequence[Frame]):
         return Frame(frame / self._fps, self.cameras[view], rgba[:3], rgba[3:], view)
 
     def digest(self) -> str:
-        """SHA-256 over times, cameras and pixels."""
+        """Return SHA-256 over times, cameras and pixels."""
         parts: list[str | torch.Tensor | np.ndarray] = [repr(self._fps)]
         for frame, view in self._pairs:
             camera = self.cameras[view]
@@ -249,7 +249,7 @@ def _expect_animal(decoded: Decoded, pairs: list[list[ImagePair]], selected: lis
 
 
 def _motion_names(folder: Path) -> list[str]:
-    """Motions of an animal; of a faulty one the folders that it has, or a word in their place."""
+    """Return motions of an animal; of a faulty one the folders that it has, or a word in their place."""
     try:
         return list(list_motions(folder))
     except UserError:
@@ -257,5 +257,5 @@ def _motion_names(folder: Path) -> list[str]:
 
 
 def _is_animal(folder: Path) -> bool:
-    """Whether a folder is meant as an animal's; one that a killed writer left behind starts with a dot."""
+    """Tell whether a folder is meant as an animal's; one that a killed writer left behind starts with a dot."""
     return not folder.name.startswith(".") and ((folder / "CamPose.inf").is_file() or (folder / "img").is_dir())

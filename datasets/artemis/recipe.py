@@ -34,7 +34,7 @@ def read_recipe(folder: Path) -> str:
 
 
 def _files(folder: Path) -> str:
-    """Digest of the names and the bytes of all files but the recipe."""
+    """Return the digest of the names and the bytes of all files but the recipe."""
     files = (path for path in folder.rglob("*") if path.is_file() and path != folder / FILE)
     paths = sorted(files, key=lambda path: path.parts)  # Windows would sort without case
     return digest(*(part for path in paths for part in (path.relative_to(folder).as_posix(), path.read_bytes())))

@@ -23,7 +23,7 @@ LEVEL = 0.4
 
 
 def read_rig(animal: Path, poses: Sequence[np.ndarray]) -> Rig:
-    """The rig of an animal at the given poses.
+    """Return the rig of an animal at the given poses.
 
     Args:
         animal: its folder.
@@ -53,7 +53,7 @@ def read_rig(animal: Path, poses: Sequence[np.ndarray]) -> Rig:
 
 
 def skin(voxels: Voxels) -> tuple[np.ndarray, np.ndarray]:
-    """The surface through the outermost voxels' centres: vertices [n, 3] in the world and triangles [f, 3]."""
+    """Return the surface through the outermost voxels' centres: vertices [n, 3] in the world and triangles [f, 3]."""
     step = -(-(int(voxels.cells.max()) + 1) // MESH_CELLS)
     cells = voxels.cells // step
     border = 2
@@ -66,7 +66,7 @@ def skin(voxels: Voxels) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _parents_among(kept: np.ndarray, parents: np.ndarray) -> np.ndarray:
-    """The nearest ancestor of each kept bone that is kept, as a row of ``kept``, -1 for none."""
+    """Return the nearest ancestor of each kept bone that is kept, as a row of ``kept``, -1 for none."""
     row = {int(bone): index for index, bone in enumerate(kept)}
     found = []
     for bone in kept:

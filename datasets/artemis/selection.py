@@ -12,12 +12,12 @@ PLACEMENT_AZIMUTHS = {"side": 90.0, "oblique": 45.0, "frontal": 0.0}
 
 
 def kept_frames(count: int, selection: Selection) -> list[int]:
-    """Numbers of the frames of a motion that a selection keeps."""
+    """Return numbers of the frames of a motion that a selection keeps."""
     return list(range(0, count, selection.stride))
 
 
 def selected_views(frames: int, views: int, selection: Selection, fixed_view: int = 0) -> list[int]:
-    """The view that the method sees at each kept frame.
+    """Return the view that the method sees at each kept frame.
 
     Args:
         frames: number of kept frames.
@@ -33,12 +33,12 @@ def selected_views(frames: int, views: int, selection: Selection, fixed_view: in
 
 
 def held_out(selected: list[int], views: int) -> list[tuple[int, int]]:
-    """All (kept frame, view) pairs that the method does not see, in the order of time."""
+    """Return all (kept frame, view) pairs that the method does not see, in the order of time."""
     return [(frame, view) for frame, seen in enumerate(selected) for view in range(views) if view != seen]
 
 
 def up_direction(camera_to_world: np.ndarray) -> np.ndarray:
-    """The world's up, from the cameras alone, unit [3].
+    """Return the world's up, from the cameras alone, unit [3].
 
     Cameras that are not rolled have horizontal x axes whatever their elevation, so up is the direction most orthogonal
     to all of them, on the side of the images' upper edges. Where the x axes are parallel it is the mean upper edge.
@@ -55,7 +55,7 @@ def up_direction(camera_to_world: np.ndarray) -> np.ndarray:
 
 
 def placed_view(placement: str, points: np.ndarray, camera_to_world: np.ndarray) -> int:
-    """The camera that stands at a named place relative to the animal.
+    """Return the camera that stands at a named place relative to the animal.
 
     The animal's long axis is the first principal axis of its points in the horizontal plane; head and tail are not told
     apart. Every camera has an azimuth (0 to 90 degrees from that axis) and an elevation above the cameras' median; the

@@ -50,7 +50,7 @@ def look(alpha: np.ndarray) -> Look | None:
 
 
 def strayed(cameras: Sequence[Camera], looks: Sequence[Look | None]) -> list[int]:
-    """Views in which the animal is not where the views' lines of sight meet.
+    """Return views in which the animal is not where the views' lines of sight meet.
 
     Args:
         cameras: of the views of one moment.
@@ -74,7 +74,7 @@ def strayed(cameras: Sequence[Camera], looks: Sequence[Look | None]) -> list[int
 
 
 def strayed_sentence(animal: Path, motion: str, wrong: int, shown: int) -> str:
-    """What to say where `strayed` finds ``wrong`` of ``shown`` views."""
+    """Return what to say where `strayed` finds ``wrong`` of ``shown`` views."""
     return (
         f"{animal / 'CamPose.inf'}: expected camera-to-world matrices with OpenCV axes that fit Intrinsic.inf and the "
         f"images, but where the lines of sight to the animal meet ('{motion}', first frame) is behind the camera or "
@@ -83,7 +83,7 @@ def strayed_sentence(animal: Path, motion: str, wrong: int, shown: int) -> str:
 
 
 def _direction(camera: Camera, pixel: np.ndarray) -> np.ndarray:
-    """Unit vector through a pixel in the world, [3]."""
+    """Return the unit vector through a pixel in the world, [3]."""
     ray = camera.world_to_camera[:3, :3].numpy().T @ np.linalg.solve(camera.intrinsics.numpy(), np.append(pixel, 1.0))
     return ray / np.linalg.norm(ray)
 

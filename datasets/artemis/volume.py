@@ -73,7 +73,7 @@ class Surface:
         return self._rows(np.sort(np.random.default_rng(0).choice(len(self.points), count, replace=False)))
 
     def sampled(self, count: int, seed: int) -> "Surface":
-        """Points in the cells of the surface voxels: each voxel gets as many as any other or one more.
+        """Return points in the cells of the surface voxels: each voxel gets as many as any other or one more.
 
         A point lies anywhere in its voxel's cell, as the true surface does, so two seeds give independent samplings of
         the surface and the distance between them is what a perfect reconstruction would get.
@@ -89,7 +89,7 @@ class Surface:
 
 
 def read_skeleton(animal: Path) -> np.ndarray:
-    """Rest bones of an animal, [J, 4, 4], held against the file of parents.
+    """Return the rest bones of an animal, [J, 4, 4], held against the file of parents.
 
     Raises:
         UserError: a file is missing or damaged, a bone that cannot be inverted, another number of bones than parents.
@@ -106,7 +106,7 @@ def read_skeleton(animal: Path) -> np.ndarray:
 
 
 def read_pose(animal: Path, motion: str, frame: int, bones: int) -> np.ndarray:
-    """Global bone-to-world matrices at one frame, [J, 4, 4].
+    """Return the global bone-to-world matrices at one frame, [J, 4, 4].
 
     Raises:
         UserError: no such file, or another number of bones than at rest.
@@ -119,7 +119,7 @@ def read_pose(animal: Path, motion: str, frame: int, bones: int) -> np.ndarray:
 
 
 def read_surface(animal: Path) -> Surface | None:
-    """The voxels of an animal that miss one of their six neighbours, or None where it has no folder of volumes.
+    """Return the voxels of an animal that miss one of their six neighbours, or None where it has no folder of volumes.
 
     Raises:
         UserError: as `read_voxels`.
@@ -134,7 +134,7 @@ def read_surface(animal: Path) -> Surface | None:
 
 
 def read_voxels(animal: Path) -> Voxels | None:
-    """The voxels of an animal, or None where it has no folder of volumes.
+    """Return the voxels of an animal, or None where it has no folder of volumes.
 
     Raises:
         UserError: a file is missing or damaged, shapes that do not fit, a bone index out of range, no lattice.
@@ -184,7 +184,7 @@ def _unsound(rows: np.ndarray) -> str:
 
 
 def lattice(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Integer cells of points on an axis-aligned lattice whose pitch may differ per axis.
+    """Return the integer cells of points on an axis-aligned lattice whose pitch may differ per axis.
 
     Args:
         points: float64, [n, 3].
@@ -207,7 +207,7 @@ def lattice(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def is_surface(cells: np.ndarray) -> np.ndarray:
-    """Which cells miss at least one of their six neighbours, bool, [n]."""
+    """Return which cells miss at least one of their six neighbours, bool, [n]."""
     # A border of one cell on each side keeps neighbours from wrapping into another row.
     size = cells.max(axis=0) + 3
     steps = np.array([size[1] * size[2], size[2], 1])
@@ -240,11 +240,11 @@ class MovingSurface:
         return self.surface.thinned(SURFACE_POINTS)
 
     def at(self, time: float) -> torch.Tensor:
-        """See `types.Truth.surface`: at most `SURFACE_POINTS` voxel centres."""
+        """Return the see `types.Truth.surface`: at most `SURFACE_POINTS` voxel centres."""
         return torch.from_numpy(self._thinned.posed(self._pose(time)))
 
     def sample(self, time: float, count: int, seed: int) -> torch.Tensor:
-        """See `types.Truth.sample`."""
+        """Return the see `types.Truth.sample`."""
         return torch.from_numpy(self.surface.sampled(count, seed).posed(self._pose(time)))
 
     def _pose(self, time: float) -> np.ndarray:

@@ -90,7 +90,7 @@ class Skeleton:
         self.tails.append(tail)
 
     def rest(self) -> np.ndarray:
-        """Rigid rest matrices (bone to body), local y along the bone, float64, [J, 4, 4]."""
+        """Return the rigid rest matrices (bone to body), local y along the bone, float64, [J, 4, 4]."""
         matrices = np.tile(np.eye(4), (len(self.names), 1, 1))
         for matrix, head, tail in zip(matrices, self.heads, self.tails, strict=True):
             along = (tail - head) / np.linalg.norm(tail - head)
@@ -115,7 +115,7 @@ class Flesh:
 
 
 def assemble(body: Body) -> tuple[Skeleton, list[Flesh]]:
-    """Skeleton and flesh of a body plan, left and right expanded."""
+    """Return the skeleton and flesh of a body plan, left and right expanded."""
     skeleton, flesh = Skeleton(), []
     for chain in body.chains:
         for side, sign in _sides(chain.mirrored):

@@ -41,12 +41,12 @@ def mix(first: np.ndarray, second: np.ndarray, amount: np.ndarray) -> np.ndarray
 
 
 def rgb(text: str) -> np.ndarray:
-    """Colour of six hexadecimal digits, [3]."""
+    """Return the colour of six hexadecimal digits, [3]."""
     return np.array([int(text[i : i + 2], 16) for i in (0, 2, 4)]) / 255
 
 
 def chestnut_pinto(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """A horse: chestnut with white patches, white socks and a blaze."""
+    """Return a horse: chestnut with white patches, white socks and a blaze."""
     x, y, z = points.T
     chestnut = mix(rgb("8a4a22"), rgb("6b3416"), 0.5 + 0.7 * noise(points, 0.22, 1))
     white = rgb("efe9dd")
@@ -60,7 +60,7 @@ def chestnut_pinto(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def tiger(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """A tiger: orange with a white belly and face, black stripes around the body, the legs and the tail."""
+    """Return a tiger: orange with a white belly and face, black stripes around the body, the legs and the tail."""
     x, y, z = points.T
     orange = mix(rgb("e08a28"), rgb("c96f1c"), 0.5 + 0.6 * noise(points, 0.2, 11))
     inner = -np.sign(x) * normals[:, 0] * (y < 0.62)
@@ -78,7 +78,7 @@ def tiger(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def giraffe(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """A giraffe: brown patches with cream borders, fading on the lower legs and the face."""
+    """Return a giraffe: brown patches with cream borders, fading on the lower legs and the face."""
     x, y, z = points.T
     cream = mix(rgb("f0dcb0"), rgb("e2c48d"), 0.5 + 0.5 * noise(points, 0.3, 21))
     brown = mix(rgb("8a4f20"), rgb("a4652b"), 0.5 + 0.6 * noise(points, 0.25, 22))

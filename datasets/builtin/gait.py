@@ -60,7 +60,7 @@ def animate(skeleton: Skeleton, gait: Gait, frames: int) -> np.ndarray:
 
 
 def pose(skeleton: Skeleton, gait: Gait, time: float) -> np.ndarray:
-    """Rest-to-posed transforms at a time in cycles, [J, 4, 4]."""
+    """Return rest-to-posed transforms at a time in cycles, [J, 4, 4]."""
     moved = np.tile(np.eye(4), (len(skeleton.names), 1, 1))
     for j, name in enumerate(skeleton.names):
         if name.split(".")[0] in ("fore", "hind"):
@@ -134,7 +134,7 @@ def _place_leg(skeleton: Skeleton, moved: np.ndarray, foot: str, gait: Gait, pha
 
 
 def _angle(vector: np.ndarray) -> float:
-    """Angle of (y, z) from up towards ahead, radians: pitch adds to it."""
+    """Return the angle of (y, z) from up towards ahead, radians: pitch adds to it."""
     return float(np.arctan2(vector[1], vector[0]))
 
 

@@ -17,7 +17,7 @@ SEAM = 0.2
 
 
 def distance(points: np.ndarray, flesh: Flesh) -> np.ndarray:
-    """Signed distance (squashed capsules: a lower bound) of points [..., 3] in metres, [...]."""
+    """Return the signed distance (squashed capsules: a lower bound) of points [..., 3] in metres, [...]."""
     start, axis = flesh.start, (flesh.end - flesh.start) / flesh.squash
     local = (points - start) / flesh.squash
     along = np.clip(local @ axis / max(axis @ axis, 1e-12), 0.0, 1.0)
@@ -26,7 +26,7 @@ def distance(points: np.ndarray, flesh: Flesh) -> np.ndarray:
 
 
 def polygonise(parts: Sequence[Flesh], cell: float) -> tuple[np.ndarray, np.ndarray]:
-    """The smooth union of all parts above the ground y = 0, as a closed surface.
+    """Return the smooth union of all parts above the ground y = 0, as a closed surface.
 
     Args:
         parts: flesh in the body frame.
@@ -61,7 +61,7 @@ def _blend_in(field: np.ndarray, axes: list[np.ndarray], part: Flesh, cell: floa
 
 
 def nearest_part(vertices: np.ndarray, parts: Sequence[Flesh]) -> np.ndarray:
-    """Which part each vertex [n, 3] lies on, int64, [n]."""
+    """Return which part each vertex [n, 3] lies on, int64, [n]."""
     return np.stack([distance(vertices, part) for part in parts]).argmin(axis=0)
 
 
@@ -89,7 +89,7 @@ def skinning(
 
 
 def _averaging(faces: np.ndarray, count: int) -> scipy.sparse.csr_matrix:
-    """Row-stochastic matrix: half a vertex, half the mean of its neighbours."""
+    """Return the row-stochastic matrix: half a vertex, half the mean of its neighbours."""
     edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
     both = np.concatenate((edges, edges[:, ::-1]))
     adjacency = scipy.sparse.csr_matrix((np.ones(len(both)), both.T), shape=(count, count)).minimum(1.0)

@@ -120,13 +120,13 @@ RECIPES = {
 
 
 def animals() -> list[str]:
-    """Names of the built-in animals."""
+    """Return names of the built-in animals."""
     return list(RECIPES)
 
 
 @cache
 def rest_surface(name: str) -> Surface:
-    """Rest surface of a built-in animal in its body frame (see `anatomy`), skinned and coloured.
+    """Return the rest surface of a built-in animal in its body frame (see `anatomy`), skinned and coloured.
 
     Raises:
         UserError: no such animal.
@@ -145,7 +145,7 @@ def rest_surface(name: str) -> Surface:
 
 
 def placement(name: str) -> np.ndarray:
-    """Rigid matrix from an animal's body frame to its world, [4, 4]."""
+    """Return the rigid matrix from an animal's body frame to its world, [4, 4]."""
     recipe = RECIPES[name]
     angle = np.radians(recipe.heading)
     matrix = np.eye(4)
@@ -158,7 +158,7 @@ def placement(name: str) -> np.ndarray:
 
 @cache
 def build(name: str) -> list[AnimatedAnimal]:
-    """Every motion of a built-in animal, in its world, metres.
+    """Return every motion of a built-in animal, in its world, metres.
 
     Raises:
         UserError: no such animal.
@@ -194,7 +194,7 @@ def recipe_digest() -> str:
 
 
 def ensure(progress: Progress | None = None) -> Path:
-    """The folder of all built-in animals in Artemis format, rendered on first use and kept in the cache.
+    """Return the folder of all built-in animals in Artemis format, rendered on first use and kept in the cache.
 
     Its name begins with their version: records of one version stand in one table, whichever processor rendered them
     (leaderboard/variants.py). An edit that changes the pictures by more than rounding raises it.

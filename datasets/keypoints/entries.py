@@ -31,7 +31,7 @@ class LeftOut:
         self._found: list[tuple[str, Unusable]] = []
 
     def usable(self, entries: Sequence[Any], read: Callable[[Entry], T]) -> Iterator[T]:
-        """What ``read`` makes of every entry, without those for which it raises `Unusable`."""
+        """Yield what ``read`` makes of every entry, without those for which it raises `Unusable`."""
         self.total += len(entries)
         for number, entry in enumerate(entries):
             try:
@@ -61,12 +61,12 @@ class LeftOut:
 
 
 def shown(entry: Entry, key: str) -> str:
-    """A value as a sentence names it: "bbox null", "no bbox"."""
+    """Return a value as a sentence names it: "bbox null", "no bbox"."""
     return f"{key} {short(entry[key])}" if key in entry else f"no {key}"
 
 
 def short(value: Any) -> str:
-    """A value as JSON writes it, cut where it is long."""
+    """Return a value as JSON writes it, cut where it is long."""
     text = json.dumps(value)
     return text if len(text) <= 60 else f"{text[:60]}... ({len(text)} characters)"
 
@@ -77,7 +77,7 @@ def _label(entry: Any, number: int) -> str:
 
 
 def listed(table: Any, key: str) -> list[Any]:
-    """A list of a table.
+    """Return a list of a table.
 
     Raises:
         ValueError: there is none.
@@ -88,19 +88,19 @@ def listed(table: Any, key: str) -> list[Any]:
 
 
 def by_id(items: Sequence[Any], key: str, kind: type) -> dict[Any, Entry]:
-    """The items that have an id and a value of a kind, by the id; others count as not listed."""
+    """Return the items that have an id and a value of a kind, by the id; others count as not listed."""
     fit = (item for item in items if isinstance(item, Mapping) and isinstance(item.get(key), kind))
     return {item["id"]: item for item in fit if isinstance(item.get("id"), _ID)}
 
 
 def look_up(table: Mapping[Any, Entry], entry: Entry, key: str) -> Entry | None:
-    """What an entry's id stands for; None where nothing is listed under it."""
+    """Return what an entry's id stands for; None where nothing is listed under it."""
     number = entry.get(key)
     return table.get(number) if isinstance(number, _ID) else None
 
 
 def image_of(images: Mapping[Any, Entry], entry: Entry) -> Entry:
-    """The image of an annotation.
+    """Return the image of an annotation.
 
     Raises:
         Unusable: it is not listed.
@@ -112,7 +112,7 @@ def image_of(images: Mapping[Any, Entry], entry: Entry) -> Entry:
 
 
 def numbers(values: Any) -> list[float]:
-    """A list of numbers; empty where it is none, or where one is too large for a float."""
+    """Return a list of numbers; empty where it is none, or where one is too large for a float."""
     try:
         return [float(value) for value in values] if isinstance(values, list) else []
     except (TypeError, ValueError, OverflowError):
@@ -120,7 +120,7 @@ def numbers(values: Any) -> list[float]:
 
 
 def box_of(entry: Entry) -> tuple[float, float, float, float]:
-    """Left, top, width and height.
+    """Return the left, top, width and height.
 
     Raises:
         Unusable: there is no such box.

@@ -39,7 +39,7 @@ Points = list[tuple[str, float, float, bool]]
 
 
 def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int]) -> OfFrames:
-    """Keypoints of the frames of a folder.
+    """Return keypoints of the frames of a folder.
 
     Args:
         path: .json of BADJA or COCO form, .csv of DeepLabCut or SLEAP.
@@ -84,7 +84,7 @@ def _checked(points: Points, size: tuple[int, int]) -> Keypoints:
 
 
 def _json(content: Any, size: tuple[int, int], left: LeftOut) -> dict[str, Points]:
-    """Points by the stem of their frame; ``left`` gets the entries that cannot be used."""
+    """Return points by the stem of their frame; ``left`` gets the entries that cannot be used."""
     if isinstance(content, list):
         return dict(left.usable(content, partial(_badja, size=size)))
     return _coco(content, left)
@@ -100,7 +100,7 @@ def _badja(entry: Entry, size: tuple[int, int]) -> tuple[str, Points]:
 
 
 def _coco(content: Any, left: LeftOut) -> dict[str, Points]:
-    """The annotation with the largest box of each image."""
+    """Return the annotation with the largest box of each image."""
     images = by_id(listed(content, "images"), "file_name", str)
     kinds = by_id(listed(content, "categories"), "keypoints", list)
     largest: dict[str, float] = {}
@@ -112,7 +112,7 @@ def _coco(content: Any, left: LeftOut) -> dict[str, Points]:
 
 
 def _annotated(images: Mapping[Any, Entry], kinds: Mapping[Any, Entry], entry: Entry) -> tuple[str, float, Points]:
-    """The stem of an annotation's image, the area of its box, and its points.
+    """Return the stem of an annotation's image, the area of its box, and its points.
 
     Raises:
         Unusable: one of them is not there.
@@ -152,13 +152,13 @@ def _sleap(rows: list[list[str]], stems: Sequence[str]) -> dict[str, Points]:
 
 
 def _score(row: list[str], at: Mapping[str, int], name: str) -> float:
-    """A node without a score, as labels by hand are, is certain."""
+    """Read scores; a node without one, as in labels by hand, is certain."""
     score = _number(row[at[f"{name}.score"]]) if f"{name}.score" in at else math.nan
     return 1.0 if math.isnan(score) else score
 
 
 def _deeplabcut(rows: list[list[str]], stems: Sequence[str]) -> dict[str, Points]:
-    """Header rows scorer, (individuals,) bodyparts, coords; of several individuals the first."""
+    """Return the header rows scorer, (individuals,) bodyparts, coords; of several individuals the first."""
     heads = {row[0].strip(): row for row in rows[:4]}
     parts, coords = heads["bodyparts"], heads["coords"]
     people = heads.get("individuals", [""] * len(parts))
@@ -190,7 +190,7 @@ def _number(text: str) -> float:
 
 
 def _counted(label: str, stems: Sequence[str]) -> str:
-    """The frame that a row is about: a bare number counts from 0, all else is the name or path of an image."""
+    """Return the frame that a row is about: a bare number counts from 0, all else is the name or path of an image."""
     number = re.fullmatch(r"([0-9]+)(\.0)?", label.strip())
     if number is None:
         return _stem(label)

@@ -32,7 +32,7 @@ APT = (
 
 
 def read_json(path: Path) -> Any:
-    """The contents of a JSON file.
+    """Return the contents of a JSON file.
 
     Raises:
         UserError: it is missing or no JSON.
@@ -50,7 +50,7 @@ OfFrames = tuple[list[Keypoints | None], str]
 
 
 def badja_joints(entry: Entry) -> tuple[str, list[tuple[float, float]], list[bool]]:
-    """An entry of BADJA's: the stem of its frame, and (column, row) and visibility of every joint.
+    """Return an entry of BADJA's: the stem of its frame, and (column, row) and visibility of every joint.
 
     Places are in a frame of `BADJA_SIZE`, pixel centres at +0.5.
 
@@ -72,7 +72,7 @@ def badja_joints(entry: Entry) -> tuple[str, list[tuple[float, float]], list[boo
 
 
 def bounded(names: Sequence[str], points: Tensor, seen: Tensor, size: tuple[int, int]) -> Keypoints:
-    """Keypoints of which those outside their frame are not visible.
+    """Return keypoints of which those outside their frame are not visible.
 
     Args:
         names: [n].
@@ -84,7 +84,7 @@ def bounded(names: Sequence[str], points: Tensor, seen: Tensor, size: tuple[int,
 
 
 def inside(points: Tensor, size: tuple[int, int]) -> Tensor:
-    """Which points lie in their frame, bool, [n]; one that is not finite does not."""
+    """Return which points lie in their frame, bool, [n]; one that is not finite does not."""
     return ((points >= 0) & (points <= torch.tensor(size))).all(dim=1)
 
 
@@ -104,7 +104,7 @@ def not_used(path: Path, found: Sequence[Keypoints | None], size: tuple[int, int
 
 
 def read_badja(path: Path, stems: Sequence[str], size: tuple[int, int]) -> OfFrames:
-    """BADJA's joints of one sequence, those outside the frame not visible.
+    """Return BADJA's joints of one sequence, those outside the frame not visible.
 
     Args:
         path: joint_annotations/<sequence>.json.
@@ -137,7 +137,7 @@ def _named_joints(entry: Entry, size: tuple[int, int]) -> tuple[str, Keypoints]:
 
 
 def coco_keypoints(values: Sequence[float], names: Sequence[str], size: tuple[int, int]) -> tuple[Keypoints, int]:
-    """One annotation's keypoints; those outside the image are taken as not visible.
+    """Return one annotation's keypoints; those outside the image are taken as not visible.
 
     Args:
         values: x, y, v of each, [3 n].
@@ -154,7 +154,7 @@ def coco_keypoints(values: Sequence[float], names: Sequence[str], size: tuple[in
 
 
 def in_crop(keypoints: Keypoints | None, crop: Crop, size: int) -> Keypoints | None:
-    """The same points in the pixels of a crop."""
+    """Return the same points in the pixels of a crop."""
     if keypoints is None:
         return None
     return Keypoints(keypoints.names, crop.from_original(keypoints.points, size), keypoints.visible)

@@ -26,7 +26,7 @@ FIRST_ROUNDS, ROUNDS = 5, 2
 
 
 def rough_masks(source: Unmasked) -> Iterator[np.ndarray]:
-    """GrabCut on every frame; before the first box and after the animal is lost masks are empty.
+    """Yield grabCut on every frame; before the first box and after the animal is lost masks are empty.
 
     Raises:
         UserError: no box.
@@ -59,7 +59,7 @@ def rough_masks(source: Unmasked) -> Iterator[np.ndarray]:
 
 
 def from_box(image: np.ndarray, box: Box, scale: float) -> np.ndarray:
-    """The mask inside a box, 0 or 1.
+    """Return the mask inside a box, 0 or 1.
 
     Args:
         image: [h, w, 3].
@@ -83,13 +83,13 @@ def from_box(image: np.ndarray, box: Box, scale: float) -> np.ndarray:
 
 
 def colors(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Histogram of the colours in a mask, [8, 8, 8], sums to one."""
+    """Return the histogram of the colours in a mask, [8, 8, 8], sums to one."""
     counts = cv2.calcHist([image], [0, 1, 2], mask, [8, 8, 8], [0, 256] * 3)
     return counts / max(1.0, float(counts.sum()))
 
 
 def from_mask(image: np.ndarray, carried: np.ndarray) -> np.ndarray | None:
-    """The mask near one that was carried over from the frame before, 0 or 1; None where nothing is left."""
+    """Return the mask near one that was carried over from the frame before, 0 or 1; None where nothing is left."""
     area = int(carried.sum())
     if not area:
         return None
@@ -104,7 +104,7 @@ def from_mask(image: np.ndarray, carried: np.ndarray) -> np.ndarray | None:
 
 
 def _cut(image: np.ndarray, labels: np.ndarray, rounds: int) -> np.ndarray:
-    """GrabCut on the part of the image around the labels: colours far away say nothing about the animal."""
+    """Run GrabCut on the part of the image around the labels: colours far away say nothing about the animal."""
     height, width = labels.shape
     x, y, w, h = cv2.boundingRect((labels != cv2.GC_BGD).astype(np.uint8))
     pad = max(12, round(0.35 * max(w, h)))
@@ -121,7 +121,7 @@ def _cut(image: np.ndarray, labels: np.ndarray, rounds: int) -> np.ndarray:
 
 
 def _largest(mask: np.ndarray) -> np.ndarray:
-    """The largest part and those not far below it, without small holes, 0 or 1."""
+    """Return the largest part and those not far below it, without small holes, 0 or 1."""
     closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(closed)
     if count < 2:
@@ -131,7 +131,7 @@ def _largest(mask: np.ndarray) -> np.ndarray:
 
 
 def _carried(mask: np.ndarray, flow: np.ndarray) -> np.ndarray:
-    """The mask of the frame before, seen from this one: ``flow`` leads from here to there, [h, w, 2]."""
+    """Return the mask of the frame before, seen from this one: ``flow`` leads from here to there, [h, w, 2]."""
     height, width = mask.shape
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
     moved = grid + flow

@@ -41,7 +41,7 @@ class Networks:
 def grounded_masks(
     text: str, detector: str = DETECTOR, segmenter: str = SEGMENTER, device: torch.device | None = None
 ) -> MaskMaker:
-    """A maker of masks by both networks.
+    """Return a maker of masks by both networks.
 
     Args:
         text: what the animal is called.
@@ -124,7 +124,7 @@ def find_box(networks: Networks, image: np.ndarray, prompt: str, before: Tensor 
 
 @torch.no_grad()
 def fill_box(networks: Networks, image: np.ndarray, box: Tensor) -> np.ndarray:
-    """The mask of what a box holds, uint8 [h, w]; SAM 2 sees the frame stretched to a square."""
+    """Return the mask of what a box holds, uint8 [h, w]; SAM 2 sees the frame stretched to a square."""
     height, width = image.shape[:2]
     side = _side(networks.segmenter.config)
     pixels = prepared(image, (side, side), networks.device)
@@ -137,7 +137,7 @@ def fill_box(networks: Networks, image: np.ndarray, box: Tensor) -> np.ndarray:
 
 
 def prepared(image: np.ndarray, size: tuple[int, int], device: torch.device) -> Tensor:
-    """A frame as the networks want it: resized and normalised, [1, 3, h, w]."""
+    """Return a frame as the networks want it: resized and normalised, [1, 3, h, w]."""
     values = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].to(device, torch.float32) / 255
     values = torch.nn.functional.interpolate(values, size[::-1], mode="bilinear", antialias=True)
     mean, spread = (values.new_tensor(numbers)[:, None, None] for numbers in (MEAN, SPREAD))
@@ -145,7 +145,7 @@ def prepared(image: np.ndarray, size: tuple[int, int], device: torch.device) -> 
 
 
 def overlap(boxes: Tensor, box: Tensor) -> Tensor:
-    """Intersection over union of boxes with one, [n, 4] and [4] -> [n]."""
+    """Return the intersection over union of boxes with one, [n, 4] and [4] -> [n]."""
     lower, upper = torch.maximum(boxes[:, :2], box[:2]), torch.minimum(boxes[:, 2:], box[2:])
     shared = (upper - lower).clamp_min(0).prod(dim=1)
     areas = [(each[..., 2:] - each[..., :2]).clamp_min(0).prod(dim=-1) for each in (boxes, box)]

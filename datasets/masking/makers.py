@@ -67,7 +67,7 @@ def write_masks(source: Unmasked, maker: MaskMaker, folder: Path) -> tuple[list[
 
 
 def run_program(command: str) -> MaskMaker:
-    """Any program as a maker of masks.
+    """Return any program as a maker of masks.
 
     Args:
         command: with {frames} and {masks} in it, for the folders that it reads and writes; {boxes}, if it is there,
@@ -126,7 +126,7 @@ def _call(words: list[str]) -> None:
 
 
 def parse_boxes(texts: tuple[str, ...], count: int) -> dict[int, Box]:
-    """Boxes by frame number from "left,top,width,height" (frame 0) or "frame:left,top,width,height".
+    """Return boxes by frame number from "left,top,width,height" (frame 0) or "frame:left,top,width,height".
 
     Raises:
         UserError: another form, an empty box, or a frame that is not there.

@@ -80,7 +80,7 @@ class MaskFiles:
     is_indexed: bool = False
 
     def read(self, index: int, object_id: int | None, size: tuple[int, int]) -> np.ndarray | None:
-        """The mask of a frame, uint8 [h, w], 255 inside; None where it has none.
+        """Return the mask of a frame, uint8 [h, w], 255 inside; None where it has none.
 
         Args:
             index: of the frame.
@@ -117,7 +117,7 @@ def open_masks(files: Sequence[Path | None]) -> MaskFiles:
 
 
 def read_values(file: Path, indexed: bool = False) -> np.ndarray:
-    """The values of a mask file, uint8 [h, w]: as they are stored, of a palette its greys or its indices.
+    """Return the values of a mask file, uint8 [h, w]: as they are stored, of a palette its greys or its indices.
 
     An alpha channel that varies, or is zero everywhere, is the mask; colours are taken as foreground unless nearly
     black; 16 bits become 8 where they are shades, and so do fractions up to 1.
@@ -150,7 +150,7 @@ def read_values(file: Path, indexed: bool = False) -> np.ndarray:
 
 
 def read_transparency(file: Path) -> np.ndarray | None:
-    """The alpha channel of an image, turned upright as its EXIF says, uint8 [h, w]; None where it has none.
+    """Return the alpha channel of an image, turned upright as its EXIF says, uint8 [h, w]; None where it has none.
 
     Raises:
         UserError: the file cannot be read.
@@ -163,7 +163,7 @@ def read_transparency(file: Path) -> np.ndarray | None:
 
 @contextmanager
 def _opened(file: Path, what: str = "a mask image") -> Iterator[Image.Image]:
-    """An image file, decoded in the block."""
+    """Return an image file, decoded in the block."""
     try:
         with Image.open(file) as image:
             yield image
@@ -181,7 +181,7 @@ def _from_channels(values: np.ndarray, mode: str) -> np.ndarray:
 
 
 def shades(colors: np.ndarray, tint: int = FILE_TINT) -> np.ndarray:
-    """The mask that colours mean: grey is a shade, any other colour the foreground unless nearly black.
+    """Return the mask that colours mean: grey is a shade, any other colour the foreground unless nearly black.
 
     Args:
         colors: uint8, [h, w, 3] or [h, w, 1].
@@ -203,7 +203,7 @@ def _has_colored_palette(file: Path) -> bool:
 
 
 def _greys(values: np.ndarray, palette: np.ndarray) -> np.ndarray:
-    """What a palette of greys makes of its indices; the indices where it shows them all alike."""
+    """Return what a palette of greys makes of its indices; the indices where it shows them all alike."""
     greys = np.arange(256, dtype=np.uint8)
     greys[: len(palette)] = palette.max(axis=1)
     shown = greys[values]
@@ -211,12 +211,12 @@ def _greys(values: np.ndarray, palette: np.ndarray) -> np.ndarray:
 
 
 def _palette(image: Image.Image) -> np.ndarray:
-    """The colours that a file gives to its indices, uint8 [entries, 3]; indices beyond them have none."""
+    """Return the colours that a file gives to its indices, uint8 [entries, 3]; indices beyond them have none."""
     return np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3)
 
 
 def fit_size(mask: np.ndarray, size: tuple[int, int], title: str) -> np.ndarray:
-    """The mask at the size of its frame; one of the same shape in another size is scaled.
+    """Return the mask at the size of its frame; one of the same shape in another size is scaled.
 
     Raises:
         UserError: another shape.
@@ -252,14 +252,14 @@ def mask_facts(mask: np.ndarray) -> MaskFacts:
 
 
 def _holes(solid: np.ndarray) -> int:
-    """Pixels of background that no path joins to the border."""
+    """Return pixels of background that no path joins to the border."""
     padded = cv2.copyMakeBorder(1 - solid, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
     _, labels = cv2.connectedComponents(padded, connectivity=4)
     return int(((padded > 0) & (labels != labels[0, 0])).sum())
 
 
 def list_images(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> list[Path]:
-    """The image files of a folder in natural order (2 before 10).
+    """Return the image files of a folder in natural order (2 before 10).
 
     Raises:
         UserError: no such folder, or two files that differ in their ending alone.
@@ -277,7 +277,7 @@ def list_images(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> list[Path]:
 
 
 def match_masks(masks: Sequence[Path], stems: Sequence[str], folder: Path) -> tuple[list[Path | None], str]:
-    """Which mask belongs to which frame: by equal names, else by the number in the name, else by order.
+    """Return which mask belongs to which frame: by equal names, else by the number in the name, else by order.
 
     Args:
         masks: files in natural order.
@@ -316,7 +316,7 @@ def match_masks(masks: Sequence[Path], stems: Sequence[str], folder: Path) -> tu
 
 
 def _left_over(masks: Sequence[Path], found: Sequence[Path | None]) -> str:
-    """A sentence on the masks that fit no frame; "" where there are none."""
+    """Return a sentence on the masks that fit no frame; "" where there are none."""
     rest = [mask.name for mask in masks if mask not in {*found}]
     if not rest:
         return ""

@@ -34,7 +34,7 @@ class Surface:
     texture: NDArray[np.uint8] | None = None
 
     def posed(self, transforms: NDArray[np.float64]) -> NDArray[np.float64]:
-        """World vertices under the skinning transforms [J, 4, 4] of one moment, [n, 3]."""
+        """Return the world vertices under the skinning transforms [J, 4, 4] of one moment, [n, 3]."""
         blended = np.einsum("nk,nkab->nab", self.bone_weights, transforms[self.bone_indices, :3])
         return np.einsum("nab,nb->na", blended[..., :3], self.vertices) + blended[..., 3]
 
@@ -75,6 +75,6 @@ class AnimatedAnimal:
         return self.bones @ np.linalg.inv(self.bones_rest)
 
     def posed(self, frame: int) -> list[NDArray[np.float64]]:
-        """World vertices of every surface at one frame, each [n, 3]."""
+        """Return the world vertices of every surface at one frame, each [n, 3]."""
         transforms = self.bones[frame] @ np.linalg.inv(self.bones_rest)
         return [surface.posed(transforms) for surface in self.surfaces]

@@ -50,7 +50,7 @@ def closest_points(triangles: NDArray[np.float64], points: NDArray[np.float64], 
 
 @kernel
 def _search(corners: np.ndarray, centres: np.ndarray, radii: np.ndarray, points: np.ndarray, limit: float) -> tuple:
-    """Row of the closest triangle, [n], barycentric coordinates, [n, 2], and distance, [n]."""
+    """Return the row of the closest triangle, [n], barycentric coordinates, [n, 2], and distance, [n]."""
     rows, distances = np.full(len(points), -1, np.int64), np.full(len(points), limit, np.float32)
     uv = np.zeros((len(points), 2), np.float32)
     for i in range(len(points)):

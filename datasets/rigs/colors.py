@@ -10,7 +10,7 @@ MIRRORED, CLAMPED = 33648, 33071
 
 
 def base_color(material: pygltflib.Material) -> tuple[list[float] | None, pygltflib.TextureInfo | None]:
-    """Factor and texture of a material's colour; older programs write its diffuse colour in an extension."""
+    """Return the factor and texture of a material's colour; older programs write its diffuse colour in an extension."""
     older = (material.extensions or {}).get("KHR_materials_pbrSpecularGlossiness")
     if older is not None:  # whoever writes both means the plain block for readers that do not know it
         info = older.get("diffuseTexture")
@@ -25,7 +25,7 @@ def base_color(material: pygltflib.Material) -> tuple[list[float] | None, pygltf
 def base_texture(
     document: Document, primitive: pygltflib.Primitive, info: pygltflib.TextureInfo
 ) -> tuple[Floats, NDArray[np.uint8]]:
-    """Texture coordinates and an image that may be repeated, whatever the file's wrap modes are."""
+    """Return the texture coordinates and an image that may be repeated, whatever the file's wrap modes are."""
     extension = (info.extensions or {}).get("KHR_texture_transform", {})
     channel = extension.get("texCoord", info.texCoord or 0)
     accessor = getattr(primitive.attributes, f"TEXCOORD_{channel}", None)

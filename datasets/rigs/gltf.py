@@ -57,7 +57,7 @@ class Document:
         self.order = self._topological_order()
 
     def error(self, sentence: str) -> UserError:
-        """The error for a fault of this file."""
+        """Return the error for a fault of this file."""
         return UserError(f"{self.path}: {sentence}.")
 
     def _parents(self) -> list[int]:
@@ -78,7 +78,7 @@ class Document:
         return order
 
     def scene_nodes(self) -> list[int]:
-        """Nodes of the default scene (all nodes where the file has no scene), parents first."""
+        """Return nodes of the default scene (all nodes where the file has no scene), parents first."""
         if not self.tree.scenes:
             return self.order
         number = self.tree.scene or 0
@@ -91,7 +91,7 @@ class Document:
         return [index for index in self.order if index in reached]
 
     def buffer(self, index: int) -> bytes:
-        """Bytes of one buffer: embedded, a data URI or a file beside this one."""
+        """Return the bytes of one buffer: embedded, a data URI or a file beside this one."""
         if index not in self._buffers:
             uri = self.tree.buffers[index].uri
             self._buffers[index] = (self.tree.binary_blob() or b"") if uri is None else self._fetch(uri)
@@ -130,7 +130,7 @@ class Document:
         return np.ascontiguousarray(rows).view(np.dtype(dtype).newbyteorder("<"))
 
     def accessor(self, index: int) -> NDArray[np.generic]:
-        """Decoded accessor, [count, components]; normalised integers become floats in [0, 1] or [-1, 1]."""
+        """Return the decoded accessor, [count, components]; normalised integers become floats in [0, 1] or [-1, 1]."""
         accessor = self.tree.accessors[index]
         if accessor.type not in COMPONENTS or accessor.componentType not in TYPES:
             raise self.error(f"expected an accessor type that skins use, but accessor {index} is {accessor.type}")
@@ -156,14 +156,14 @@ class Document:
         return values
 
     def floats(self, index: int) -> Floats:
-        """Decoded accessor as finite float64, [count, components]."""
+        """Return the decoded accessor as finite float64, [count, components]."""
         values = self.accessor(index).astype(np.float64)
         if not np.isfinite(values).all():
             raise self.error(f"expected finite numbers, but accessor {index} holds NaN or infinity")
         return values
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """Decoded image, sRGB uint8, [h, w, 3]."""
+        """Return the decoded image, sRGB uint8, [h, w, 3]."""
         image = self.tree.images[index]
         if image.bufferView is not None:
             view = self.tree.bufferViews[image.bufferView]
@@ -186,24 +186,24 @@ class Document:
         return found
 
     def node_weights(self, index: int) -> list[float] | None:
-        """Weights of the morph targets that a node gives instead of its mesh's; None where it gives none."""
+        """Return weights of the morph targets that a node gives instead of its mesh's; None where it gives none."""
         weights: list[float] | None = self._written["nodes"][index].get("weights")
         return weights
 
     def animated_nodes(self, animation: int) -> set[int]:
-        """Nodes that an animation moves."""
+        """Return nodes that an animation moves."""
         channels = self.tree.animations[animation].channels
         return {channel.target.node for channel in channels if channel.target.node is not None}
 
     def clip_range(self, animation: int) -> tuple[float, float]:
-        """First and last key time of an animation in seconds."""
+        """Return the first and last key time of an animation in seconds."""
         times = [self.floats(sampler.input) for sampler in self.tree.animations[animation].samplers]
         if not times:
             return 0.0, 0.0
         return min(float(keys.min()) for keys in times), max(float(keys.max()) for keys in times)
 
     def local_matrices(self, animation: int | None, times: Floats) -> Floats:
-        """Local transform of every node at the given times, [len(times), nodes, 4, 4]."""
+        """Return the local transform of every node at the given times, [len(times), nodes, 4, 4]."""
         moved: dict[tuple[int, str], Floats] = {}
         if animation is not None:
             clip = self.tree.animations[animation]
@@ -226,7 +226,7 @@ class Document:
         return matrices
 
     def global_matrices(self, local: Floats) -> Floats:
-        """Node-to-world transforms from local ones, [T, nodes, 4, 4]."""
+        """Return node-to-world transforms from local ones, [T, nodes, 4, 4]."""
         matrices = local.copy()
         for index in self.order:
             if self.parents[index] >= 0:
@@ -324,7 +324,7 @@ def _slerp(start: Floats, end: Floats, s: Floats) -> Floats:
 
 
 def compose(translation: Floats, rotation: Floats, scale: Floats) -> Floats:
-    """T R S matrices from [t, 3], xyzw quaternions [t, 4] and [t, 3] (leading sizes broadcast), [t, 4, 4]."""
+    """Return T R S matrices from [t, 3], xyzw quaternions [t, 4] and [t, 3] (leading sizes broadcast), [t, 4, 4]."""
     count = max(len(translation), len(rotation), len(scale))
     x, y, z, w = (rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).T
     turn = np.array(

@@ -10,7 +10,7 @@ STILL = 1e-4
 
 
 def target_offsets(document: Document, primitive: pygltflib.Primitive) -> Floats:
-    """Displacements of each morph target of a primitive, zero where it moves nothing, [targets, n, 3]."""
+    """Return displacements of each morph target of a primitive, zero where it moves nothing, [targets, n, 3]."""
     count = document.tree.accessors[primitive.attributes.POSITION].count
     offsets = np.zeros((len(primitive.targets or []), count, 3))
     for row, target in enumerate(primitive.targets or []):
@@ -21,7 +21,7 @@ def target_offsets(document: Document, primitive: pygltflib.Primitive) -> Floats
 
 
 def target_weights(document: Document, animation: int, node: int, targets: int, times: Floats) -> Floats:
-    """Weights of a node's morph targets: the animation's, else the node's own, else its mesh's, [T, targets]."""
+    """Return weights of a node's morph targets: the animation's, else the node's own, else its mesh's, [T, targets]."""
     if not targets:
         return np.zeros((len(times), 0))
     clip = document.tree.animations[animation]
@@ -38,7 +38,7 @@ def target_weights(document: Document, animation: int, node: int, targets: int, 
 def still_offsets(
     document: Document, animation: int, node: int, primitive: pygltflib.Primitive, times: Floats
 ) -> Floats | float:
-    """What the morph targets of a primitive add to its vertices all through a clip, [n, 3]; 0 without any.
+    """Return what the morph targets of a primitive add to its vertices all through a clip, [n, 3]; 0 without any.
 
     Raises:
         UserError: the clip changes them: bones and voxels cannot hold that.

@@ -24,7 +24,7 @@ TRIANGLES, STRIP, FAN = 4, 5, 6
 
 
 def clips(path: Path) -> list[str]:
-    """Names of the animations of a rig file, in the file's order.
+    """Return names of the animations of a rig file, in the file's order.
 
     Unnamed ones are called clip_<index>; one that has the name of an earlier one gets _<index> behind it.
 
@@ -36,7 +36,7 @@ def clips(path: Path) -> list[str]:
 
 
 def content(path: Path) -> str:
-    """Digest of a rig file and of the files beside it that it names: the same for every copy of the rig.
+    """Return the digest of a rig file and of the files beside it that it names: the same for every copy of the rig.
 
     Raises:
         UserError: the file is missing or is no glTF, or a file beside it is missing.
@@ -121,7 +121,7 @@ def _clip_names(document: Document) -> list[str]:
 
 
 def _folder_name(name: str) -> str:
-    """The name with everything that a folder or a space-separated list cannot hold replaced."""
+    """Return the name with everything that a folder or a space-separated list cannot hold replaced."""
     return re.sub(r"[^\w.-]+", "_", name).strip("._") or "unnamed"
 
 
@@ -153,19 +153,19 @@ class _Skeleton:
         return len(self.nodes) - 1
 
     def parents(self) -> NDArray[np.int64]:
-        """Nearest ancestor that is a bone, -1 for a root, [J]."""
+        """Return the nearest ancestor that is a bone, -1 for a root, [J]."""
         first = {node: bone for bone, node in reversed(list(enumerate(self.nodes)))}
         return np.array([next((first[n] for n in self.ancestors(node) if n in first), -1) for node in self.nodes])
 
     def ancestors(self, node: int) -> list[int]:
-        """Ancestors of a node, the nearest first."""
+        """Return ancestors of a node, the nearest first."""
         line = []
         while (node := self.document.parents[node]) >= 0:
             line.append(node)
         return line
 
     def sorted(self, animal: AnimatedAnimal) -> AnimatedAnimal:
-        """The same animal with parents before children (Artemis wants a root in row 0)."""
+        """Return the same animal with parents before children (Artemis wants a root in row 0)."""
         depth = {node: len(self.ancestors(node)) for node in self.nodes}
         order = np.array(sorted(range(len(self.nodes)), key=lambda bone: depth[self.nodes[bone]]))
         rank = np.argsort(order)
@@ -197,7 +197,7 @@ def _skinned_surfaces(document: Document, skeleton: _Skeleton, node: int) -> lis
 
 
 def inverse_binds(document: Document, skin: int) -> Floats:
-    """Mesh space -> joint space of each joint of a skin, [joints, 4, 4].
+    """Return the mesh space -> joint space of each joint of a skin, [joints, 4, 4].
 
     Raises:
         UserError: too few, or one that cannot be inverted.
@@ -237,7 +237,7 @@ def _attached_surfaces(document: Document, skeleton: _Skeleton, node: int) -> li
 
 
 def influences(document: Document, primitive: pygltflib.Primitive, count: int) -> tuple[NDArray[np.int64], Floats]:
-    """Joint numbers within a skin of ``count`` joints and weights that sum to one, both [n, 4 k].
+    """Return the joint numbers within a skin of ``count`` joints and weights that sum to one, both [n, 4 k].
 
     Raises:
         UserError: a vertex without either, or a joint that the skin does not have.
@@ -292,7 +292,7 @@ def read_surface(
 
 
 def _faces(document: Document, primitive: pygltflib.Primitive, count: int) -> NDArray[np.int64]:
-    """Triangles, [f, 3], of lists, strips and fans, indexed or not."""
+    """Return triangles, [f, 3], of lists, strips and fans, indexed or not."""
     if primitive.indices is None:
         corners = np.arange(count)
     else:

@@ -29,7 +29,7 @@ DILATION = 5
 
 
 def raycaster(vertices: Sequence[NDArray[np.float64]], surfaces: Sequence[Surface]) -> EmbreeScene:
-    """Scene of the surfaces with the given vertices (each [n, 3]); geometry id = index of the surface."""
+    """Return the scene of the surfaces with the given vertices (each [n, 3]); geometry id = index of the surface."""
     scene = EmbreeScene(robust=True)
     for points, surface in zip(vertices, surfaces, strict=True):
         TriangleMesh(scene, points.astype(np.float32), surface.faces.astype(np.int32))
@@ -75,7 +75,7 @@ class Picture:
         return _straight(rgb, alpha), np.round(alpha * 255).astype(np.uint8)
 
     def _window(self, camera: Camera) -> tuple[int, int, int, int]:
-        """Pixel rectangle (left, top, right, bottom; the last two exclusive) that holds the animal."""
+        """Return the pixel rectangle (left, top, right, bottom; the last two exclusive) that holds the animal."""
         world_to_camera, intrinsics = camera.world_to_camera.numpy(), camera.intrinsics.numpy()
         local = (self.extent + self.origin) @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
         if (local[:, 2] <= 0).any():
@@ -101,7 +101,7 @@ class Picture:
         return rays.reshape(-1, 6)
 
     def _cast(self, rays: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Which rays hit the animal, [m], and the shaded colour that they see, [m, 3]."""
+        """Return which rays hit the animal, [m], and the shaded colour that they see, [m, 3]."""
         answer = self.scene.run(rays[:, :3], rays[:, 3:], query="INTERSECT", output=True)
         where = np.flatnonzero(answer["primID"] >= 0)
         geometry, primitive = answer["geomID"][where], answer["primID"][where]
@@ -114,7 +114,7 @@ class Picture:
         return where, color * self._shade(answer["Ng"][where], rays[where, 3:])[:, None]
 
     def _shade(self, normals: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Factor in [0.7, 1] from the flat normals, turned towards the viewer, [n]."""
+        """Return the factor in [0.7, 1] from the flat normals, turned towards the viewer, [n]."""
         away = np.einsum("na,na->n", normals, directions)
         length = np.sqrt(np.einsum("na,na->n", normals, normals))
         sign = np.where(away > 0, -1.0, 1.0) / np.maximum(length, 1e-20)
@@ -124,7 +124,7 @@ class Picture:
 
 
 def _albedo(surface: Surface, corners: NDArray[np.int64], share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unshaded colour at points of triangles, [n, 3]."""
+    """Return the unshaded colour at points of triangles, [n, 3]."""
     if (surface.colors == surface.colors[0]).all():  # flat, which is common and cheap
         color = surface.colors[:1]
     else:
@@ -135,7 +135,7 @@ def _albedo(surface: Surface, corners: NDArray[np.int64], share: NDArray[np.floa
 
 
 def sample_texture(texture: NDArray[np.uint8], uv: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Bilinear lookup in a repeated texture; (0, 0) is its upper left corner, [n, 2] -> [n, 3] in [0, 1]."""
+    """Return the bilinear lookup in a repeated texture; (0, 0) is its upper left corner, [n, 2] -> [n, 3] in [0, 1]."""
     height, width = texture.shape[:2]
     x, y = uv[:, 0] * width - 0.5, uv[:, 1] * height - 0.5
     left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
@@ -147,7 +147,7 @@ def sample_texture(texture: NDArray[np.uint8], uv: NDArray[np.float64]) -> NDArr
 
 
 def _straight(premultiplied: NDArray[np.float32], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Un-premultiplied colour, carried a little past the silhouette, black beyond, [h, w, 3]."""
+    """Return un-premultiplied colour, carried a little past the silhouette, black beyond, [h, w, 3]."""
     spread = cv2.blur(np.dstack((premultiplied, alpha)), (DILATION, DILATION))
     color = np.where(alpha[..., None] > 0, premultiplied, spread[..., :3])
     weight = np.where(alpha > 0, alpha, spread[..., 3])[..., None]

@@ -143,7 +143,7 @@ def _expect_empty(out: Path) -> None:
 
 
 def _picture(animal: AnimatedAnimal, frame: int) -> Picture:
-    """The animal at one frame; rays are cast relative to its middle, where single precision is best."""
+    """Return the animal at one frame; rays are cast relative to its middle, where single precision is best."""
     posed = animal.posed(frame)
     points = np.concatenate(posed)
     origin = (points.min(0) + points.max(0)) / 2
@@ -153,7 +153,7 @@ def _picture(animal: AnimatedAnimal, frame: int) -> Picture:
 
 
 def horizontal_axes(up: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Two orthonormal directions perpendicular to `up`, right-handed with it as the third, each [3]."""
+    """Return two orthonormal directions perpendicular to `up`, right-handed with it as the third, each [3]."""
     least = np.eye(3)[np.argmin(np.abs(up))]
     along = np.cross(np.cross(up, least), up)
     along /= np.linalg.norm(along)
@@ -163,7 +163,7 @@ def horizontal_axes(up: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
 def camera_ring(
     posed: NDArray[np.float64], up: NDArray[np.float64], views: int, width: int, height: int
 ) -> list[Camera]:
-    """Cameras evenly around the motion, all at one distance, at which every point stays inside every image.
+    """Return cameras evenly around the motion, all at one distance, at which every point stays inside every image.
 
     Args:
         posed: vertices of all frames, [T, n, 3].

@@ -38,7 +38,7 @@ class Volume:
 
 
 def voxelise(surfaces: Sequence[Surface], cells: int = CELLS) -> Volume:
-    """Voxels inside the rest surfaces or within half a cell of them, weighted like the nearest surface point.
+    """Return voxels inside the rest surfaces or within half a cell of them, weighted like the nearest surface point.
 
     Inside means: not connected to the outside of the lattice. So open seams between materials and overlapping parts do
     no harm; a hole wider than a cell empties the body and leaves its shell.
@@ -60,7 +60,7 @@ def voxelise(surfaces: Sequence[Surface], cells: int = CELLS) -> Volume:
 def _nearest_weights(
     triangles: NDArray[np.float64], surfaces: Sequence[Surface], points: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Top weights of the nearest surface point of each point, [V, K] and [V, K]."""
+    """Return the top weights of the nearest surface point of each point, [V, K] and [V, K]."""
     bones = 1 + max(int(surface.bone_indices.max()) for surface in surfaces)
     keep = min(INFLUENCES, bones)
     faces, uv, _ = closest_points(triangles, points)
@@ -85,6 +85,6 @@ def _nearest_weights(
 
 
 def barycentric(uvs: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Weights of a triangle's three corners from Embree's two coordinates, [n, 2] -> [n, 3]."""
+    """Return weights of a triangle's three corners from Embree's two coordinates, [n, 2] -> [n, 3]."""
     pair = np.clip(uvs.astype(np.float64), 0.0, 1.0)
     return np.stack((np.clip(1.0 - pair.sum(1), 0.0, 1.0), pair[:, 0], pair[:, 1]), axis=1)

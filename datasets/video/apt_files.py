@@ -80,7 +80,7 @@ class Annotations:
 
 
 def read_annotations(root: Path) -> Annotations:
-    """Every subject of every split, by "<clip folder>@<track>".
+    """Return every subject of every split, by "<clip folder>@<track>".
 
     Raises:
         UserError: no annotation file, one that is damaged or of another kind, or no annotation that fits an image.
@@ -143,7 +143,7 @@ def _add(path: Path, table: dict[str, Any], subjects: dict[str, Subject], seen: 
 
 
 def _sighting(images: dict[Any, Entry], kinds: dict[Any, Entry], entry: Entry) -> tuple[str, int, int, Sighting]:
-    """Species, track, the number of keypoints outside the image, and the sighting of one annotation.
+    """Return species, track, the number of keypoints outside the image, and the sighting of one annotation.
 
     Raises:
         Unusable: one that is not there or makes no sense.
@@ -176,7 +176,7 @@ def _size(image: Entry) -> tuple[int, int]:
 
 
 def _track(entry: Entry) -> int:
-    """The number of an animal in its clip; nobody may guess it."""
+    """Return the number of an animal in its clip; nobody may guess it."""
     found = numbers([entry.get("track_id")])
     if not found or not found[0].is_integer():
         raise Unusable("have no whole number as track_id", shown(entry, "track_id"))
@@ -186,7 +186,7 @@ def _track(entry: Entry) -> int:
 def _within(
     box: tuple[float, float, float, float], size: tuple[int, int], entry: Entry
 ) -> tuple[float, float, float, float]:
-    """The part of a box that lies in its image."""
+    """Return the part of a box that lies in its image."""
     left, top, width, height = box
     right, bottom = min(left + width, size[0]), min(top + height, size[1])
     left, top = max(left, 0.0), max(top, 0.0)
@@ -196,7 +196,7 @@ def _within(
 
 
 def clean_path(text: str) -> PurePosixPath:
-    """A file name as the data set's own folder has it.
+    """Return a file name as the data set's own folder has it.
 
     APT-36K's "D:\\Animal_pose\\AP-36k-patr1\\29wolf\\v3c2\\frame7.jpg" becomes "29wolf/v3c2/frame7.jpg".
     """
@@ -212,6 +212,6 @@ def _number(stem: str) -> int:
 
 
 def image_places(root: Path, file: PurePosixPath) -> Iterator[Path]:
-    """Where an image may lie."""
+    """Yield where an image may lie."""
     for folder in ("data", "", "images"):
         yield root / folder / file

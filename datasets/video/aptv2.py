@@ -51,7 +51,7 @@ class AptV2(VideoDataset):
                 raise UserError(f"{folder}: expected a folder, got no such folder.")
 
     def cases(self, selection: Selection) -> list[str]:
-        """Every animal that is annotated in enough frames of a clip.
+        """Return every animal that is annotated in enough frames of a clip.
 
         Raises:
             UserError: annotations that cannot be used.
@@ -62,7 +62,7 @@ class AptV2(VideoDataset):
         return enough
 
     def default_cases(self, selection: Selection) -> list[str]:
-        """The quadrupeds that have masks; all where none has."""
+        """Return the quadrupeds that have masks; all where none has."""
         names = self.cases(selection)
         subjects = self._annotations.subjects
         chosen = [name for name in names if subjects[name].species not in PRIMATES and self._masked(subjects[name])]
@@ -114,7 +114,7 @@ class AptV2(VideoDataset):
         return faults + super().check(cases, sheets)
 
     def unmasked(self, case: str) -> Unmasked:
-        """The frames of a case and the annotated box in each, for programs that make masks.
+        """Return the frames of a case and the annotated box in each, for programs that make masks.
 
         Raises:
             UserError: as `load`.
@@ -132,7 +132,7 @@ class AptV2(VideoDataset):
         return read_annotations(self.root)
 
     def _images(self, subject: Subject) -> tuple[list[Path], tuple[int, int]]:
-        """The frames of a subject, and their width and height, which all of its annotations must state."""
+        """Return the frames of a subject, and their width and height, which all of its annotations must state."""
         files = [self._image(sighting) for sighting in subject.sightings]
         size = image_size(files[0])
         for file, sighting in zip(files, subject.sightings, strict=True):

@@ -23,7 +23,7 @@ Box = tuple[int, int, int, int]
 
 
 def follow(times: Sequence[float], boxes: Sequence[Box], wanted: Sequence[float], size: tuple[int, int]) -> list[Crop]:
-    """The squares at some moments of a video.
+    """Return the squares at some moments of a video.
 
     Args:
         times: seconds of the frames whose boxes are known, ascending.
@@ -43,7 +43,7 @@ def follow(times: Sequence[float], boxes: Sequence[Box], wanted: Sequence[float]
 
 
 def cut(rgb: np.ndarray, mask: np.ndarray, crop: Crop, size: int) -> np.ndarray:
-    """The crop as a premultiplied image, averaged down or enlarged to ``size``, uint8 [size, size, 4].
+    """Return the crop as a premultiplied image, averaged down or enlarged to ``size``, uint8 [size, size, 4].
 
     Args:
         rgb: the original frame, uint8 [h, w, 3].
@@ -67,7 +67,7 @@ def cut(rgb: np.ndarray, mask: np.ndarray, crop: Crop, size: int) -> np.ndarray:
 
 
 def lost_share(mask: np.ndarray, crop: Crop) -> float:
-    """Share of the animal that lies outside a crop, in [0, 1]."""
+    """Return the share of the animal that lies outside a crop, in [0, 1]."""
     solid = mask > 127
     total = int(solid.sum())
     left, top = max(0, math.floor(crop.left)), max(0, math.floor(crop.top))

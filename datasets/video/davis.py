@@ -38,7 +38,7 @@ Facts = dict[str, Any]
 
 
 def known_sequences() -> dict[str, Facts]:
-    """What is known of the animals in DAVIS, by sequence (davis.toml)."""
+    """Return what is known of the animals in DAVIS, by sequence (davis.toml)."""
     return tomllib.loads((resources.files("rewild4d.datasets.video") / "davis.toml").read_text(encoding="utf-8"))
 
 
@@ -74,11 +74,11 @@ class Davis(VideoDataset):
             raise UserError(f"{self.masks}: expected a folder of masks, got no such folder.")
 
     def cases(self, selection: Selection) -> list[str]:
-        """Every sequence with masks; where it has several objects, "<sequence>@<id>" for each of them too."""
+        """Return every sequence with masks; where it has several objects, "<sequence>@<id>" for each of them too."""
         return list(self._table)
 
     def default_cases(self, selection: Selection) -> list[str]:
-        """The quadrupeds among the known sequences (all sequences where there is none), one object at a time.
+        """Return the quadrupeds among the known sequences (all sequences where there is none), one object at a time.
 
         Objects that are known to be people or things are none of them (`animals` in davis.toml).
         """
@@ -147,7 +147,7 @@ class Davis(VideoDataset):
         return files
 
     def _own_masks(self, sequence: str, files: list[Path]) -> MaskFiles:
-        """DAVIS's masks; none where it has none."""
+        """Return DAVIS's masks; none where it has none."""
         for name in _ANNOTATIONS:
             folder = self.root / name / str(self.resolution) / sequence
             if folder.is_dir() and (found := list_images(folder)):
@@ -155,7 +155,7 @@ class Davis(VideoDataset):
         return MaskFiles((None,) * len(files), ())
 
     def _given_masks(self, sequence: str, files: list[Path], object_id: int | None) -> tuple[MaskFiles | None, str]:
-        """Masks of --masks, and a sentence on them; those without object ids are of the one animal of the case.
+        """Return masks of --masks, and a sentence on them; those without object ids are of the one animal of the case.
 
         Raises:
             UserError: they hold object ids, but not this one.
@@ -175,7 +175,7 @@ class Davis(VideoDataset):
         return masks, f"{note}; they hold no object ids: all of them is taken as object {object_id}"
 
     def _joints(self, sequence: str, files: list[Path], size: tuple[int, int]) -> tuple[dict[str, Keypoints], str]:
-        """Keypoints by the frame's stem, and a sentence on what their file holds but is not used."""
+        """Return keypoints by the frame's stem, and a sentence on what their file holds but is not used."""
         stems = [file.stem for file in files]
         own = next((file for file in _badja_files(self.root, sequence) if file.is_file()), None)
         if self.keypoints is not None:

@@ -45,7 +45,7 @@ class Picture:
     alpha: Tensor | None
 
     def over(self, background: float) -> Tensor:
-        """The image on a grey level; as it is where it has no alpha, [3, h, w]."""
+        """Return the image on a grey level; as it is where it has no alpha, [3, h, w]."""
         if self.alpha is None:
             return self.rgb
         return (self.rgb * self.alpha + (1 - self.alpha) * background).clamp(0, 1)
@@ -69,11 +69,11 @@ class Reel:
         return len(self.files) or len(_video_frames(self.path))
 
     def label(self, index: int) -> str:
-        """The path of an image; for a video with the frame behind it."""
+        """Return the path of an image; for a video with the frame behind it."""
         return str(self.files[index]) if self.files else f"{self.path}, frame {index}"
 
     def picture(self, index: int) -> Picture:
-        """One image.
+        """Return one image.
 
         Raises:
             UserError: it cannot be read, is damaged, or holds other than numbers in [0, 1].
@@ -97,7 +97,7 @@ class Reel:
         return _planes(values)
 
     def _read(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Colour [h, w, 3] and alpha [h, w] or None, float32 in [0, 1]."""
+        """Return the colour [h, w, 3] and alpha [h, w] or None, float32 in [0, 1]."""
         if not self.files:
             frame = _video_frames(self.path)[index] / np.float32(255)
             return frame[..., :3], frame[..., 3] if frame.shape[2] == 4 else None
@@ -136,7 +136,7 @@ def open_footage(path: Path) -> Footage:
 
 
 def match_reels(ours: Footage, theirs: Footage) -> tuple[list[Reel], list[str]]:
-    """The reels of ``ours`` in the order of ``theirs``, matched by name; and a note where order had to do.
+    """Return the reels of ``ours`` in the order of ``theirs``, matched by name; and a note where order had to do.
 
     Raises:
         UserError: one holds images and the other clips, or the names do not match.
@@ -150,7 +150,7 @@ def match_reels(ours: Footage, theirs: Footage) -> tuple[list[Reel], list[str]]:
 
 
 def match_images(ours: Reel, theirs: Reel) -> tuple[Reel, list[str]]:
-    """``ours`` with its images in the order of ``theirs``, matched by name; and a note where order had to do.
+    """Return ``ours`` with its images in the order of ``theirs``, matched by name; and a note where order had to do.
 
     Raises:
         UserError: the names do not match, or a video has another number of frames.
@@ -166,7 +166,7 @@ def match_images(ours: Reel, theirs: Reel) -> tuple[Reel, list[str]]:
 def _match(
     ours: Sequence[T], theirs: Sequence[T], name: Callable[[T], str], our_path: Path, their_path: Path
 ) -> tuple[list[T], list[str]]:
-    """``ours`` in the order of ``theirs``: by name, or in order where no name is shared and the counts agree."""
+    """Return ``ours`` in the order of ``theirs``: by name, or in order where no name is shared and the counts agree."""
     by_name = {name(item): item for item in ours}
     wanted = [name(item) for item in theirs]
     missing = [word for word in wanted if word not in by_name]
@@ -193,7 +193,7 @@ def _clip(path: Path) -> Reel:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """What a folder holds in natural order (2 before 10), hidden entries left out."""
+    """Return what a folder holds in natural order (2 before 10), hidden entries left out."""
     try:
         found = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
@@ -217,7 +217,7 @@ def _planes(image: np.ndarray) -> Tensor:
 
 
 def _read_array(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Colour and alpha of an .npy array, as `read_picture` gives them."""
+    """Return the colour and alpha of an .npy array, as `read_picture` gives them."""
     try:
         values = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
@@ -240,14 +240,14 @@ def _described(values: Any) -> str:
 
 
 def _video(path: Path) -> Reel:
-    """A video; its frame rate is read now, its frames later."""
+    """Return a video; its frame rate is read now, its frames later."""
     with _reader(path) as reader:
         return Reel(path, (), float(reader.get_meta_data()["fps"]))
 
 
 @lru_cache(maxsize=4)
 def _video_frames(path: Path) -> list[np.ndarray]:
-    """Every frame, each once at any frame rate, uint8 [h, w, 3], or [h, w, 4] where any is transparent anywhere.
+    """Return every frame, each once at any frame rate, uint8 [h, w, 3], or [h, w, 4] where any is transparent anywhere.
 
     Four videos are kept: a prediction, its truth and their masks.
     """

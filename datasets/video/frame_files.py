@@ -13,13 +13,13 @@ FRAME_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 def image_size(file: Path) -> tuple[int, int]:
-    """Width and height of an upright image."""
+    """Return the width and height of an upright image."""
     height, width = read_rgb(file, upright=True).shape[:2]
     return width, height
 
 
 def read_images(files: Sequence[Path], size: tuple[int, int]) -> Iterator[np.ndarray]:
-    """The frames one after the other, turned upright as their EXIF says, uint8 [h, w, 3].
+    """Yield the frames one after the other, turned upright as their EXIF says, uint8 [h, w, 3].
 
     Raises:
         UserError: a frame that cannot be read or has another size than the first.
@@ -37,6 +37,6 @@ def read_images(files: Sequence[Path], size: tuple[int, int]) -> Iterator[np.nda
 def read_masks(
     masks: MaskFiles, object_id: int | None, indices: Sequence[int], size: tuple[int, int]
 ) -> Iterator[np.ndarray | None]:
-    """The masks of some frames, one after the other; None where a frame has none."""
+    """Yield the masks of some frames, one after the other; None where a frame has none."""
     for index in indices:
         yield masks.read(index, object_id, size)

@@ -63,7 +63,7 @@ def check_videos(reader: VideoReader, cases: Sequence[str] = (), sheets: Path | 
 
 
 def check_video(video: Video, sheets: Path | None) -> list[Finding]:
-    """Findings on one video; its contact sheet goes to ``sheets``/<case>.png.
+    """Return findings on one video; its contact sheet goes to ``sheets``/<case>.png.
 
     Raises:
         UserError: files that cannot be read.
@@ -125,7 +125,7 @@ def _twins(facts: Sequence[MaskFacts | None]) -> list[int]:
 
 
 def _jumps(facts: Sequence[MaskFacts | None]) -> list[int]:
-    """Frames whose mask differs much from that of the frame before."""
+    """Return frames whose mask differs much from that of the frame before."""
     found = []
     for i in range(1, len(facts)):
         before, after = facts[i - 1], facts[i]
@@ -159,7 +159,7 @@ def _names(video: Video, indices: Sequence[int]) -> str:
 
 
 def tile(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-    """A small picture of a frame with its mask tinted and outlined, uint8 [h, TILE, 3]."""
+    """Return a small picture of a frame with its mask tinted and outlined, uint8 [h, TILE, 3]."""
     scale = TILE / image.shape[1]
     size = (TILE, max(1, round(image.shape[0] * scale)))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)

@@ -96,11 +96,11 @@ class Online(VideoDataset):
             raise UserError(f"--start and --end: expected 0 <= start < end, got {self.start or 0:g} and {end}.")
 
     def cases(self, selection: Selection) -> list[str]:
-        """The video's name, and one for each object where its masks hold several."""
+        """Return the video's name, and one for each object where its masks hold several."""
         return list(self._table)
 
     def default_cases(self, selection: Selection) -> list[str]:
-        """The whole mask, or each object on its own where there are several."""
+        """Return the whole mask, or each object on its own where there are several."""
         return [case for case, number in self._table.items() if number is not None] or list(self._table)
 
     def video(self, case: str) -> Video:
@@ -124,7 +124,7 @@ class Online(VideoDataset):
         return with_parts(video, self.parts, is_named=self._table[case] is None and len(self._table) > 1)
 
     def unmasked(self, case: str) -> Unmasked:
-        """The chosen frames without their masks, for programs that make some; masks are named by frame number.
+        """Return the chosen frames without their masks, for programs that make some; masks are named by frame number.
 
         Raises:
             UserError: as `load`.
@@ -249,7 +249,7 @@ class Online(VideoDataset):
         return self._video_masks(self._mask_place)
 
     def _video_masks(self, path: Path) -> tuple[Masks, str]:
-        """Masks out of a video: of all frames, or of the chosen ones only."""
+        """Return masks out of a video: of all frames, or of the chosen ones only."""
         facts, (indices, _) = video_facts(path), self._chosen
         total = len(self._material.times)
         if len(facts.times) == total:
@@ -279,7 +279,7 @@ class Online(VideoDataset):
 
 
 def _thinned(times: list[float], indices: list[int], fps: float) -> list[int]:
-    """The frames nearest to an even grid, each once."""
+    """Return the frames nearest to an even grid, each once."""
     grid = np.arange(times[0], times[-1] + 0.5 / fps, 1 / fps)
     after = np.searchsorted(times, grid).clip(1, max(1, len(times) - 1))
     before = after - 1
@@ -289,7 +289,7 @@ def _thinned(times: list[float], indices: list[int], fps: float) -> list[int]:
 
 
 def _picked(frames: Iterator[np.ndarray], indices: Sequence[int]) -> Iterator[np.ndarray]:
-    """Some frames of a stream; it is not read beyond the last of them."""
+    """Yield some frames of a stream; it is not read beyond the last of them."""
     wanted, last = set(indices), max(indices)
     for index, frame in enumerate(frames):
         if index in wanted:
@@ -307,6 +307,6 @@ def _mask_stream(path: Path, indices: Sequence[int], size: tuple[int, int], alph
 
 
 def _file_alpha(file: Path, size: tuple[int, int]) -> np.ndarray | None:
-    """The alpha channel of an image that has one, uint8 [h, w]."""
+    """Return the alpha channel of an image that has one, uint8 [h, w]."""
     alpha = read_transparency(file)
     return None if alpha is None else fit_size(alpha, size, str(file))

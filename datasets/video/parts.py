@@ -26,7 +26,7 @@ OFTEN = 0.1
 
 
 def with_parts(video: Video, parts: str, is_named: bool) -> Video:
-    """The video with its masks cut down to the parts that are wanted.
+    """Return the video with its masks cut down to the parts that are wanted.
 
     Args:
         video: its ``true_masks`` stay as they are.
@@ -54,7 +54,7 @@ def with_parts(video: Video, parts: str, is_named: bool) -> Video:
 
 
 def _counted(video: Video) -> tuple[int, int]:
-    """`standing_apart` of a video's masks; kept on disk, because masks may be a long film."""
+    """Return `standing_apart` of a video's masks; kept on disk, because masks may be a long film."""
     file = cache_folder() / "wild" / f"parts-{digest(video.identity, repr((NOISE, APART, 2)))[:32]}.json"
     if not file.is_file():
         found = standing_apart(video.masks)
@@ -64,7 +64,7 @@ def _counted(video: Video) -> tuple[int, int]:
 
 
 def standing_apart(masks: Masks) -> tuple[int, int]:
-    """How many masks have a part that stands apart from the largest one, and how many show anything.
+    """Return how many masks have a part that stands apart from the largest one, and how many show anything.
 
     A part counts from `NOISE` of the largest one's area on; the animal's length is the median, over the masks, of the
     longer side of the largest one's box.
@@ -110,7 +110,7 @@ def main_parts(masks: Masks, held: Collection[int] = ()) -> Iterator[np.ndarray 
 
 
 def _main(solid: np.ndarray, before: np.ndarray | None) -> np.ndarray:
-    """Pixels nearer to the main part than to another, bool [h, w]."""
+    """Return pixels nearer to the main part than to another, bool [h, w]."""
     nearest: np.ndarray
     _, nearest = cv2.distanceTransformWithLabels(
         (~solid).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_CCOMP

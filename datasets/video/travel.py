@@ -46,7 +46,7 @@ class TravelMeter:
 
 
 def _background_shift(before: np.ndarray, after: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """Median motion of corners outside the animal, [2]."""
+    """Return the median motion of corners outside the animal, [2]."""
     free = 255 * (1 - cv2.dilate(covered, np.ones((2 * MARGIN + 1, 2 * MARGIN + 1), np.uint8)))
     corners = cv2.goodFeaturesToTrack(before, CORNERS, 0.01, 8, mask=free)
     if corners is None:
@@ -57,7 +57,7 @@ def _background_shift(before: np.ndarray, after: np.ndarray, covered: np.ndarray
 
 
 def reduced(image: np.ndarray, longest: int = LONGEST) -> np.ndarray:
-    """The image averaged down to at most so many pixels on its longer side, [h, w] or [h, w, 3]."""
+    """Return the image averaged down to at most so many pixels on its longer side, [h, w] or [h, w, 3]."""
     scale = longest / max(image.shape[:2])
     if scale >= 1:
         return np.ascontiguousarray(image)

@@ -48,7 +48,7 @@ class VideoFacts:
 
 
 def read_video(path: Path) -> Iterator[np.ndarray]:
-    """Every frame of a video, upright, uint8 [h, w, 4] (alpha is 255 where the video has none).
+    """Yield every frame of a video, upright, uint8 [h, w, 4] (alpha is 255 where the video has none).
 
     Raises:
         UserError: ffmpeg cannot read the file.
@@ -58,7 +58,7 @@ def read_video(path: Path) -> Iterator[np.ndarray]:
 
 
 def video_facts(path: Path) -> VideoFacts:
-    """Times and size of a video, by decoding all of it; kept until the file changes.
+    """Return times and size of a video, by decoding all of it; kept until the file changes.
 
     Raises:
         UserError: ffmpeg cannot read the file, or it holds no frame.
@@ -87,7 +87,7 @@ def _facts(path: Path, size: int, changed: int) -> VideoFacts:
 
 
 def ascending(stamps: list[str], count: int) -> tuple[float, ...] | None:
-    """Times from the first frame on; None where stamps are missing or do not ascend."""
+    """Return times from the first frame on; None where stamps are missing or do not ascend."""
     try:
         times = [float(stamp) for stamp in stamps[:count]]
     except ValueError:
@@ -116,7 +116,7 @@ def _frames(path: Path, log: IO[str]) -> Iterator[np.ndarray]:
 
 
 def _pam(pipe: IO[bytes]) -> np.ndarray | None:
-    """The next image of a stream, or None at its end."""
+    """Return the next image of a stream, or None at its end."""
     header: dict[bytes, bytes] = {}
     while (line := pipe.readline()) and line != b"ENDHDR\n":
         key, _, value = line.strip().partition(b" ")

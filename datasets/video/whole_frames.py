@@ -17,7 +17,7 @@ LONGEST = 960
 
 
 def whole_clip(video: Video) -> Clip:
-    """The usable frames of a video, averaged down where they are large; times are the video's own.
+    """Return the usable frames of a video, averaged down where they are large; times are the video's own.
 
     Raises:
         UserError: no frame shows the animal, or files that cannot be read.

@@ -111,7 +111,7 @@ class Layout:
 
 
 def split_video(video: Video, selection: Selection) -> tuple[Clip, Truth]:
-    """The frames that a method gets and those that are held out, cut around the animal.
+    """Return the frames that a method gets and those that are held out, cut around the animal.
 
     Cameras are None: nobody knows them (`contracts.Reconstruction.camera`).
 
@@ -136,7 +136,7 @@ def split_video(video: Video, selection: Selection) -> tuple[Clip, Truth]:
 
 
 def _travel_in_crops(layout: Layout, size: int) -> torch.Tensor:
-    """The travel in pixels of the crop that each step leads to, [T - 1, 2]."""
+    """Return the travel in pixels of the crop that each step leads to, [T - 1, 2]."""
     sides = torch.tensor([layout.crops[row].side for row in layout.shown[1:]])
     return torch.tensor(layout.travel).reshape(-1, 2) * (size / sides)[:, None]
 
@@ -144,7 +144,7 @@ def _travel_in_crops(layout: Layout, size: int) -> torch.Tensor:
 def usable(
     video: Video, facts: Sequence[MaskFacts | None], stride: int = 1, least: int = 1
 ) -> tuple[list[int], tuple[str, ...]]:
-    """Indices of the frames that show the whole animal, and what was left out and why, a sentence each.
+    """Return indices of the frames that show the whole animal, and what was left out and why, a sentence each.
 
     Frames that the image's border cuts stay where most are like that.
 
@@ -190,7 +190,7 @@ def original_images(video: Video, selection: Selection) -> Iterator[np.ndarray]:
 
 
 def _laid_out(video: Video, selection: Selection) -> tuple[Layout, Path]:
-    """The layout of a video and the folder of its cut frames, made where they are not there yet."""
+    """Return the layout of a video and the folder of its cut frames, made where they are not there yet."""
     folder = cache_folder() / "wild" / _key(video, selection)
     if not (folder / "rgba.npy").is_file():
         layout = lay_out(video, _facts(video.masks), selection)
@@ -224,7 +224,7 @@ def _facts(masks: Masks) -> list[MaskFacts | None]:
 def _crops(
     video: Video, facts: Sequence[MaskFacts | None], used: Sequence[int], tested: Sequence[bool]
 ) -> tuple[Crop, ...]:
-    """The crops of the used frames, from what the masks of those say that are not held out."""
+    """Return the crops of the used frames, from what the masks of those say that are not held out."""
     shown = [
         (i, fact.box) for i, test in zip(used, tested, strict=True) if not test and (fact := facts[i]) and fact.box
     ]
@@ -238,7 +238,7 @@ def split_frames(count: int, split: int) -> list[bool]:
 
 
 def _told(video: Video, indices: list[int], what: str) -> str:
-    """A sentence about some frames, with runs as ranges."""
+    """Return a sentence about some frames, with runs as ranges."""
     if not indices:
         return ""
     runs: list[list[int]] = []
@@ -299,7 +299,7 @@ def _key(video: Video, selection: Selection) -> str:
 
 
 def files_identity(*files: Path | None) -> str:
-    """Path, size and time of change of some files, as text."""
+    """Return the path, size and time of change of some files, as text."""
     return digest(*(file_state(file) for file in files if file is not None))
 
 
@@ -326,7 +326,7 @@ class _Frames(Sequence[Frame]):
         return Frame(self.times[index], None, rgba[:3], rgba[3:], 0, crop, points)
 
     def digest(self, indices: Sequence[int]) -> str:
-        """SHA-256 over times, crops, keypoints and pixels of some frames."""
+        """Return SHA-256 over times, crops, keypoints and pixels of some frames."""
         parts: list[str | torch.Tensor | np.ndarray] = []
         for index in indices:
             parts += [repr(self.times[index]), repr(self.layout.crops[index]), self._rgba[index]]

@@ -30,7 +30,7 @@ def chosen(name: str, spec: Spec, choice: planning.Choice) -> Spec:
 
 
 def cases_of(name: str, known: Sequence[str], patterns: Sequence[str]) -> tuple[tuple[str, ...], str]:
-    """The cases of a table that the data has, and a sentence on those that it has not.
+    """Return the cases of a table that the data has, and a sentence on those that it has not.
 
     Args:
         name: of the table.

@@ -59,7 +59,7 @@ def main(arguments: list[str]) -> int:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Width and height of "640x360".
+    """Return the width and height of "640x360".
 
     Raises:
         UserError: anything else, or a side that is too short or too long.

@@ -92,7 +92,7 @@ def main(arguments: list[str]) -> int:
 
 
 def make_maker(options: Options, device: torch.device) -> MaskMaker:
-    """The maker that `--tool` names.
+    """Return the maker that `--tool` names.
 
     Raises:
         UserError: an unknown one, or one that lacks a command or a package.

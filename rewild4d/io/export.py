@@ -24,7 +24,7 @@ from rewild4d.visualize.turntable import find_stance, turn
 
 
 def parse_kinds(text: str) -> tuple[str, ...]:
-    """The kinds of files that "ply,glb" names.
+    """Return the kinds of files that "ply,glb" names.
 
     Raises:
         UserError: an unknown kind, or none.
@@ -39,7 +39,7 @@ def parse_kinds(text: str) -> tuple[str, ...]:
 
 
 def why_not(reconstruction: Reconstruction, kind: str, clip: Clip) -> str:
-    """Why a kind of file cannot be written; "" where it can."""
+    """Return why a kind of file cannot be written; "" where it can."""
     if kind == "glb" and not isinstance(reconstruction, Articulated):
         return "the method has no skeleton with skinning weights"
     if kind in ("cameras", "mp4") and not any(input_camera(reconstruction, frame) for frame in clip.frames):
@@ -75,7 +75,7 @@ def export(reconstruction: Reconstruction, clip: Clip, kinds: Sequence[str], fol
 
 
 def camera_table(reconstruction: Reconstruction, frames: Sequence[Frame]) -> dict[str, Any]:
-    """The cameras of some frames as plain numbers, with the conventions spelt out."""
+    """Return the cameras of some frames as plain numbers, with the conventions spelt out."""
     rows = [_camera_row(input_camera(reconstruction, frame), frame) for frame in frames]
     return {
         "axes": "OpenCV: x right, y down, z forward",

@@ -59,14 +59,14 @@ class Discs:
     colors: Tensor | None
 
     def splats(self, colors: Tensor) -> Splats:
-        """Opaque Gaussians of the given colours, [n, 3]."""
+        """Return the opaque Gaussians of the given colours, [n, 3]."""
         count = len(self.points)
         scales = self.radius * self.points.new_tensor((1.0, 1.0, THICKNESS)).expand(count, 3)
         return Splats(self.points, quats_from_normals(self.normals), scales, torch.ones(count), colors[:, None])
 
 
 def read_mesh(path: Path) -> Mesh:
-    """A mesh with its colours, from an .obj or a .ply file.
+    """Return a mesh with its colours, from an .obj or a .ply file.
 
     Raises:
         UserError: no such file, another kind of file, damaged, without triangles, or beyond `ply.LARGEST`.
@@ -113,7 +113,7 @@ def discs(meshes: Sequence[Mesh], count: int, seed: int) -> list[Discs]:
 
 
 def _draw(mesh: Mesh, count: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Faces, [count], and barycentric coordinates in them, [count, 3]."""
+    """Return faces, [count], and barycentric coordinates in them, [count, 3]."""
     generator = torch.Generator().manual_seed(seed)
     corners = mesh.vertices[mesh.faces].double()
     area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=-1)
@@ -139,7 +139,7 @@ def _colors(mesh: Mesh, face: Tensor, shares: Tensor) -> Tensor | None:
 
 
 def _read_obj(path: Path) -> Mesh:
-    """Vertices (with colours behind the position where a program writes them), faces, one texture."""
+    """Return vertices (with colours behind the position where a program writes them), faces, one texture."""
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError as error:
@@ -170,7 +170,7 @@ def _read_obj(path: Path) -> Mesh:
 
 
 def _index(number: int, count: int) -> int:
-    """OBJ counts from 1, and backwards from the latest with negative numbers."""
+    """Return OBJ counts from 1, and backwards from the latest with negative numbers."""
     return number - 1 if number > 0 else count + number
 
 
@@ -200,7 +200,7 @@ def _mesh(
 
 
 def _corners(path: Path, triples: list[tuple[int, int, int]], count: int, what: str) -> Tensor:
-    """Rows of ``count`` things that the corners of triangles name, int64, [f, 3]."""
+    """Return rows of ``count`` things that the corners of triangles name, int64, [f, 3]."""
     if not all(0 <= corner < count for triple in triples for corner in triple):
         raise UserError(f"{path}: expected faces of {what} 1 to {count}, got one of another.")
     return torch.tensor(triples, dtype=torch.int64).reshape(-1, 3)

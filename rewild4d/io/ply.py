@@ -31,7 +31,7 @@ BRIGHTEST_LOGIT = 15.0
 
 
 def read_points(path: Path) -> Tensor:
-    """The vertices of any PLY file, float64, [n, 3].
+    """Return the vertices of any PLY file, float64, [n, 3].
 
     Raises:
         UserError: no such file, not a PLY, damaged, without x, y and z, or with a NaN.
@@ -40,7 +40,7 @@ def read_points(path: Path) -> Tensor:
 
 
 def read_mesh(path: Path) -> tuple[Tensor, Tensor]:
-    """Vertices, float64, [n, 3], and triangles, int64, [f, 3]; polygons are cut into fans, [0, 3] without faces.
+    """Return vertices, float64, [n, 3], and triangles, int64, [f, 3]; polygons are cut into fans, [0, 3] without faces.
 
     Raises:
         UserError: as `read_points`, or a face that names a vertex which is not there.
@@ -52,7 +52,7 @@ def read_mesh(path: Path) -> tuple[Tensor, Tensor]:
 
 
 def read_splats(path: Path) -> Splats:
-    """The Gaussians of a PLY file, activated values in single precision.
+    """Return the Gaussians of a PLY file, activated values in single precision.
 
     Raises:
         UserError: as `read_points`, a property of a Gaussian is missing, or a value is beyond `LARGEST`.
@@ -66,7 +66,7 @@ def read_splats(path: Path) -> Splats:
 
 
 def read_surface(path: Path, count: int, seed: int) -> Tensor:
-    """Points that stand for the surface in a PLY file, float64, [n, 3].
+    """Return points that stand for the surface in a PLY file, float64, [n, 3].
 
     A mesh is sampled uniformly by area, ``count`` points; Gaussians stand with their centres (`sample_gaussians`); of a
     plain cloud all points are taken as they are.
@@ -90,7 +90,7 @@ def read_surface(path: Path, count: int, seed: int) -> Tensor:
 
 
 def is_mesh(path: Path) -> bool:
-    """Whether `read_surface` samples what a PLY file holds; its errors."""
+    """Tell whether `read_surface` samples what a PLY file holds; its errors."""
     elements = read_elements(path)
     vertices = _vertices(path, elements)
     if set(SPLAT_PROPERTIES) <= vertices.columns.keys():
@@ -157,7 +157,7 @@ def _vertices(path: Path, elements: dict[str, Element]) -> Element:
 
 
 def _columns(path: Path, element: Element, names: tuple[str, ...]) -> np.ndarray:
-    """Finite values of the named properties, float64, [n, len(names)]."""
+    """Return the finite values of the named properties, float64, [n, len(names)]."""
     missing = [name for name in names if name not in element.columns]
     if missing:
         raise UserError(f"{path}: expected vertices with {', '.join(names)}, got none of the name {missing[0]}.")

@@ -41,7 +41,7 @@ class _Property(NamedTuple):
 
 
 def read_elements(path: Path) -> dict[str, Element]:
-    """All elements of a PLY file by name.
+    """Return all elements of a PLY file by name.
 
     Raises:
         UserError: no such file, not a PLY, a format or type that does not exist, a body shorter than the header says.
@@ -61,7 +61,7 @@ def read_elements(path: Path) -> dict[str, Element]:
 
 
 def _header(path: Path, lines: list[str]) -> tuple[str, list[tuple[str, int, list[_Property]]]]:
-    """Byte order ("" for ASCII) and each element's name, rows and properties."""
+    """Return the byte order ("" for ASCII) and each element's name, rows and properties."""
     order: str | None = None
     elements: list[tuple[str, int, list[_Property]]] = []
     for line in lines:
@@ -99,7 +99,7 @@ class _Body(ABC):
         self.path = path
 
     def element(self, name: str, count: int, properties: list[_Property]) -> Element:
-        """The next element, or a sentence that it is cut off."""
+        """Return the next element, or a sentence that it is cut off."""
         try:
             if any(item.length for item in properties):
                 return self._rows(count, properties)
@@ -108,7 +108,7 @@ class _Body(ABC):
             raise UserError(f"{self.path}: expected {count} rows of '{name}', but the file ends before.") from error
 
     def _rows(self, count: int, properties: list[_Property]) -> Element:
-        """Rows with lists have no fixed length."""
+        """Tell whether rows hold lists and so have no fixed length."""
         lengths: dict[str, list[int]] = {item.name: [] for item in properties}
         parts: dict[str, list[np.ndarray]] = {item.name: [np.empty(0, item.type)] for item in properties}
         for _ in range(count):
@@ -133,11 +133,11 @@ class _Body(ABC):
 
     @abstractmethod
     def _table(self, count: int, properties: list[_Property]) -> dict[str, np.ndarray]:
-        """Columns of the next rows, all of scalars; EOFError where there are fewer."""
+        """Return columns of the next rows, all of scalars; EOFError where there are fewer."""
 
     @abstractmethod
     def _take(self, kind: str, count: int) -> np.ndarray:
-        """The next values of one type; EOFError where there are fewer."""
+        """Return the next values of one type; EOFError where there are fewer."""
 
 
 class _Binary(_Body):

@@ -11,7 +11,7 @@ OPACITY = 0.1
 
 
 def sample_mesh(vertices: Tensor, faces: Tensor, count: int, seed: int) -> Tensor:
-    """Points uniform by area on a triangle mesh.
+    """Return points uniform by area on a triangle mesh.
 
     Args:
         vertices: [v, 3].
@@ -38,7 +38,7 @@ def sample_mesh(vertices: Tensor, faces: Tensor, count: int, seed: int) -> Tenso
 
 
 def sample_gaussians(splats: Splats, count: int, seed: int, opacity: float = OPACITY) -> Tensor:
-    """Points that stand for the surface that Gaussians draw: their centres (METHOD section 8).
+    """Return points that stand for the surface that Gaussians draw: their centres (METHOD section 8).
 
     The rule: Gaussians of at least the given opacity count, each with its centre; of more than ``count`` so many are
     drawn. Points spread over the ellipses instead would stand one deviation outside wherever Gaussians are round.
@@ -61,5 +61,5 @@ def sample_gaussians(splats: Splats, count: int, seed: int, opacity: float = OPA
 
 
 def _draw(ends: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Rows drawn with chances proportional to the steps of a rising sum, [count]."""
+    """Return rows drawn with chances proportional to the steps of a rising sum, [count]."""
     return np.searchsorted(ends, rng.random(count) * ends[-1], side="right").clip(max=len(ends) - 1)

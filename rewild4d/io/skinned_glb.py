@@ -91,7 +91,7 @@ def write_glb(path: Path, reconstruction: Articulated, times: Sequence[float], n
 
 
 def motion(reconstruction: Articulated, times: Sequence[float]) -> Motion:
-    """The motion of a reconstruction's skeleton; each bone's node stands in its pivot at rest."""
+    """Return the motion of a reconstruction's skeleton; each bone's node stands in its pivot at rest."""
     moved = [reconstruction.articulation(time) for time in times]
     transforms = torch.stack([bones.double().cpu() for bones, _ in moved])
     root = torch.stack([matrix.double().cpu() for _, matrix in moved])
@@ -104,7 +104,7 @@ def motion(reconstruction: Articulated, times: Sequence[float]) -> Motion:
 
 
 def squares(splats: Splats) -> tuple[Tensor, Tensor, Tensor]:
-    """A square for each Gaussian.
+    """Return a square for each Gaussian.
 
     Returns:
         Corners, [4 n, 3]; two triangles each, int64, [2 n, 3]; normals of the corners, unit, [4 n, 3].
@@ -123,7 +123,7 @@ def squares(splats: Splats) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def influences(weights: Tensor) -> tuple[Tensor, Tensor]:
-    """The joints that move each row, most important first, in sets of four.
+    """Return the joints that move each row, most important first, in sets of four.
 
     Args:
         weights: rows sum to one, [n, J].
@@ -144,7 +144,7 @@ def influences(weights: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def shown(splats: Splats) -> Tensor:
-    """Which Gaussians are opaque enough to become squares, bool [n]."""
+    """Return which Gaussians are opaque enough to become squares, bool [n]."""
     return splats.opacities >= SEEN
 
 
@@ -155,7 +155,7 @@ def _seen(splats: Splats, weights: Tensor) -> tuple[Splats, Tensor]:
 
 
 def _linear_colors(splats: Splats) -> Tensor:
-    """Colour without the view-dependent part, linear as glTF wants vertex colours, [n, 3]."""
+    """Return the colour without the view-dependent part, linear as glTF wants vertex colours, [n, 3]."""
     colors = splats.colors[:, 0].double().cpu()
     srgb = (colors if splats.colors.shape[1] == 1 else 0.5 + C0 * colors).clamp(0, 1)
     return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
@@ -196,7 +196,7 @@ def _scene(
     builder: _Builder, name: str, copyright: str, attributes: dict[str, int], indices: int, pivots: Tensor,
     parents: list[int],
 ) -> pygltflib.GLTF2:  # fmt: skip
-    """Nodes: 0 the root, 1 to J the bones, then the mesh."""
+    """Return nodes: 0 the root, 1 to J the bones, then the mesh."""
     nodes = [pygltflib.Node(name="root", children=[])]
     for bone, parent in enumerate(parents):
         local = pivots[bone] - (pivots[parent] if parent >= 0 else 0)

@@ -79,7 +79,7 @@ class PriorChoice:
         return self.name == "rig" or self.noise is not None
 
     def identity(self, clip: Clip, truth: Truth) -> str:
-        """Digest of all that decides the prior, before it is made: sixteen hex digits.
+        """Return the digest of all that decides the prior, before it is made: sixteen hex digits.
 
         Raises:
             UserError: "rig", and the data set has none.
@@ -97,15 +97,15 @@ class PriorChoice:
         return digest(*parts)[:16]
 
     def settings(self, clip: Clip) -> PriorConfig:
-        """Settings of the fit that this clip asks for: footage without cameras has its own."""
+        """Return settings of the fit that this clip asks for: footage without cameras has its own."""
         return self.settings_under(_has_cameras(clip))
 
     def settings_under(self, known_cameras: bool) -> PriorConfig:
-        """Settings of the fit where cameras are known or not."""
+        """Return settings of the fit where cameras are known or not."""
         return FOOTAGE if self.name == "template" and not known_cameras else self.config
 
     def keypoints(self, clip: Clip) -> tuple[Marks | None, Marks | None]:
-        """The clip's keypoints for the fit and those to score it by; None where there are none."""
+        """Return the clip's keypoints for the fit and those to score it by; None where there are none."""
         return split_marks(marks([frame.keypoints for frame in clip.frames], self._pairs), self.use)
 
     @property
@@ -114,7 +114,7 @@ class PriorChoice:
 
 
 def split_marks(found: Marks, use: Use) -> tuple[Marks | None, Marks | None]:
-    """Marks for the fit and marks to score it by; None for no marks."""
+    """Return marks for the fit and marks to score it by; None for no marks."""
     moments, step = found.moments.unique(), {"all": 1, "half": 2, "none": 0}[use]
     seen = torch.isin(found.moments, moments[::step] if step else moments[:0])
     given, scored = found.chosen(seen), found.chosen(~seen)
@@ -122,7 +122,7 @@ def split_marks(found: Marks, use: Use) -> tuple[Marks | None, Marks | None]:
 
 
 def make_prior(choice: PriorChoice, clip: Clip, truth: Truth, path: Path, log: Log) -> Prior:
-    """The chosen prior; a fitted one is kept at ``path`` and read from there the next time.
+    """Return the chosen prior; a fitted one is kept at ``path`` and read from there the next time.
 
     For a clip without cameras it has a row for each frame whose camera agrees with the others' (`steady`), and `notes`
     say what was left out and what speaks against it.

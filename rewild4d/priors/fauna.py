@@ -109,7 +109,7 @@ def _rest(folder: Path, names: list[str], angles: list[Tensor]) -> tuple[Tensor,
 
 
 def _unposed(posed: Tensor, angles: Tensor) -> tuple[Tensor, float]:
-    """The rest mesh whose pose is the given one, and how far posing it again stays from that (mean distance).
+    """Return the rest mesh whose pose is the given one, and how far posing it again stays from that (mean distance).
 
     Raises:
         ValueError: there is no room for bones.
@@ -128,7 +128,7 @@ def _unposed(posed: Tensor, angles: Tensor) -> tuple[Tensor, float]:
 
 
 def _bones(vertices: Tensor) -> tuple[Tensor, tuple[int, ...]]:
-    """`estimate_bones` of vertices that have room for them.
+    """Return `estimate_bones` of vertices that have room for them.
 
     Raises:
         ValueError: they lie in a plane, too few of them are low enough to be feet, or a bone has no direction.
@@ -145,7 +145,7 @@ def _bones(vertices: Tensor) -> tuple[Tensor, tuple[int, ...]]:
 
 
 def _is_flat(vertices: Tensor) -> bool:
-    """Whether points lie (nearly) in a plane, whichever way it is turned, or are no shape at all, [n, 3]."""
+    """Tell whether points lie (nearly) in a plane, whichever way it is turned, or are no shape at all, [n, 3]."""
     diagonal = (vertices.amax(0) - vertices.amin(0)).norm()
     if not 0 < float(diagonal) < math.inf:
         return True

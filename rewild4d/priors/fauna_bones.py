@@ -12,7 +12,7 @@ QUADRANTS = ((1, 1), (1, -1), (-1, -1), (-1, 1))
 
 
 def estimate_bones(vertices: Tensor) -> tuple[Tensor, tuple[int, ...]]:
-    """Bones (start, end) and the parent of each.
+    """Return bones (start, end) and the parent of each.
 
     Args:
         vertices: rest shape, [n, 3].
@@ -43,7 +43,7 @@ def estimate_bones(vertices: Tensor) -> tuple[Tensor, tuple[int, ...]]:
 
 
 def _foot(vertices: Tensor, side: int, end: int) -> Tensor:
-    """The lowest vertex of a quadrant, [3]."""
+    """Return the lowest vertex of a quadrant, [3]."""
     low = vertices[vertices[:, 1] < vertices[:, 1].quantile(0.4)]
     x0, z0 = low[:, 0].median(), low[:, 2].median()
     span = torch.quantile(low, 0.95, dim=0) - torch.quantile(low, 0.05, dim=0)
@@ -55,7 +55,7 @@ def _foot(vertices: Tensor, side: int, end: int) -> Tensor:
 
 
 def skinning_weights(vertices: Tensor, bones: Tensor) -> Tensor:
-    """Softmax over bones of minus the distance to the bone over the temperature, [n, 20]."""
+    """Return Softmax over bones of minus the distance to the bone over the temperature, [n, 20]."""
     start, along = bones[:, 0], bones[:, 1] - bones[:, 0]
     offset = vertices[:, None] - start
     share = ((offset * along).sum(-1) / along.square().sum(-1).clamp_min(1e-12)).clamp(0, 1)
@@ -64,7 +64,7 @@ def skinning_weights(vertices: Tensor, bones: Tensor) -> Tensor:
 
 
 def joint_transforms(bones: Tensor, parents: tuple[int, ...], angles: Tensor) -> Tensor:
-    """Rest -> posed of every bone: the product from root to leaf of M R M^-1, M the bone's frame at rest.
+    """Return the rest -> posed of every bone: the product from root to leaf of M R M^-1, M the bone's frame at rest.
 
     Args:
         bones: [20, 2, 3].
@@ -90,7 +90,7 @@ def joint_transforms(bones: Tensor, parents: tuple[int, ...], angles: Tensor) ->
 
 
 def _euler(angles: Tensor) -> Tensor:
-    """Rx @ Ry @ Rz, [j, 3] -> [j, 3, 3]."""
+    """Return the rx @ Ry @ Rz, [j, 3] -> [j, 3, 3]."""
     (cx, cy, cz), (sx, sy, sz) = angles.cos().unbind(-1), angles.sin().unbind(-1)
     zero, one = torch.zeros_like(cx), torch.ones_like(cx)
     about_x = torch.stack((one, zero, zero, zero, cx, -sx, zero, sx, cx), -1).unflatten(-1, (3, 3))

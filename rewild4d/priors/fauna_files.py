@@ -22,7 +22,7 @@ _NAME = re.compile(r"(?P<step>\d+)_\s*(?P<frame>\S+)_mesh\.obj")
 
 
 def stems(folder: Path) -> dict[str, str]:
-    """Frame name -> file stem, of the latest step, in order of the frames.
+    """Return the frame name -> file stem, of the latest step, in order of the frames.
 
     Raises:
         UserError: no folder, or no meshes in it.
@@ -44,7 +44,7 @@ def stems(folder: Path) -> dict[str, str]:
 def frames(
     folder: Path, stem_of: dict[str, str], boxes: Path | None, size: int, *, flipped: bool
 ) -> tuple[list[Tensor], list[Camera]]:
-    """Joint angles, float64, [20, 3], and the camera of every frame; see `read_fauna` for the rest.
+    """Return the joint angles, float64, [20, 3], and the camera of every frame; see `read_fauna` for the rest.
 
     Raises:
         UserError: a file is missing, or its numbers are no angles, no pose or no box.
@@ -71,7 +71,7 @@ def _camera(path: Path) -> Camera:
 
 
 def _placed(camera: Camera, box: Path | None, size: int, flipped: bool) -> Camera:
-    """The camera of the crop at another size, or of the whole frame that a box file places the crop in."""
+    """Return the camera of the crop at another size, or of the whole frame that a box file places the crop in."""
     if box is None:
         return camera.resized(size, size)
     numbers = _numbers(box, 8)[1:7].tolist()
@@ -85,7 +85,7 @@ def _placed(camera: Camera, box: Path | None, size: int, flipped: bool) -> Camer
 
 
 def _numbers(path: Path, count: int) -> Tensor:
-    """Whitespace-separated numbers, float64, [count].
+    """Return whitespace-separated numbers, float64, [count].
 
     Raises:
         UserError: no such file, or other numbers of numbers.
@@ -104,7 +104,7 @@ def _numbers(path: Path, count: int) -> Tensor:
 
 
 def read_obj(path: Path) -> tuple[Tensor, Tensor]:
-    """Vertices, float64, [n, 3], and triangles, int64, [f, 3].
+    """Return vertices, float64, [n, 3], and triangles, int64, [f, 3].
 
     Raises:
         UserError: the file cannot be read, a line is cut off or no triangle, or a vertex is not there or not finite.
@@ -137,7 +137,7 @@ def read_obj(path: Path) -> tuple[Tensor, Tensor]:
 
 
 def _vertex(words: list[str]) -> tuple[float, ...]:
-    """The three coordinates; what stands behind them is a colour or a weight."""
+    """Return the three coordinates; what stands behind them is a colour or a weight."""
     x, y, z = (float(word) for word in words[:3])
     if not all(math.isfinite(value) for value in (x, y, z)):
         raise ValueError("not finite")

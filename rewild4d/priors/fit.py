@@ -107,7 +107,7 @@ class KnownCameras(Race):
         return self.config.view_weight * (self.guesses.heading() @ self.gaze).square()
 
     def winner(self) -> Animal:
-        """The best guess in the world, with the rest mesh's diagonal scaled to the object frame's."""
+        """Return the best guess in the world, with the rest mesh's diagonal scaled to the object frame's."""
         best = self.guesses.select(self.costs.argmin()[None])
         shape = Proportions(best.shape[0], best.relief[0])
         size = best.scales().double()[0] * diagonal(quadruped(shape, unit=False).vertices).double() / OBJECT_DIAGONAL

@@ -46,7 +46,7 @@ class Evidence:
         return points + ("" if self.travel is None else "with the animal's travel, ")
 
     def mirrored(self, width: int) -> "Evidence":
-        """The same for the horizontally flipped frames."""
+        """Return the same for the horizontally flipped frames."""
         travel = None if self.travel is None else self.travel * self.travel.new_tensor((-1.0, 1.0))
         return Evidence(None if self.marks is None else self.marks.mirrored(width), travel)
 
@@ -85,7 +85,7 @@ class StandingCamera(Race):
         return cost
 
     def _off_marks(self, found: Marks) -> Tensor:
-        """Robust mean distance of joints to their keypoints, [B]."""
+        """Return the robust mean distance of joints to their keypoints, [B]."""
         boxes = self.boxes[found.moments]
         side = 2 * math.tan(FIELD_OF_VIEW / 2)
         wanted = (found.pixels - boxes[:, :2]) / boxes[:, 2:]
@@ -96,7 +96,7 @@ class StandingCamera(Race):
         return super().verdict(stage) + self.config.travel_weight * self._against_travel()
 
     def _against_travel(self) -> Tensor | float:
-        """Whether heads point against (1) or along (-1) the way the animal goes over the ground, [B]."""
+        """Tell whether heads point against (1) or along (-1) the way the animal goes over the ground, [B]."""
         if self.said.travel is None or not len(self.said.travel):
             return 0.0
         walked = self.said.travel / self.boxes[1:, 2:]
@@ -115,7 +115,7 @@ class StandingCamera(Race):
         super().run(stage)
 
     def rivals(self, order: list[int]) -> list[int]:
-        """The best of each quadrant: head to the left or right, towards or away from the camera."""
+        """Return the best of each quadrant: head to the left or right, towards or away from the camera."""
         heads = self.guesses.heading().detach()
         quadrants = [(bool(heads[row, 0] > 0), bool(heads[row, 2] > 0)) for row in order]
         best: dict[tuple[bool, bool], int] = {}
@@ -160,7 +160,7 @@ def _run(
     clip: Clip, frames: tuple[Frame, ...], said: Evidence, config: PriorConfig, seed: int, log: Log, total: int,
     known: Views | None,
 ) -> StandingCamera:  # fmt: skip
-    """All rounds, from all starts to one guess; ``known`` is the animal whose proportions are taken over."""
+    """Return all rounds, from all starts to one guess; ``known`` is the animal whose proportions are taken over."""
     boxes = windows(frames)
     seen = [
         replace(frame, camera=fauna_camera(box, frame.mask.shape[2], frame.mask.shape[1]))

@@ -91,7 +91,7 @@ class Hypotheses:
         )
 
     def select(self, rows: Tensor) -> "Hypotheses":
-        """Some of the guesses, detached."""
+        """Return some of the guesses, detached."""
         rest = {f.name: getattr(self, f.name).detach()[rows] for f in fields(self) if f.name != "path"}
         return Hypotheses(path=self.path, **rest)
 
@@ -99,27 +99,27 @@ class Hypotheses:
         return len(self.facing)
 
     def scales(self) -> Tensor:
-        """Size of the animals in working units per template unit, [B]."""
+        """Return the size of the animals in working units per template unit, [B]."""
         return torch.exp(SCALE_SPREAD * self.scale)
 
     def roots(self) -> Tensor:
-        """Rigid root motion without the scale, [B, T, 4, 4]."""
+        """Return the rigid root motion without the scale, [B, T, 4, 4]."""
         series = cosine_series(len(self.path), self.turn.shape[1])
         turns = axis_angle_to_matrix((series @ self.turn) * torch.tensor(TURN_SPREAD))
         return rigid(self.facing[:, None] @ turns, self.path + SHIFT_SPREAD * (series @ self.shift))
 
     def heading(self) -> Tensor:
-        """Mean direction from tail to head, [B, 3]."""
+        """Return the mean direction from tail to head, [B, 3]."""
         return torch.nn.functional.normalize(self.roots()[..., :3, 2].mean(1), dim=-1)
 
     def joint_angles(self) -> Tensor:
-        """Axis-angle vectors in radians, [B, T, J, 3]."""
+        """Return axis-angle vectors in radians, [B, T, J, 3]."""
         series = cosine_series(len(self.path), self.angles.shape[1])
         raw = torch.einsum("tk,bkja->btja", series, self.angles) * ANGLE_SPREADS
         return ANGLE_LIMIT * torch.tanh(raw / ANGLE_LIMIT)
 
     def silhouettes(self, targets: Targets, stage: Stage) -> Tensor:
-        """Soft silhouettes in the targets' crops, whose cameras are in the working frame, [B, v, s, s]."""
+        """Return the soft silhouettes in the targets' crops, whose cameras are in the working frame, [B, v, s, s]."""
         template = quadruped(Proportions(self.shape, self.relief), unit=False)
         size = targets.masks.shape[-1]
         if stage.rasterized:
@@ -129,7 +129,7 @@ class Hypotheses:
         return splat(blobs, (template.blob_sizes * self.scales()[:, None])[:, None], targets.intrinsics, size)
 
     def _seen(self, template: Template, points: Tensor, weights: Tensor, targets: Targets, moving: bool) -> Tensor:
-        """Points of the template in the targets' camera coordinates, [B, n, 3] -> [B, v, n, 3]."""
+        """Return points of the template in the targets' camera coordinates, [B, n, 3] -> [B, v, n, 3]."""
         matrix = targets.world_to_camera @ self.roots()[:, targets.moments]
         scale = self.scales()[:, None]
         linear = torch.cat((matrix[..., :3] * scale[..., None, None], matrix[..., 3:]), -1)
@@ -141,7 +141,7 @@ class Hypotheses:
         return torch.einsum("bvnac,bnc->bvna", blended[..., :3], points) + blended[..., 3]
 
     def backward_gait(self) -> Tensor:
-        """Whether low feet move towards the head (against every gait, up to 1) or the tail (down to -1), [B].
+        """Tell whether low feet move towards the head (against every gait, up to 1) or the tail (down to -1), [B].
 
         A foot that bears weight goes backwards in the body's frame, whether the animal travels or walks on the spot;
         with head and tail confused it goes forwards. Near zero where the feet hardly move.
@@ -157,7 +157,7 @@ class Hypotheses:
         return (bearing * step).sum((1, 2)) / (travel + STILL_STEP * bearing.sum((1, 2)))
 
     def penalties(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """How unusual the proportions, the relief, the joint angles and the root's motion are, each [B].
+        """Return how unusual the proportions, the relief, the joint angles and the root's motion are, each [B].
 
         Fast terms cost more than slow ones: a moment seen by one camera says nothing of depth, its neighbours do.
         Where the animal heads on the whole costs nothing: the starts only sample it.

@@ -64,7 +64,7 @@ OFF_ROTATION = 0.01
 
 
 def seal(prior: Prior) -> Prior:
-    """The same prior with its digest, over everything else."""
+    """Return the same prior with its digest, over everything else."""
     cameras = [array for camera in (*prior.cameras, *prior.cameras_flip) for array in _camera_arrays(camera)]
     quality = json.dumps(prior.quality, sort_keys=True)
     arrays = (
@@ -98,7 +98,7 @@ def require_loadable(prior: Prior, source: Path) -> None:
 
 
 def _arrays(prior: Prior) -> dict[str, Any]:
-    """What a prior file holds."""
+    """Return what a prior file holds."""
     arrays: dict[str, Any] = {
         name: getattr(prior, name).detach().cpu().numpy()
         for name in (*SHAPES, *FLIPPED)
@@ -144,7 +144,7 @@ def load_prior(path: Path) -> Prior:
 
 
 def _validated(path: Path, raw: Mapping[str, np.ndarray]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """The arrays of `SHAPES` and those of `FLIPPED` that are there, after all checks."""
+    """Return the arrays of `SHAPES` and those of `FLIPPED` that are there, after all checks."""
     sizes: dict[str, int] = {}
     arrays = {key: _checked(path, raw, key, shape, sizes) for key, shape in SHAPES.items()}
     flipped = {key: _checked(path, raw, key, shape, sizes) for key, shape in FLIPPED.items() if key in raw}
@@ -182,7 +182,7 @@ def _quality(path: Path, text: str) -> dict[str, float]:
 def _checked(
     path: Path, raw: Mapping[str, np.ndarray], key: str, shape: tuple[str | int, ...], sizes: dict[str, int]
 ) -> Tensor:
-    """One array with its documented shape and type; a letter stands for the size seen first."""
+    """Return one array with its documented shape and type; a letter stands for the size seen first."""
     if key not in raw:
         held = ", ".join(sorted(raw)) or "nothing"
         raise UserError(f"{path}: expected an array '{key}', but the file holds only {held}.")
@@ -266,7 +266,7 @@ def _is_pinhole(intrinsics: Tensor) -> bool:
 
 
 def _is_forest(parents: Tensor) -> bool:
-    """Whether every bone reaches a root."""
+    """Tell whether every bone reaches a root."""
     at = torch.arange(len(parents))
     for _ in range(len(parents)):
         at = torch.where(at >= 0, parents[at.clamp(0, len(parents) - 1)].clamp(-1, len(parents) - 1), at)

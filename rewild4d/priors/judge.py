@@ -23,7 +23,7 @@ AGREED = 0.9
 
 
 def measured(prior: Prior, frames: Sequence[Frame]) -> dict[str, float]:
-    """What a prior's masks and cameras say of it.
+    """Return what a prior's masks and cameras say of it.
 
     Args:
         prior: one row per frame.
@@ -58,7 +58,7 @@ def agreement(cameras: Sequence[Camera], cameras_flip: Sequence[Camera]) -> floa
 
 
 def doubts(quality: Mapping[str, float]) -> tuple[str, ...]:
-    """What a prior's figures say against it, a sentence each."""
+    """Return what a prior's figures say against it, a sentence each."""
     found = []
     iou = min(quality.get("mask_iou", 1.0), quality.get("mask_iou_flip", 1.0))
     if iou < POOR:
@@ -72,7 +72,7 @@ def doubts(quality: Mapping[str, float]) -> tuple[str, ...]:
 
 
 def joint_scores(prior: Prior, frames: Sequence[Frame], found: Marks) -> dict[str, float]:
-    """Share of joints near their annotation, and of frames in which front and rear lie the right way round.
+    """Return the share of joints near their annotation, and of frames in which front and rear lie the right way round.
 
     Args:
         prior: one row per frame.
@@ -113,7 +113,7 @@ def _longer_side(mask: Tensor) -> float:
 
 
 def _among(found: Marks, names: Sequence[str]) -> Tensor:
-    """Which marks are one of the named landmarks, bool, [m]."""
+    """Return which marks are one of the named landmarks, bool, [m]."""
     places = {LANDMARKS[name] for name in names}
     marks = zip(found.bones.tolist(), found.along.tolist(), strict=True)
     return torch.tensor([(bone, round(along, 4)) in places for bone, along in marks])

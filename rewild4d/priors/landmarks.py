@@ -53,12 +53,12 @@ class Marks:
     pixels: Tensor
 
     def mirrored(self, width: int) -> "Marks":
-        """The same in horizontally flipped frames."""
+        """Return the same in horizontally flipped frames."""
         flipped = torch.stack((width - self.pixels[:, 0], self.pixels[:, 1]), dim=1)
         return Marks(self.moments, torch.tensor(MIRROR)[self.bones], self.along, flipped)
 
     def chosen(self, rows: Tensor) -> "Marks":
-        """Some of the marks, by index or bool, [m]."""
+        """Return some of the marks, by index or bool, [m]."""
         return Marks(self.moments[rows], self.bones[rows], self.along[rows], self.pixels[rows])
 
     def __len__(self) -> int:
@@ -66,7 +66,7 @@ class Marks:
 
 
 def mapping_names() -> list[str]:
-    """Names of the mapping files that come with the package."""
+    """Return names of the mapping files that come with the package."""
     folder = resources.files("rewild4d.priors") / "mappings"
     return sorted(file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml"))
 
@@ -94,7 +94,7 @@ def load_mapping(name: str) -> dict[str, str]:
 
 
 def marks(keypoints: Sequence[Keypoints | None], mapping: dict[str, str]) -> Marks:
-    """All visible keypoints that the mapping knows; frames without any have None."""
+    """Return all visible keypoints that the mapping knows; frames without any have None."""
     rows, pixels = [], []
     for moment, points in enumerate(keypoints):
         if points is None:
@@ -113,7 +113,7 @@ def marks(keypoints: Sequence[Keypoints | None], mapping: dict[str, str]) -> Mar
 
 
 def landmark_pixels(prior: Prior, found: Marks, cameras: Sequence[Camera] | None = None) -> Tensor:
-    """Where the prior puts the marks, in pixels, [m, 2]; the marks' moments are rows of the prior."""
+    """Return where the prior puts the marks, in pixels, [m, 2]; the marks' moments are rows of the prior."""
     cameras = cameras or prior.cameras
     start, end = prior.bones[found.bones].unbind(1)
     rest = start + found.along[:, None] * (end - start)

@@ -55,14 +55,14 @@ def sample_surface(prior: Prior, count: int, generator: torch.Generator) -> Surf
 
 
 def quats_from_normals(normals: Tensor) -> Tensor:
-    """Orientations whose third axis is the normal, [n, 3] -> [n, 4]."""
+    """Return orientations whose third axis is the normal, [n, 3] -> [n, 4]."""
     helper = torch.where(normals[:, :1].abs() < 0.9, normals.new_tensor((1.0, 0, 0)), normals.new_tensor((0, 1.0, 0)))
     first = normalize(torch.linalg.cross(helper, normals), dim=-1)
     return matrix_to_quat(torch.stack((first, torch.linalg.cross(normals, first), normals), dim=-1))
 
 
 def pose_at(prior: Prior, time: float) -> tuple[Tensor, Tensor]:
-    """The prior's motion at any time: exact at its frames, interpolated between, held beyond the ends.
+    """Return the prior's motion at any time: exact at its frames, interpolated between, held beyond the ends.
 
     Returns:
         object_to_world, float64, [4, 4]; rest -> posed transforms, float32, [J, 4, 4].
@@ -88,12 +88,12 @@ def camera_at(prior: Prior, time: float) -> Camera:
 
 
 def world_camera(prior: Prior, time: float) -> Camera:
-    """`camera_at` in the world where the prior's animal stands."""
+    """Return `camera_at` in the world where the prior's animal stands."""
     return camera_in_object(camera_at(prior, time), torch.linalg.inv(pose_at(prior, time)[0]))
 
 
 def _neighbours(times: Tensor, time: float) -> tuple[int, int, float]:
-    """The frames before and after a time, and its part of the way; one frame twice at it and beyond the ends."""
+    """Return the frames before and after a time, and its part of the way; one frame twice at it and beyond the ends."""
     after = min(int(torch.searchsorted(times, torch.tensor(time, dtype=times.dtype) - 1e-9)), len(times) - 1)
     if after == 0 or time >= float(times[after]) - 1e-9:
         return after, after, 0.0
@@ -112,7 +112,7 @@ def blend_similarities(a: Tensor, b: Tensor, part: float) -> Tensor:
 
 
 def pose_gaussians(sample: SurfaceSample, quats: Tensor, scales: Tensor, colors: Tensor, transforms: Tensor) -> Splats:
-    """Opaque Gaussians on the posed surface, in the object frame.
+    """Return the opaque Gaussians on the posed surface, in the object frame.
 
     Args:
         sample: the surface at rest.
@@ -167,7 +167,7 @@ def colors_from_frames(prior: Prior, sample: SurfaceSample, frames: Sequence[Fra
 
 
 def _look_up(frame: Frame, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Bilinear colour (premultiplied) [n, 3] and matte [n] at pixel positions [n, 2]."""
+    """Return the bilinear colour (premultiplied) [n, 3] and matte [n] at pixel positions [n, 2]."""
     height, width = frame.mask.shape[1:]
     grid = pixels / pixels.new_tensor((width, height)) * 2 - 1
     image = torch.cat((frame.rgb, frame.mask))[None]
@@ -176,7 +176,7 @@ def _look_up(frame: Frame, pixels: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _nearest(pixels: Tensor, depth: Tensor, camera: Camera, cell: float = 3.0) -> Tensor:
-    """Which points lie at the front of a depth buffer with cells of a few pixels, boolean [n]."""
+    """Return which points lie at the front of a depth buffer with cells of a few pixels, boolean [n]."""
     width, height = math.ceil(camera.width / cell), math.ceil(camera.height / cell)
     column, row = (pixels / cell).floor().long().unbind(-1)
     inside = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)

@@ -20,7 +20,7 @@ HEAD_COLOR = (255, 0, 80)
 
 
 def overlay(clip: Clip, prior: Prior, moments: Sequence[int] | None = None, photo: float = 0.0) -> Tensor:
-    """Masks in green, the template in magenta (grey where they agree), bones on top.
+    """Return masks in green, the template in magenta (grey where they agree), bones on top.
 
     Left legs are drawn orange, right legs blue, the spine white and the head red, so that a turned template shows.
 
@@ -81,7 +81,7 @@ def save_overlay(clip: Clip, prior: Prior, beside: Path, side: int = 320) -> lis
 
 
 def _tile(clip: Clip, prior: Prior, moment: int, side: int) -> np.ndarray:
-    """The square around the animal: its picture, dimmed, under the overlay, uint8 [side, side, 3]."""
+    """Return the square around the animal: its picture, dimmed, under the overlay, uint8 [side, side, 3]."""
     frame = clip.frames[moment]
     drawn = overlay(clip, prior, [moment], photo=0.5)[0]
     rows, columns = torch.nonzero(torch.maximum(frame.mask[0], drawn.amax(0)) > 0.2, as_tuple=True)

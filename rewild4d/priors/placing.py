@@ -20,7 +20,7 @@ NEAR = 0.01
 
 
 def resized(prior: Prior, width: int, height: int) -> Prior:
-    """The same prior for frames of another size."""
+    """Return the same prior for frames of another size."""
     cameras, flipped = (
         tuple(camera.resized(width, height) for camera in each) for each in (prior.cameras, prior.cameras_flip)
     )
@@ -28,7 +28,7 @@ def resized(prior: Prior, width: int, height: int) -> Prior:
 
 
 def placed(prior: Prior, clip: Clip) -> Prior:
-    """A prior from a file, for the frames of a clip whose cameras nobody knows.
+    """Return a prior from a file, for the frames of a clip whose cameras nobody knows.
 
     It may have been made for the clip's own images (then its times are the clip's) or for whole frames of the video
     that the clip was cut from (then they are the video's). Frames that it does not know lie between two that it does.
@@ -50,7 +50,7 @@ def placed(prior: Prior, clip: Clip) -> Prior:
 
 
 def in_world(prior: Prior, clip: Clip, file: str) -> Prior:
-    """A prior from a file, for a clip whose cameras are known: at its moments, seen by its cameras.
+    """Return a prior from a file, for a clip whose cameras are known: at its moments, seen by its cameras.
 
     Raises:
         UserError: it is for other moments, or its cameras and `object_to_world` contradict the clip's cameras, or no
@@ -80,7 +80,7 @@ def in_world(prior: Prior, clip: Clip, file: str) -> Prior:
 
 
 def _apart(prior: Prior, row: int, first: Camera, second: Camera) -> float:
-    """The largest distance between the images of a posed bone's end under two cameras, pixels."""
+    """Return the largest distance between the images of a posed bone's end under two cameras, pixels."""
     transforms = prior.transforms[row].double()
     ends = prior.bones.double() @ transforms[:, :3, :3].transpose(1, 2) + transforms[:, None, :3, 3]
     return float((first.project(ends)[0] - second.project(ends)[0]).norm(dim=-1).max())
@@ -140,7 +140,7 @@ def _sampled(prior: Prior, times: Tensor) -> tuple[Tensor, Tensor, tuple[Camera,
 
 
 def in_crops(prior: Prior, clip: Clip) -> Prior:
-    """A prior of whole frames for a clip of square crops of them; it has a row for each of the clip's frames.
+    """Return a prior of whole frames for a clip of square crops of them; it has a row for each of the clip's frames.
 
     Raises:
         UserError: a frame is no crop, or the prior is for frames of another size.

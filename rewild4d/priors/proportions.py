@@ -85,7 +85,7 @@ class Proportions:
 
     @staticmethod
     def of(**measures: float) -> "Proportions":
-        """The average animal but for the named measures (object units, radians)."""
+        """Return the average animal but for the named measures (object units, radians)."""
         deviations = torch.zeros(len(PROPORTIONS))
         for name, value in measures.items():
             average, spread, additive = PROPORTIONS[name]
@@ -94,14 +94,14 @@ class Proportions:
         return Proportions(deviations)
 
     def reliefs(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Relief of the body, the front legs and the rear legs: logarithms and object units, [..., s, 4]."""
+        """Return the relief of the body, the front legs and the rear legs: logarithms and object units, [..., s, 4]."""
         if self.relief is None:
             flat = self.deviations.new_zeros(*self.deviations.shape[:-1], sum(SECTIONS), 4)
             return flat.split(SECTIONS, dim=-2)
         return (self.relief * self.relief.new_tensor(RELIEF_SPREAD)).split(SECTIONS, dim=-2)
 
     def measures(self) -> dict[str, Tensor]:
-        """Every measure by name, each [...]."""
+        """Return every measure by name, each [...]."""
         return {
             name: p.average + p.spread * z if p.additive else p.average * torch.exp(p.spread * z)
             for (name, p), z in zip(PROPORTIONS.items(), self.deviations.unbind(-1), strict=True)

@@ -50,19 +50,19 @@ class Race:
         match_areas(self.guesses, self._targets(self.config.stages[0].size), self.config.stages[0])
 
     def free(self, stage: Stage) -> list[str]:
-        """Names of the parameters that a round may change."""
+        """Return names of the parameters that a round may change."""
         return [*STILL_PARAMETERS, *("angles",) * stage.joints, *("relief",) * stage.relief]
 
     def evidence(self) -> Tensor | float:
-        """What speaks against each guess at every step besides its silhouette and its penalties, [B]."""
+        """Return what speaks against each guess at every step besides its silhouette and its penalties, [B]."""
         return 0.0
 
     def verdict(self, stage: Stage) -> Tensor | float:
-        """What counts only when guesses are compared, [B]."""
+        """Return what counts only when guesses are compared, [B]."""
         return self.config.gait_weight * self.guesses.backward_gait() if stage.joints else 0.0
 
     def rivals(self, order: list[int]) -> list[int]:
-        """Guesses that stay in the race although others are better, most wanted first; ``order`` is by cost."""
+        """Return guesses that stay in the race although others are better, most wanted first; ``order`` is by cost."""
         heads = self.guesses.heading().detach()
         return [row for row in order if heads[row] @ heads[order[0]] < 0][:1]
 
@@ -97,7 +97,7 @@ class Race:
         return crop_targets(self.frames, self.moments, self.working, size, self.name)
 
     def _draw(self, targets: Targets, count: int) -> Targets:
-        """All observations, or a fresh sample of as many as a step may look at."""
+        """Return all observations, or a fresh sample of as many as a step may look at."""
         if len(targets.masks) <= count:
             return targets
         rows = torch.randperm(len(targets.masks), generator=self.generator)[:count]

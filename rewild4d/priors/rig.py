@@ -35,7 +35,7 @@ SAMPLES = 3000
 
 
 def rig_prior(clip: Clip, rig: Rig, template: Prior) -> Prior:
-    """The true animal as a prior.
+    """Return the true animal as a prior.
 
     Args:
         clip: what the method sees; the prior's frames and cameras are its.
@@ -118,7 +118,7 @@ def symmetric_frame(points: Tensor, axes: Tensor) -> Tensor:
 
 
 def _normal(guess: np.ndarray) -> np.ndarray:
-    """The x axis after turns about y and z, given as one axis-angle vector (0, y, z)."""
+    """Return the x axis after turns about y and z, given as one axis-angle vector (0, y, z)."""
     turn = axis_angle_to_matrix(torch.tensor((0.0, guess[0], guess[1]), dtype=torch.float64))
     return turn[:, 0].numpy()
 
@@ -134,7 +134,7 @@ def twins(bones: Tensor) -> Tensor:
 
 
 def _ends(pivots: Tensor, parents: Tensor) -> Tensor:
-    """Where bones end: the mean of their children's pivots; a bone without any goes on as its parent does."""
+    """Return where bones end: the mean of their children's pivots; a bone without any goes on as its parent does."""
     ends = pivots.clone()
     for bone, pivot in enumerate(pivots):
         children = pivots[parents == bone]
@@ -150,7 +150,7 @@ def _moved(points: Tensor, matrix: Tensor) -> Tensor:
 
 
 def _rigid_about(transforms: Tensor, pivots: Tensor) -> Tensor:
-    """The nearest rigid transforms that move the pivots [J, 3] as these [T, J, 4, 4] do: bones may be scaled."""
+    """Return the nearest rigid transforms that move the pivots [J, 3] as these [T, J, 4, 4] do: bones may be scaled."""
     turn = nearest_rotation(transforms[..., :3, :3])
     there = (transforms[..., :3, :3] @ pivots[..., None])[..., 0] + transforms[..., :3, 3]
     return rigid(turn, there - (turn @ pivots[..., None])[..., 0])

@@ -44,7 +44,7 @@ class Rays:
 
 
 def mask_rays(frames: Sequence[Frame], moments: Sequence[int], name: str) -> Rays:
-    """Rays through the mask centroids, in the world.
+    """Return rays through the mask centroids, in the world.
 
     Raises:
         UserError: no mask holds anything, or a frame has no camera.
@@ -70,13 +70,13 @@ def mask_rays(frames: Sequence[Frame], moments: Sequence[int], name: str) -> Ray
 
 
 def spread(directions: Tensor) -> float:
-    """Largest angle of a direction to the mean direction, radians."""
+    """Return the largest angle of a direction to the mean direction, radians."""
     mean = torch.nn.functional.normalize(directions.mean(0), dim=0)
     return float(torch.arccos((directions @ mean).clamp(-1, 1)).max())
 
 
 def trajectory(rays: Rays, count: int) -> Tensor:
-    """The smooth path that comes closest to all rays, in the world, float64, [count, 3].
+    """Return the smooth path that comes closest to all rays, in the world, float64, [count, 3].
 
     Where the rays hardly differ in direction, depth is unknown: then the path lies in the plane across the view that
     holds the world's origin (or, if that is behind the camera, one unit away), since recordings are mostly centred.
@@ -98,7 +98,7 @@ def trajectory(rays: Rays, count: int) -> Tensor:
 
 
 def _same_place(rays: Rays) -> bool:
-    """Whether the cameras' centres are one point next to the distance of the scene."""
+    """Tell whether the cameras' centres are one point next to the distance of the scene."""
     middle = rays.centers.mean(0)
     return bool((rays.centers - middle).norm(dim=1).max() < 0.05 * middle.norm() + 1e-9)
 
@@ -115,7 +115,7 @@ def _frontal_path(rays: Rays, count: int) -> Tensor:
 
 
 def up_directions(rays: Rays, elevations: Sequence[float]) -> Tensor:
-    """Candidates for the world's up direction, float64, [k, 3].
+    """Return candidates for the world's up direction, float64, [k, 3].
 
     Cameras are held without roll, so up is square to every camera's x axis: many directions settle it. With one
     direction only, an axis of the world that fits is taken, else the given camera elevations (degrees) are tried.
@@ -145,14 +145,14 @@ def working_frame(rays: Rays, path: Tensor, up: Tensor) -> Tensor:
 
 
 def single_view(rays: Rays, working: Tensor) -> Tensor | None:
-    """The one direction all cameras look in, in the working frame, [3]; None where directions spread."""
+    """Return the one direction all cameras look in, in the working frame, [3]; None where directions spread."""
     if spread(rays.directions) >= WIDE_BASELINE:
         return None
     return torch.nn.functional.normalize(working[:3, :3].T @ rays.directions.mean(0), dim=0).float()
 
 
 def facings(count: int) -> Tensor:
-    """Turns about y by even shares of the circle, [count, 3, 3]."""
+    """Return turns about y by even shares of the circle, [count, 3, 3]."""
     angle = torch.arange(count) * (2 * torch.pi / count)
     zero, one = torch.zeros(count), torch.ones(count)
     rows = (angle.cos(), zero, angle.sin(), zero, one, zero, -angle.sin(), zero, angle.cos())

@@ -54,7 +54,7 @@ class Targets:
 
 
 def known_camera(frame: Frame, name: str) -> Camera:
-    """The frame's camera.
+    """Return the frame's camera.
 
     Raises:
         UserError: it has none.
@@ -99,7 +99,7 @@ def crop_targets(frames: Sequence[Frame], moments: Sequence[int], world: Tensor,
 
 
 def _square(mask: Tensor) -> tuple[int, int, int] | None:
-    """Left, top and side of the crop window; it may reach beyond the image."""
+    """Return the left, top and side of the crop window; it may reach beyond the image."""
     rows, columns = torch.nonzero(mask > 0.5, as_tuple=True)
     if len(rows) == 0:
         return None
@@ -119,7 +119,7 @@ def _window(image: Tensor, left: int, top: int, side: int, size: int) -> Tensor:
 
 
 def splat(points: Tensor, sizes: Tensor, intrinsics: Tensor, size: int) -> Tensor:
-    """Soft silhouettes of round Gaussians.
+    """Return the soft silhouettes of round Gaussians.
 
     Args:
         points: in camera coordinates, [..., n, 3].
@@ -143,7 +143,7 @@ def splat(points: Tensor, sizes: Tensor, intrinsics: Tensor, size: int) -> Tenso
 
 
 def rasterized(vertices: Tensor, quads: Tensor, intrinsics: Tensor, size: int) -> Tensor:
-    """Silhouettes of a surface by the benchmark's rasterizer: a flat Gaussian on every quadrilateral.
+    """Return silhouettes of a surface by the benchmark's rasterizer: a flat Gaussian on every quadrilateral.
 
     Size and opacity are such that the 50 % contour is the surface's outline to a few hundredths of its area. Gradients
     reach the vertices through the Gaussians' centres alone, which is most of it and half the time.
@@ -178,14 +178,14 @@ def rasterized(vertices: Tensor, quads: Tensor, intrinsics: Tensor, size: int) -
 
 @cache
 def _blur_matrix(size: int, sigma: float) -> Tensor:
-    """Rows that sum to at most one: what leaves the crop is lost, [size, size]."""
+    """Return rows that sum to at most one: what leaves the crop is lost, [size, size]."""
     at = torch.arange(size)
     kernel = torch.exp(-0.5 * ((at[:, None] - at) / sigma).square())
     return kernel / torch.exp(-0.5 * (torch.arange(-size, size + 1) / sigma).square()).sum()
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur of square images, zero outside, [..., s, s]."""
+    """Return Gaussian blur of square images, zero outside, [..., s, s]."""
     matrix = _blur_matrix(images.shape[-1], round(max(sigma, 0.05), 2))
     return matrix @ images @ matrix.T
 
@@ -200,7 +200,7 @@ def mismatch(rendered: Tensor, targets: Targets, sigma: float) -> Tensor:
 
 
 def outline(vertices: Tensor, faces: Tensor, camera: Camera) -> np.ndarray:
-    """The silhouette of a mesh, anti-aliased, uint8, [h, w].
+    """Return the silhouette of a mesh, anti-aliased, uint8, [h, w].
 
     Args:
         vertices: in the camera's world, [n, 3].
@@ -219,7 +219,7 @@ def outline(vertices: Tensor, faces: Tensor, camera: Camera) -> np.ndarray:
 
 
 def overlap(vertices: Sequence[Tensor], faces: Tensor, cameras: Sequence[Camera], masks: Sequence[Tensor]) -> float:
-    """Mean intersection over union of posed meshes with masks at 0.5; empty masks do not count.
+    """Return the mean intersection over union of posed meshes with masks at 0.5; empty masks do not count.
 
     Args:
         vertices: posed in the cameras' world, one [n, 3] per observation.

@@ -38,7 +38,7 @@ class Filtered:
 
 
 def clusters(points: Tensor, reach: float = REACH, neighbours: int = NEIGHBOURS) -> Tensor:
-    """DBSCAN: the cluster of each point, counted from 0; -1 is noise. int64, [n].
+    """Return DBSCAN: the cluster of each point, counted from 0; -1 is noise. int64, [n].
 
     Args:
         points: [n, d].
@@ -51,7 +51,7 @@ def clusters(points: Tensor, reach: float = REACH, neighbours: int = NEIGHBOURS)
 
 
 def steady(cameras: Sequence[Camera], times: Tensor) -> Tensor:
-    """Which cameras belong to the largest cluster; all of them where no cluster forms. bool, [T].
+    """Return which cameras belong to the largest cluster; all of them where no cluster forms. bool, [T].
 
     Where a few frames lie between two of the sequence because they are held out or were not used, a steady camera has
     moved on by as many steps: points on the straight way stand in for them.
@@ -72,7 +72,7 @@ def steady(cameras: Sequence[Camera], times: Tensor) -> Tensor:
 
 
 def _between(features: Tensor, times: Tensor) -> Tensor:
-    """Points for up to `GAP` frames that are missing between neighbours, [m, d]."""
+    """Return points for up to `GAP` frames that are missing between neighbours, [m, d]."""
     gaps = times.diff()
     missing = (gaps / gaps.median()).round().long() - 1 if len(gaps) else gaps.long()
     parts = [

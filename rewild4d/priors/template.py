@@ -65,7 +65,7 @@ class _Tube(NamedTuple):
     heights: Tensor
 
     def points(self, segments: int, inset: Tensor | float = 0.0) -> Tensor:
-        """Points around each ring, moved inwards by ``inset`` ([..., r]), [..., r * segments, 3]."""
+        """Return points around each ring, moved inwards by ``inset`` ([..., r]), [..., r * segments, 3]."""
         angles = torch.arange(segments) * (2 * torch.pi / segments)
         rim = ((self.widths - inset)[..., None, None] * self.across[..., None, :]) * angles.cos()[:, None] + (
             (self.heights - inset)[..., None, None] * self.upward[..., None, :]
@@ -73,7 +73,7 @@ class _Tube(NamedTuple):
         return (self.centers[..., None, :] + rim).flatten(-3, -2)
 
     def mesh(self, segments: int) -> Tensor:
-        """Rings and one cap point at each end, [..., r * segments + 2, 3]."""
+        """Return rings and one cap point at each end, [..., r * segments + 2, 3]."""
         return torch.cat((self.points(segments), self.centers[..., :1, :], self.centers[..., -1:, :]), dim=-2)
 
     def blobs(self, segments: int) -> tuple[Tensor, Tensor]:
@@ -84,7 +84,7 @@ class _Tube(NamedTuple):
 
 @cache
 def _spline(controls: int, rings: int) -> tuple[Tensor, Tensor]:
-    """Values and derivatives of a clamped quadratic B-spline at even parameters, each [rings, controls]."""
+    """Return values and derivatives of a clamped quadratic B-spline at even parameters, each [rings, controls]."""
     degree = 2
     knots = np.concatenate((np.zeros(degree), np.linspace(0.0, 1.0, controls - degree + 1), np.ones(degree)))
     basis = BSpline(knots, np.eye(controls), degree)
@@ -107,7 +107,7 @@ def _loft(sections: Sequence[tuple[Tensor, Tensor, Tensor]], relief: Tensor, rin
 
 @cache
 def _tube_quads(rings: int, segments: int) -> Tensor:
-    """Corners of the quadrilaterals of a tube whose vertices are ordered as `_Tube.mesh` gives them, [q, 4]."""
+    """Return corners of the quadrilaterals of a tube whose vertices are ordered as `_Tube.mesh` gives them, [q, 4]."""
     ring, segment = torch.meshgrid(torch.arange(rings - 1), torch.arange(segments), indexing="ij")
     a = (ring * segments + segment).flatten()
     b = (ring * segments + (segment + 1) % segments).flatten()
@@ -116,7 +116,7 @@ def _tube_quads(rings: int, segments: int) -> Tensor:
 
 @cache
 def _tube_faces(rings: int, segments: int) -> Tensor:
-    """Triangles of the same tube with its caps, [f, 3]."""
+    """Return triangles of the same tube with its caps, [f, 3]."""
     a, b, c, d = _tube_quads(rings, segments).unbind(1)
     around = torch.arange(segments)
     following, last = (around + 1) % segments, (rings - 1) * segments
@@ -136,7 +136,7 @@ def _point(y: Tensor, z: Tensor, x: Tensor | None = None) -> Tensor:
 
 
 def _spine(m: dict[str, Tensor]) -> list[Tensor]:
-    """The nine spine joints from the nose to the tail tip, each [..., 3]."""
+    """Return the nine spine joints from the nose to the tail tip, each [..., 3]."""
     half, high = m["body_length"] / 2, 0.45 * m["chest_height"]
     zero = torch.zeros_like(half)
     withers, hips = _point(high, half), _point(0.45 * m["hip_height"], -half)
@@ -151,7 +151,7 @@ def _spine(m: dict[str, Tensor]) -> list[Tensor]:
 
 
 def _leg(m: dict[str, Tensor], end: str) -> list[Tensor]:
-    """The four joints of a left leg from the top to the foot, each [..., 3]; ``end`` is "front" or "rear"."""
+    """Return the four joints of a left leg from the top to the foot, each [..., 3]; ``end`` is "front" or "rear"."""
     side = 1.0 if end == "front" else -1.0
     length, stance = m[f"{end}_leg"], m[f"{end}_stance"]
     top = side * m["body_length"] / 2
@@ -231,7 +231,7 @@ def _chain_weights(stations: tuple[float, ...], rings: int, bones: tuple[int, ..
 
 @cache
 def _skinning() -> tuple[tuple[Tensor, ...], Tensor]:
-    """Weights of the rings of every tube, each [r, J] (body, then the legs by number), and all faces, [f, 3]."""
+    """Return weights of the rings of every tube, each [r, J] (body, then the legs by number), and all faces, [f, 3]."""
     body = _chain_weights(BODY_STATIONS, BODY_RINGS, (0, 1, 2, 3, 7, 6, 5, 4), 0.0)
     tops = (10, 13, 16, 19)
     legs = tuple(_chain_weights(LEG_STATIONS, LEG_RINGS, (PARENTS[t], t, t - 1, t - 2), -1.0) for t in tops)
@@ -245,7 +245,7 @@ def _skinning() -> tuple[tuple[Tensor, ...], Tensor]:
 
 @cache
 def quads() -> Tensor:
-    """Corners of the quadrilaterals of the whole mesh, its caps left out, int64, [q, 4]."""
+    """Return corners of the quadrilaterals of the whole mesh, its caps left out, int64, [q, 4]."""
     body, leg = _tube_quads(BODY_RINGS, BODY_SEGMENTS), _tube_quads(LEG_RINGS, LEG_SEGMENTS)
     first, each = BODY_RINGS * BODY_SEGMENTS + 2, LEG_RINGS * LEG_SEGMENTS + 2
     return torch.cat((body, *(first + k * each + leg for k in range(4))))
@@ -299,7 +299,7 @@ def quadruped(shape: Proportions | None = None, *, unit: bool = True) -> Templat
 
 
 def diagonal(vertices: Tensor) -> Tensor:
-    """Length of the bounding-box diagonal, [..., n, 3] -> [...]."""
+    """Return the length of the bounding-box diagonal, [..., n, 3] -> [...]."""
     return (vertices.amax(-2) - vertices.amin(-2)).norm(dim=-1)
 
 

@@ -59,7 +59,7 @@ def windows(frames: tuple[Frame, ...]) -> Tensor:
 
 
 def fauna_camera(window: Tensor, width: int, height: int) -> Camera:
-    """The standing camera over one window ([3]: centre and side) of an image, in the working frame."""
+    """Return the standing camera over one window ([3]: centre and side) of an image, in the working frame."""
     x, y, side = window.tolist()
     focal = side / 2 / math.tan(FIELD_OF_VIEW / 2)
     intrinsics = torch.tensor(((focal, 0.0, x), (0.0, focal, y), (0.0, 0.0, 1.0)), dtype=torch.float64)
@@ -115,7 +115,7 @@ class Views(Hypotheses):
         return Views(path=self.path, **both)
 
     def roots(self) -> Tensor:
-        """Rigid root motion without the scale: azimuth, then the camera's elevation, [B, T, 4, 4]."""
+        """Return the rigid root motion without the scale: azimuth, then the camera's elevation, [B, T, 4, 4]."""
         series = cosine_series(len(self.path), self.turn.shape[1])
         azimuth, elevation = (series @ self.turn).unbind(-1)
         turn = _about_x(ELEVATION + ELEVATION_SPREAD * elevation) @ _about_y(AZIMUTH_SPREAD * azimuth)
@@ -123,7 +123,7 @@ class Views(Hypotheses):
         return rigid(turn @ self.facing[:, None], self.path + self.shift * torch.tensor(SHIFT_SPREADS))
 
     def projected(self, found: Marks) -> Tensor:
-        """Where each guess puts the marks: x and y over depth in the camera's axes, [B, m, 2]."""
+        """Return where each guess puts the marks: x and y over depth in the camera's axes, [B, m, 2]."""
         bones = quadruped(Proportions(self.shape, self.relief), unit=False).bones
         moments, rows = found.moments.unique(return_inverse=True)
         transforms = pose(self.joint_angles()[:, moments], bones[:, None, :, 0], PARENTS)[:, rows, found.bones]
@@ -153,7 +153,7 @@ class Views(Hypotheses):
         )
 
     def carriage(self) -> Tensor:
-        """How unlike an animal head and tail are carried, squared shares of the body's length, [B].
+        """Return how unlike an animal head and tail are carried, squared shares of the body's length, [B].
 
         A head points forwards and reaches beyond the withers, a tail hangs behind the hips. Outlines alone would fold
         the head into the body and take a raised tail for a neck.

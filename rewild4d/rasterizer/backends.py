@@ -37,7 +37,7 @@ def set_default(name: str) -> None:
 
 
 def pick_rasterizer(name: str, device: torch.device) -> str:
-    """The backend that renders float32 on a device: the named one, or the one that "auto" picks.
+    """Return the backend that renders float32 on a device: the named one, or the one that "auto" picks.
 
     Raises:
         UserError: unknown, or it cannot be used here; says why.
@@ -52,7 +52,7 @@ def pick_rasterizer(name: str, device: torch.device) -> str:
 
 
 def resolve(backend: str, device: torch.device, dtype: torch.dtype) -> str:
-    """The name of the backend that renders such tensors.
+    """Return the name of the backend that renders such tensors.
 
     Raises:
         ValueError: unknown, or it cannot render them here.
@@ -69,13 +69,13 @@ def resolve(backend: str, device: torch.device, dtype: torch.dtype) -> str:
 
 @cache
 def load(name: str) -> Callable[[RasterInput], Rendered]:
-    """The `rasterize` of a backend."""
+    """Return the `rasterize` of a backend."""
     return importlib.import_module(f"rewild4d.rasterizer.{MODULES[name]}").rasterize
 
 
 @cache  # which also makes it say what it picked only once
 def _automatic(kind: str, dtype: torch.dtype) -> str:
-    """The fastest that takes tensors of a device type; the reference takes all."""
+    """Return the fastest that takes tensors of a device type; the reference takes all."""
     fast = {"cpu": ("numba",), "cuda": ("triton", "gsplat")}.get(kind, ())
     reasons = {name: _unfit(name, torch.device(kind), dtype) for name in fast}
     name = next((name for name, reason in reasons.items() if not reason), "reference")
@@ -87,7 +87,7 @@ def _automatic(kind: str, dtype: torch.dtype) -> str:
 
 
 def _unfit(name: str, device: torch.device, dtype: torch.dtype) -> str:
-    """Why a backend cannot render such tensors here; empty where it can."""
+    """Return why a backend cannot render such tensors here; empty where it can."""
     single, got = dtype == torch.float32, f"got {dtype} on {device}"
     if name == "reference" or (name == "numba" and single and device.type == "cpu"):
         return ""
@@ -105,7 +105,7 @@ def _unfit(name: str, device: torch.device, dtype: torch.dtype) -> str:
 
 
 def _missing(package: str) -> str:
-    """Why a package cannot be imported; empty where it can."""
+    """Return why a package cannot be imported; empty where it can."""
     try:
         importlib.import_module(package)
     except ModuleNotFoundError as error:

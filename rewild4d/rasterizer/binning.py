@@ -106,7 +106,7 @@ def _shape(records: np.ndarray, view: int, n: int) -> tuple:
 
 @inlined
 def _reached_blocks(shape: tuple, left: float, top: float, block_left: np.ndarray, block_top: np.ndarray) -> int:
-    """Bits of the blocks in which the exponent at some point between pixel centres exceeds log2(1/255).
+    """Return bits of the blocks in which the exponent at some point between pixel centres exceeds log2(1/255).
 
     The maximum over a rectangle lies on one of the two sides that face the centre, at the clamped one-dimensional
     optimum; all sixteen blocks are tested at once. ``left`` and ``top`` are the tile's first pixel less the centre.
@@ -124,7 +124,7 @@ def _reached_blocks(shape: tuple, left: float, top: float, block_left: np.ndarra
 
 @inlined
 def _is_before(depths: np.ndarray, view: int, first: int, second: int) -> bool:
-    """Whether one Gaussian comes before another front to back."""
+    """Tell whether one Gaussian comes before another front to back."""
     here, there = depths[view, first], depths[view, second]
     return here < there or (here == there and first < second)
 

@@ -78,7 +78,7 @@ def place_in_tile(
 
 @inlined
 def alpha_at(log_opacity: Any, t: Any, u: Any, strongest: Any, terms: tuple) -> tuple:
-    """Alpha before the lower cut, and log2 of alpha before the upper one."""
+    """Return the alpha before the lower cut, and log2 of alpha before the upper one."""
     exponent = fnma(t, t, fnma(u, u, log_opacity))
     return minimum(exp2_with(terms, exponent), strongest), exponent
 
@@ -154,7 +154,7 @@ def blend(
 
 @inlined
 def tile_place(tile: int, tiles_x: int, tiles_y: int) -> tuple:
-    """View, top and left pixel of a tile."""
+    """Return the view, top and left pixel of a tile."""
     return tile // (tiles_x * tiles_y), tile // tiles_x % tiles_y * TILE, tile % tiles_x * TILE
 
 

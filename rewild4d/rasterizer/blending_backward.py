@@ -51,13 +51,13 @@ _STRONGEST_ALPHA, _STRONGEST = np.float32(MAX_ALPHA), np.float32(math.log2(MAX_A
 
 
 def slot_width(channels: int) -> int:
-    """Numbers in a slot: a vector of moments and of up to three channels' sums; more have their own vectors."""
+    """Return numbers in a slot: a vector of moments and of up to three channels' sums; more have their own vectors."""
     return LANES + (0 if channels <= FEW else -(-channels // LANES) * LANES)
 
 
 @inlined
 def _first_channel(channels: int) -> int:
-    """Where in a slot the channel sums begin."""
+    """Return where in a slot the channel sums begin."""
     return MOMENTS if channels <= FEW else LANES
 
 

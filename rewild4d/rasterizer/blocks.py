@@ -12,7 +12,7 @@ from rewild4d.kernels.tails import load_first, store_first
 
 
 def _pick(quarters: list[int]) -> Any:
-    """An intrinsic that picks quarters of (a, b), numbered 0..7."""
+    """Return an intrinsic that picks quarters of (a, b), numbered 0..7."""
     lanes = [4 * quarter + i for quarter in quarters for i in range(4)]
 
     @intrinsic
@@ -31,7 +31,7 @@ _even_quarters, _odd_quarters = _pick([0, 2, 4, 6]), _pick([1, 3, 5, 7])
 
 @inlined
 def exchange_quarters(a: Any, b: Any, c: Any, d: Any) -> tuple[Any, Any, Any, Any]:
-    """Blocks to rows and back: quarter i of vector j goes to quarter j of vector i."""
+    """Return blocks to rows and back: quarter i of vector j goes to quarter j of vector i."""
     left, right = _first_halves(a, b), _first_halves(c, d)
     left_below, right_below = _second_halves(a, b), _second_halves(c, d)
     return (
@@ -81,7 +81,7 @@ def store_blocks(plane: np.ndarray, first_row: int, x: int, y: int, width: int, 
 
 @inlined
 def load_blocks(plane: np.ndarray, first_row: int, x: int, y: int, width: int, height: int) -> tuple:
-    """Four blocks side by side, zero where they leave the image; arguments as in `store_blocks`."""
+    """Return four blocks side by side, zero where they leave the image; arguments as in `store_blocks`."""
     corner, room = (first_row + y) * width + x, width - x
     return exchange_quarters(
         _load_row(plane, corner, y < height, room),

@@ -102,7 +102,7 @@ def _check_range(named: dict[str, Tensor]) -> None:
 
 
 def _largest(values: Tensor) -> float:
-    """The largest magnitude, of at least one finite value."""
+    """Return the largest magnitude, of at least one finite value."""
     if values.device.type == "cpu":  # see `_check_finite`
         numbers = values.numpy()
         return float(max(numbers.max(), -numbers.min()))

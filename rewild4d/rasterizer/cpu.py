@@ -56,7 +56,7 @@ def _zeros(*shape: int) -> Tensor:
 
 
 def _padded(tensor: Tensor, rows: int, dimension: int = 0) -> Tensor:
-    """The tensor with zeros below, where it has fewer rows: kernels take Gaussians by the eight."""
+    """Return the tensor with zeros below, where it has fewer rows: kernels take Gaussians by the eight."""
     missing = rows - tensor.shape[dimension]
     if missing == 0:
         return tensor

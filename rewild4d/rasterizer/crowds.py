@@ -67,7 +67,7 @@ def _along(gradients: np.ndarray, pixel: int, features: np.ndarray, feature: int
 
 @inlined
 def _place(pixel: int, tile_left: int, tile_top: int) -> tuple:
-    """Column and row in the image of a tile's pixel, counted block by block."""
+    """Return the column and row in the image of a tile's pixel, counted block by block."""
     block, lane = pixel // _PIXELS, pixel % _PIXELS
     x = tile_left + block % (TILE // BLOCK) * BLOCK + lane % BLOCK
     return x, tile_top + block // (TILE // BLOCK) * BLOCK + lane // BLOCK

@@ -28,31 +28,31 @@ LOG2_MIN_ALPHA = math.log2(MIN_ALPHA)
 
 @inlined
 def dot(a: tuple, b: tuple) -> Any:
-    """Scalar product of two triples."""
+    """Return the scalar product of two triples."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @inlined
 def mix(x: Any, a: tuple, y: Any, b: tuple) -> tuple:
-    """The triple x a + y b."""
+    """Return the triple x a + y b."""
     return x * a[0] + y * b[0], x * a[1] + y * b[1], x * a[2] + y * b[2]
 
 
 @inlined
 def scaled(x: Any, a: tuple) -> tuple:
-    """The triple x a."""
+    """Return the triple x a."""
     return x * a[0], x * a[1], x * a[2]
 
 
 @inlined
 def added(a: tuple, b: tuple) -> tuple:
-    """The triple a + b."""
+    """Return the triple a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @inlined
 def camera_axes(world_to_camera: np.ndarray, view: int) -> tuple:
-    """The rows of a camera's rotation and its translation."""
+    """Return the rows of a camera's rotation and its translation."""
     m = world_to_camera[view]
     rows = (m[0, 0], m[0, 1], m[0, 2]), (m[1, 0], m[1, 1], m[1, 2]), (m[2, 0], m[2, 1], m[2, 2])
     return rows, (m[0, 3], m[1, 3], m[2, 3])
@@ -60,13 +60,13 @@ def camera_axes(world_to_camera: np.ndarray, view: int) -> tuple:
 
 @inlined
 def pinhole(intrinsics: np.ndarray, view: int) -> tuple:
-    """Focal lengths and principal point."""
+    """Return the focal lengths and principal point."""
     return intrinsics[view, 0, 0], intrinsics[view, 1, 1], intrinsics[view, 0, 2], intrinsics[view, 1, 2]
 
 
 @inlined
 def unit_quat(quat: tuple) -> tuple:
-    """The unit quaternion and one over the length."""
+    """Return the unit quaternion and one over the length."""
     w, x, y, z = quat
     length = root(w * w + x * x + y * y + z * z)
     inverse = 1.0 / where_gt(length, spread(1e-12), length, spread(1e-12))
@@ -75,7 +75,7 @@ def unit_quat(quat: tuple) -> tuple:
 
 @inlined
 def rotation_columns(w: Any, x: Any, y: Any, z: Any) -> tuple:
-    """Columns of the rotation matrix."""
+    """Return columns of the rotation matrix."""
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
         (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
@@ -92,7 +92,7 @@ def slope_limits(focal: float, center: float, size: int) -> tuple:
 
 @inlined
 def clamp(value: Any, limits: tuple) -> Any:
-    """The value, kept between two limits."""
+    """Return the value, kept between two limits."""
     low, high = limits
     value = where_gt(low, value, low, value)
     return where_gt(value, high, high, value)
@@ -100,7 +100,7 @@ def clamp(value: Any, limits: tuple) -> Any:
 
 @inlined
 def image_axes(linear_x: tuple, linear_y: tuple, axes: tuple, scales: tuple) -> tuple:
-    """The Gaussian's half axes in the image, two rows of three: covariance = rows times their transpose."""
+    """Return the Gaussian's half axes in the image, two rows of three: covariance = rows times their transpose."""
     a, b, c = scales
     row_x = dot(linear_x, axes[0]) * a, dot(linear_x, axes[1]) * b, dot(linear_x, axes[2]) * c
     row_y = dot(linear_y, axes[0]) * a, dot(linear_y, axes[1]) * b, dot(linear_y, axes[2]) * c
@@ -109,14 +109,14 @@ def image_axes(linear_x: tuple, linear_y: tuple, axes: tuple, scales: tuple) -> 
 
 @inlined
 def factor(xx: Any, xy: Any, yy: Any, det: Any) -> tuple:
-    """The triangular factor of the inverse covariance, times log2(e) / 2."""
+    """Return the triangular factor of the inverse covariance, times log2(e) / 2."""
     along_x = root(HALF_LOG2_E * yy / det)
     return along_x, (0.0 - along_x) * xy / yy, root(HALF_LOG2_E / yy)
 
 
 @inlined
 def _in_two(value: Any) -> tuple:
-    """A number that single precision holds, and what the value has beyond it (Dekker 1971)."""
+    """Return a number that single precision holds, and what the value has beyond it (Dekker 1971)."""
     shifted = value * 536870913.0  # 2^29 + 1: 53 digits less 24
     high = shifted - (shifted - value)
     return high, value - high
@@ -126,7 +126,7 @@ def _in_two(value: Any) -> tuple:
 def _shown(
     opacity: Any, det: Any, z: Any, near: float, u: Any, v: Any, extent_x: Any, extent_y: Any, size: tuple
 ) -> Any:
-    """One where a Gaussian can be seen, zero elsewhere."""
+    """Return one where a Gaussian can be seen, zero elsewhere."""
     zero = spread(0.0)
     shown = where_gt(opacity, spread(MIN_ALPHA), where_gt(det, zero, spread(1.0), zero), zero)
     shown = where_gt(z, spread(near), shown, zero)

@@ -42,7 +42,7 @@ CHUNK = 1024
 def _covariance_gradient(
     raw_xx: Any, xy: Any, raw_yy: Any, eps2d: float, antialias: bool, g_tt: Any, g_tu: Any, g_uu: Any, g_log: Any
 ) -> tuple:
-    """Gradient of the projected covariance (xx, xy, yy) from that of a record."""
+    """Return the gradient of the projected covariance (xx, xy, yy) from that of a record."""
     xx, yy = raw_xx + eps2d, raw_yy + eps2d
     det = xx * yy - xy * xy
     a, b, c = factor(xx, xy, yy, det)
@@ -64,7 +64,7 @@ def _covariance_gradient(
 
 @inlined
 def _rotation_gradient(quat: tuple, a: tuple, b: tuple, c: tuple) -> tuple:
-    """Gradient of the raw quaternion from that of the rotation's three columns."""
+    """Return the gradient of the raw quaternion from that of the rotation's three columns."""
     w, x, y, z, inverse = quat
     v_w = 2 * (z * (a[1] - b[0]) + y * (c[0] - a[2]) + x * (b[2] - c[1]))
     v_x = 2 * (y * (a[1] + b[0]) + z * (a[2] + c[0]) + w * (b[2] - c[1]) - 2 * x * (b[1] + c[2]))

@@ -29,7 +29,7 @@ SIZES = ["width", "height", "across", "down", "count"]
 
 @triton.jit
 def _pixels(tile: tl.tensor, width: tl.tensor, height: tl.tensor, across: tl.tensor, down: tl.tensor) -> tuple:
-    """View of the tile; column and row of its pixels, [P]; whether they lie in the image, [P]."""
+    """Return the view of the tile; column and row of its pixels, [P]; whether they lie in the image, [P]."""
     lane = tl.arange(0, PIXELS)
     x = tile % across * SIDE + lane % SIDE
     y = tile // across % down * SIDE + lane // SIDE
@@ -41,7 +41,7 @@ def _alphas(
     entries: tl.tensor, first: tl.tensor, end: tl.tensor, centres: tl.tensor, rests: tl.tensor, records: tl.tensor,
     x: tl.tensor, y: tl.tensor, GROUP: tl.constexpr,
 ) -> tuple:  # fmt: skip
-    """The group's Gaussians and which are any, [G]; t, u, log2 of the uncapped alpha, and alpha, [G, P]."""
+    """Return the group's Gaussians and which are any, [G]; t, u, log2 of the uncapped alpha, and alpha, [G, P]."""
     place = first + tl.arange(0, GROUP)
     real = place < end
     n = tl.load(entries + place, real, 0)
@@ -58,7 +58,7 @@ def _alphas(
 
 @triton.jit
 def _weights(alpha: tl.tensor, left: tl.tensor) -> tuple:
-    """What is left behind each Gaussian were no pixel closed, and the Gaussian's share of the pixel, [G, P].
+    """Return what is left behind each Gaussian were no pixel closed, and the Gaussian's share of the pixel, [G, P].
 
     ``left`` [P] only falls, so a pixel is closed exactly where it is not above the least transmittance.
     """

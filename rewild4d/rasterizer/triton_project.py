@@ -33,7 +33,7 @@ SIZES = ["width", "height", "across", "down", "views", "count", "channels"]
 
 @triton.jit
 def _row(pointer: tl.tensor, place: tl.tensor, real: tl.tensor) -> tuple:
-    """Three numbers from a place on, in double precision."""
+    """Return three numbers from a place on, in double precision."""
     return (
         tl.load(pointer + place, real, 0.0).to(tl.float64),
         tl.load(pointer + place + 1, real, 0.0).to(tl.float64),
@@ -43,7 +43,7 @@ def _row(pointer: tl.tensor, place: tl.tensor, real: tl.tensor) -> tuple:
 
 @triton.jit
 def _unit_quat(quats: tl.tensor, n: tl.tensor, real: tl.tensor) -> tuple:
-    """The unit quaternion and one over the length."""
+    """Return the unit quaternion and one over the length."""
     w = tl.load(quats + 4 * n, real, 1.0).to(tl.float64)
     x, y, z = _row(quats, 4 * n + 1, real)
     inverse = 1.0 / tl.maximum(tl.sqrt(w * w + x * x + y * y + z * z), 1e-12)
@@ -52,7 +52,7 @@ def _unit_quat(quats: tl.tensor, n: tl.tensor, real: tl.tensor) -> tuple:
 
 @triton.jit
 def _axes(w: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tuple:
-    """The rotation matrix, column by column."""
+    """Return the rotation matrix, column by column."""
     return (
         1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y),
         2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
@@ -62,7 +62,7 @@ def _axes(w: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tuple:
 
 @triton.jit
 def _camera_row(world_to_camera: tl.tensor, view: tl.tensor, row: tl.constexpr) -> tuple:
-    """A row of a camera's matrix."""
+    """Return a row of a camera's matrix."""
     place = world_to_camera + view * 16 + row * 4
     return (
         tl.load(place).to(tl.float64), tl.load(place + 1).to(tl.float64),
@@ -72,7 +72,7 @@ def _camera_row(world_to_camera: tl.tensor, view: tl.tensor, row: tl.constexpr) 
 
 @triton.jit
 def _pinhole(intrinsics: tl.tensor, view: tl.tensor, axis: tl.constexpr) -> tuple:
-    """Focal length and principal point along one image axis."""
+    """Return the focal length and principal point along one image axis."""
     place = intrinsics + view * 9 + axis * 3
     return tl.load(place + axis).to(tl.float64), tl.load(place + 2).to(tl.float64)
 
@@ -87,7 +87,7 @@ def _tangent(slope: tl.tensor, focal: tl.tensor, center: tl.tensor, size: tl.ten
 
 @triton.jit
 def _factor(xx: tl.tensor, xy: tl.tensor, yy: tl.tensor, det: tl.tensor) -> tuple:
-    """The triangular factor of the inverse covariance, times log2(e) / 2."""
+    """Return the triangular factor of the inverse covariance, times log2(e) / 2."""
     along_x = tl.sqrt(yy * _HALF_LOG2_E / det)
     return along_x, -along_x * xy / yy, tl.sqrt(1.0 / yy * _HALF_LOG2_E)
 
