@@ -108,7 +108,7 @@ class _Body(ABC):
             raise UserError(f"{self.path}: expected {count} rows of '{name}', but the file ends before.") from error
 
     def _rows(self, count: int, properties: list[_Property]) -> Element:
-        """Tell whether rows hold lists and so have no fixed length."""
+        """Read rows that hold lists and so have no fixed length."""
         lengths: dict[str, list[int]] = {item.name: [] for item in properties}
         parts: dict[str, list[np.ndarray]] = {item.name: [np.empty(0, item.type)] for item in properties}
         for _ in range(count):
