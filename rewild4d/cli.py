@@ -44,10 +44,10 @@ def usage() -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run a command and exit: 0 done, 1 a run failed, 2 bad input, 130 stopped by Ctrl-C."""
-    _print_utf8()
-    watching = False
+    watching, status = False, 1
     try:
         watching = answer_interrupts(main.__code__, f"{STOPPED}\n")
+        _print_utf8()
         status = _run(sys.argv[1:] if arguments is None else arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output has had enough, as in `| head`
@@ -57,11 +57,12 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"rewild4d-bench: {error}", file=sys.stderr)
         status = 2
     except KeyboardInterrupt:
-        print(STOPPED, file=sys.stderr)
         status = STATUS
     finally:
-        if watching:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        if watching:  # a second Ctrl-C, while the process ends, would print pages
+            signal.signal(signal.SIGINT, signal.SIG_IGN if status == STATUS else signal.default_int_handler)
+    if status == STATUS:
+        print(STOPPED, file=sys.stderr)
     sys.exit(status)
 
 
