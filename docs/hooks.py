@@ -4,10 +4,8 @@ import ast
 import base64
 import contextlib
 import io
-import os
 import re
 import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -39,22 +37,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def page(script: str, name: str) -> str:
     """Write a percent script as Markdown, each code cell with its output; the cells run in the repository's root."""
-    parts, scope = [f"*This page is `{name}`, run when the site was built.*"], {"__name__": "__main__"}
-    previous = Path.cwd()
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ.setdefault("REWILD4D_CACHE", folder)
-        os.chdir(ROOT)
-        try:
-            for kind, body in cells(script):
-                if kind == "markdown":
-                    parts.insert(len(parts) if len(parts) > 1 else 0, re.sub(r"^# ?", "", body, flags=re.MULTILINE))
-                else:
-                    parts += [f"```python\n{body}\n```", *run(body, scope)]
-        finally:
-            os.chdir(previous)
-            if os.environ["REWILD4D_CACHE"] == folder:
-                del os.environ["REWILD4D_CACHE"]
-    return "\n\n".join(parts) + "\n"
+    title, parts, scope = "", [f"*This page is `{name}`, run when the site was built.*"], {"__name__": "__main__"}
+    with contextlib.chdir(ROOT):
+        for kind, body in cells(script):
+            text = re.sub(r"^# ?", "", body, flags=re.MULTILINE) if kind == "markdown" else f"```python\n{body}\n```"
+            if not title:
+                title, _, text = text.partition("\n")
+            parts += [text.strip(), *(run(body, scope) if kind == "code" else [])]
+    return "\n\n".join([title, *parts]) + "\n"
 
 
 def cells(script: str) -> list[tuple[str, str]]:
@@ -85,5 +75,5 @@ def show(value: Any) -> str:
         value.savefig(picture, format="png", dpi=80)
         return f"![output](data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()})"
     if hasattr(value, "to_html"):
-        return re.sub(r"\n\s*", "", value.to_html(border=0))
+        return re.sub(r'\n\s*| class="dataframe"| style="[^"]*"', "", value.to_html(border=0))
     return f"```text\n{value!r}\n```"

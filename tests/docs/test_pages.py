@@ -19,9 +19,7 @@ COMMAND = re.compile(r"(?:^ {4}|`|time )rewild4d-bench ([a-z]+)", re.MULTILINE)
 def anchors(page: Path) -> set[str]:
     """Names of a page's headings, as GitHub and mkdocs make them."""
     text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
-    text = re.sub(
-        r'^--8<-- "([^":]+):.*"$', lambda found: (ROOT / found[1]).read_text("utf-8"), text, flags=re.MULTILINE
-    )
+    text = INCLUDED.sub(lambda found: (ROOT / found[1]).read_text(encoding="utf-8"), text)
     plain = (re.sub(r"[^\w\s-]", "", heading).strip().lower() for heading in HEADING.findall(text))
     return {re.sub(r"\s+", "-", heading) for heading in plain}
 
