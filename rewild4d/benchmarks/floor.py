@@ -89,10 +89,8 @@ def count_blends(scene: SplatScene) -> int:
 
 def list_blends(scene: SplatScene) -> Blends:
     """List the useful blends."""
-    projected = _projected(scene)
-    count = _walk(*projected, scene.size, *(np.empty(0, np.int64),) * 2)
-    pixels, gaussians = np.empty(count, np.int64), np.empty(count, np.int64)
-    _walk(*projected, scene.size, pixels, gaussians)
+    pixels, gaussians = np.empty((2, count_blends(scene)), np.int64)
+    _walk(*_projected(scene), scene.size, pixels, gaussians)
     order = np.argsort(pixels, kind="stable")
     return Blends(pixels[order], gaussians[order])
 
