@@ -96,8 +96,8 @@ def list_blends(scene: SplatScene) -> Blends:
 
 
 def _projected(scene: SplatScene) -> tuple[np.ndarray, ...]:
-    """Return, front to back, index [n], centre in pixels [n, 2], covariance (xx, xy, yy) [n, 3] and opacity [n],
-    float64."""
+    """Return, front to back, index [n], centre [n, 2], covariance (xx, xy, yy) [n, 3] and opacity [n], float64,
+    pixels."""
     means, quats, scales, opacities, _ = (tensor.detach().double().numpy() for tensor in scene.gaussians)
     matrix, pinhole = scene.world_to_camera[0].double().numpy(), scene.intrinsics[0].double().numpy()
     local = means @ matrix[:3, :3].T + matrix[:3, 3]
@@ -124,8 +124,7 @@ def _walk(
     pixels: np.ndarray,
     gaussians: np.ndarray,
 ) -> int:
-    """Blend front to back, Gaussian by Gaussian over its rectangle; count the blends, and list them where there is
-    room."""
+    """Blend front to back, Gaussian by Gaussian over its rectangle; count the blends, and list them if there is room."""
     left = np.ones((size, size))
     count = 0
     for k in range(len(index)):
