@@ -124,7 +124,7 @@ def _walk(
     pixels: np.ndarray,
     gaussians: np.ndarray,
 ) -> int:
-    """Blend front to back, Gaussian by Gaussian over its rectangle; count the blends, and list them if there is room."""
+    """Blend front to back, Gaussian by Gaussian over its rectangle; count the blends, list them if there is room."""
     left = np.ones((size, size))
     count = 0
     for k in range(len(index)):
