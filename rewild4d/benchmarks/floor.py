@@ -89,17 +89,15 @@ def count_blends(scene: SplatScene) -> int:
 
 def list_blends(scene: SplatScene) -> Blends:
     """List the useful blends."""
-    projected = _projected(scene)
-    count = _walk(*projected, scene.size, *(np.empty(0, np.int64),) * 2)
-    pixels, gaussians = np.empty(count, np.int64), np.empty(count, np.int64)
-    _walk(*projected, scene.size, pixels, gaussians)
+    pixels, gaussians = np.empty((2, count_blends(scene)), np.int64)
+    _walk(*_projected(scene), scene.size, pixels, gaussians)
     order = np.argsort(pixels, kind="stable")
     return Blends(pixels[order], gaussians[order])
 
 
 def _projected(scene: SplatScene) -> tuple[np.ndarray, ...]:
-    """Return, front to back, index [n], centre in pixels [n, 2], covariance (xx, xy, yy) [n, 3] and opacity [n],
-    float64."""
+    """Return, front to back, index [n], centre [n, 2], covariance (xx, xy, yy) [n, 3] and opacity [n], float64,
+    pixels."""
     means, quats, scales, opacities, _ = (tensor.detach().double().numpy() for tensor in scene.gaussians)
     matrix, pinhole = scene.world_to_camera[0].double().numpy(), scene.intrinsics[0].double().numpy()
     local = means @ matrix[:3, :3].T + matrix[:3, 3]
@@ -126,8 +124,7 @@ def _walk(
     pixels: np.ndarray,
     gaussians: np.ndarray,
 ) -> int:
-    """Blend front to back, Gaussian by Gaussian over its rectangle; count the blends, and list them where there is
-    room."""
+    """Blend front to back, Gaussian by Gaussian over its rectangle; count the blends, list them if there is room."""
     left = np.ones((size, size))
     count = 0
     for k in range(len(index)):

@@ -26,8 +26,7 @@ STATUS = Path("/proc/self/status")
 
 
 def raster_rows(count: int, size: int) -> list[Row]:
-    """Measure cold and cached start, and the peak memory of forward and backward for ``count`` Gaussians at ``size``
-    pixels."""
+    """Measure cold and cached start, and the peak memory of forward and backward of a scene."""
     with tempfile.TemporaryDirectory() as folder, progress("start-up and memory", 3) as bar:
         file = Path(folder, "scene.pt")
         _save(splat_scene(START_COUNT, START_SIZE), file)

@@ -34,8 +34,7 @@ def _all_below(addresses: np.ndarray, counts: np.ndarray, bound: float) -> bool:
 
 
 def all_below(tensors: Iterable[Tensor], bound: float) -> bool:
-    """Tell whether every number of float32 CPU tensors is below a positive bound in magnitude (NaN is not), in one
-    thread."""
+    """Tell whether every number of float32 CPU tensors is below a positive bound in magnitude; NaN is not."""
     kept = [tensor.contiguous() for tensor in tensors]  # alive until the kernel has read them
     assert all(map(packed, kept))
     spans = np.array([(tensor.data_ptr(), tensor.numel()) for tensor in kept], np.int64).reshape(-1, 2)

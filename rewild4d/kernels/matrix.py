@@ -107,7 +107,7 @@ _tile1, _tile2, _tile3 = (matrix_tile(ROWS, vectors, multiply_add) for vectors i
 
 @kernel
 def tile_width(left: int) -> int:
-    """Return the vectors of the next tile's rows; four are cut into two and two, since eight sums alone wait for each
+    """Return the vectors of the next tile's rows; four are cut in two and two, as eight sums alone wait for each
     other."""
     return 2 if left == VECTORS + 1 == 4 else min(left, VECTORS)
 

@@ -27,8 +27,7 @@ class Gaussians(nn.Module):
         quats: wxyz, not normalised, [n, 4].
         log_scales: [n, 3].
         logit_opacities: [n].
-        colors: RGB, then `REST_GAIN` times the coefficients above degree 0 in the canonical frame, [n, (degree + 1)^2,
-            3].
+        colors: RGB, then `REST_GAIN` times the canonical coefficients above degree 0, [n, (degree + 1)^2, 3].
         blur: standard deviation added to every Gaussian: 0 in training, then `Supervision.missing_blur`, scalar.
     """
 
@@ -93,8 +92,7 @@ class Gaussians(nn.Module):
         return quat_to_matrix(quat_multiply(quats, rest * rest.new_tensor((1.0, -1.0, -1.0, -1.0))))
 
     def splat_colors(self, quats: Tensor) -> Tensor:
-        """Return colours for `Splats` with unit ``quats`` [n, 4]: RGB or coefficients in their frame, [n, (degree +
-        1)^2, 3]."""
+        """Return RGB or coefficients in the frame of unit ``quats`` [n, 4] for `Splats`, [n, (degree + 1)^2, 3]."""
         if self.colors.shape[1] == 1:
             return self.rgb()[:, None]
         constant = (self.colors[:, :1] - 0.5) / C0

@@ -219,7 +219,7 @@ class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     attach: Weight = 20.0
     """Pose: weight of the squared gap between a joint and its parent's copy, over the squared diagonal."""
     limb_plane: Weight = 0.0
-    """Pose: weight of a limb bone's squared rotation against its parent out of the plane along the body (half
+    """Pose: weight of a limb bone's squared rotation out of the plane along the body, against its parent (half
     radians)."""
     body_plane: Weight = 0.0
     """Pose: weight of the same of the other bones."""
@@ -228,8 +228,7 @@ class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     temporal: Weight = 10.0
     """Pose: weight of the squared second difference over neighbouring frames."""
     still: Weight = 0.0
-    """Pose: weight of the steps between neighbouring frames under Geman and McClure's function: slow drift is held
-    still."""
+    """Pose: weight of steps between neighbouring frames under Geman and McClure's function, which stops slow drift."""
     still_step: Positive = 1e-3
     """Step of a rotation (half radians) or joint (diagonals) that separates drift from motion."""
     rigid: Weight = 1.0

@@ -48,8 +48,7 @@ class Model(nn.Module):
         self.register_buffer("parents", parents)
 
     def pose(self, times: Tensor, keys: list[Key]) -> Pose:
-        """Compute poses of views at (possibly jittered) times (i + 1) / T, [B]; where tied, mirror images share a
-        pose."""
+        """Compute poses of views at (jittered) times (i + 1) / T, [B]; where tied, mirror images share a pose."""
         config = self.config.pose
         if config.tied:
             ones = torch.ones(len(keys))

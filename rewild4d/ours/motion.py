@@ -12,8 +12,7 @@ from rewild4d.types import Camera
 
 
 def frame_position(times: Tensor, time: float) -> float:
-    """Return the frame position of a time in seconds, clamped to the ascending ``times`` [T]: 1.5 is between frames 1
-    and 2."""
+    """Return the position of a time in seconds among ``times`` [T], clamped: 1.5 is between frames 1 and 2."""
     if len(times) == 1 or time <= float(times[0]):
         return 0.0
     if time >= float(times[-1]):

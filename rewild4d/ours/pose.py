@@ -80,8 +80,7 @@ class PoseNetwork(nn.Module):
         nn.init.zeros_(self.head.bias)
 
     def forward(self, code: Tensor, flipped: Sequence[bool] | None = None, mirror: Tensor | None = None) -> Pose:
-        """Compute poses of a batch of codes [B, E]; those ``flipped`` [B] with left and right exchanged by ``mirror``
-        [J]."""
+        """Compute poses of codes [B, E], with left and right exchanged by ``mirror`` [J] where ``flipped`` [B]."""
         if (
             POSE_NETWORK.takes(self.anchors, owner=self)
             and fits_sizes(self.config.width, self.config.heads)

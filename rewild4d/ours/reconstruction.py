@@ -44,8 +44,7 @@ class OursReconstruction:
 
     @torch.no_grad()
     def at(self, time: float) -> Splats:
-        """Return the Gaussians at a time in seconds in the world; between frames the networks and the root
-        interpolate."""
+        """Return the Gaussians at a time in seconds in the world; networks and root interpolate between frames."""
         position = frame_position(self.times, time)
         pose = self._pose(torch.tensor([position]))
         strength = ramp(1.0, self.config.deform.ramp_start, self.config.deform.ramp_end)

@@ -53,8 +53,8 @@ class SkinningField(nn.Module):
         return weights, tv_loss(probabilities, self.resolution, delta)
 
     def sample(self, probabilities: Tensor, points: Tensor) -> Tensor:
-        """Sample weights [n, J] at points [n, 3] (no gradient) from `probabilities` [R^3, J]; points are clamped to the
-        cube."""
+        """Sample `probabilities` [R^3, J] at points [n, 3] clamped to the cube, without their gradient: weights [n,
+        J]."""
         if FIELD.takes(probabilities, owner=self):
             return sample_grid(probabilities, points, self.origin, self.pitch, self.resolution)[0]
         last = self.resolution - 1

@@ -1,16 +1,20 @@
 """The parts that CPU kernels are made of, against NumPy and torch."""
 
+import math
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 import torch
+from numba.core.errors import TypingError
 from torch import nn
 
+from rewild4d.kernels.columns import read_columns, write_columns
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.doubles import floor, load_columns, log2, root, spread, store_columns, where_gt
 from rewild4d.kernels.halves import add_pair_product, available, pair_matrix, pair_rows, pair_vectors
+from rewild4d.kernels.magnitudes import all_below
 from rewild4d.kernels.matrix import add_product, matrix_tile, multiply_add, transpose_tile
 from rewild4d.kernels.memory import keep_freed_memory
 from rewild4d.kernels.rows import add_scaled, sum_rows
@@ -239,3 +243,49 @@ def test_vectors_of_doubles_compute_as_numpy_does() -> None:
     a, b = x[:8], x[8:]
     expected = np.log2(a), (1 - a * b) / (b + 2), np.sqrt(a), np.floor(a - b), np.where(a > b, a, -1)
     np.testing.assert_allclose(made.reshape(8, 5).T, expected, rtol=1e-10, atol=1e-10)
+
+
+WIDE = 32
+
+
+@pytest.mark.parametrize("numbers", [1, 3, 4, 15, 16, 20, 48])
+@pytest.mark.parametrize(("begin", "end"), [(0, 32), (5, 37), (0, 1), (20, 37), (32, 48)])
+def test_columns_are_the_transposed_rows(numbers: int, begin: int, end: int) -> None:
+    rows = np.arange(48 * numbers, dtype=np.float32).reshape(48, numbers) + 1
+    columns = np.full(-(-numbers // 16) * 16 * WIDE, np.nan, np.float32)
+    read_columns(rows, begin, end, columns, WIDE)
+    made = columns.reshape(-1, WIDE)[:numbers]
+    assert (made[:, : end - begin] == rows[begin:end].T).all()
+    assert (made[:, end - begin :] == 0).all(), "lanes behind the rows"
+    written = np.zeros_like(rows)
+    write_columns(columns, WIDE, written, begin, end)
+    assert (written[begin:end] == rows[begin:end]).all()
+    written[begin:end] = 0
+    assert (written == 0).all(), "no other row is touched"
+
+
+def test_other_numbers_than_single_precision_are_an_error() -> None:
+    with pytest.raises(TypingError):
+        read_columns(np.zeros((4, 3)), 0, 4, np.zeros(16 * WIDE, np.float32), WIDE)
+    with pytest.raises(TypingError):
+        write_columns(np.zeros(16 * WIDE, np.float32), WIDE, np.zeros((4, 3)), 0, 4)
+
+
+@pytest.mark.parametrize("count", [1, 63, 64, 65, 130])
+@pytest.mark.parametrize("odd", [math.nan, math.inf, -math.inf, 8.0, -8.0])
+def test_one_odd_number_is_seen_wherever_it_stands(count: int, odd: float) -> None:
+    before, after = torch.ones(3), -torch.ones(70)
+    for place in range(count):
+        values = torch.linspace(-7.9, 7.9, count)
+        assert all_below((before, values, after), 8.0)
+        values[place] = odd
+        assert not all_below((before, values, after), 8.0), place
+
+
+def test_tensors_of_any_layout_and_none_at_all() -> None:
+    wide = torch.zeros(4, 6)
+    wide[:, 3:] = math.nan
+    assert all_below((wide[:, :3], wide.T[:3]), 1.0)
+    assert not all_below((wide[:, 1:4],), 1.0)
+    assert all_below((), 1.0)
+    assert all_below((torch.zeros(0, 3), torch.zeros(1).expand(5, 2)), 1.0)

@@ -46,7 +46,7 @@ def _huber(step: Any, held: Any) -> Any:
 
 @kernel
 def _variation(tickets: np.ndarray, grid: np.ndarray, delta: float, grad: np.ndarray, sums: np.ndarray) -> None:
-    """Set grad [R, R, R J] and sums [R] of the Huber function of forward differences, plane by plane; the border is
+    """Set grad [R, R, R J] and sums [R] of the Huber function of forward differences, by planes; the border is
     repeated."""
     size, line = grid.shape[0], grid.shape[2]
     joints, last = line // size, size - 1

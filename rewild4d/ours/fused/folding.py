@@ -1,5 +1,4 @@
-"""Flatten the deformation network, its few keys and values folded into the first matrices
-(`DeformNetwork._attention`)."""
+"""Flatten the deformation network, its few keys and values folded into the first matrices."""
 
 from typing import Any, NamedTuple
 

@@ -275,8 +275,7 @@ def _matte_backward(
 
 
 def matte_loss(alpha: Tensor, mask: Tensor, window: tuple[int, int, int, int], area: float) -> Tensor:
-    """Compute `silhouette_loss` inside a window (top, left, height, width); float32 on the CPU, gradient for alpha
-    only."""
+    """Compute `silhouette_loss` in a window (top, left, height, width); float32 on the CPU, gradient for alpha only."""
     return _Matte.apply(alpha, mask, window, area)
 
 

@@ -72,8 +72,7 @@ def _backward(quats: np.ndarray, chosen: np.ndarray, grad: np.ndarray, on_quats:
 
 
 def smallest_axes(quats: Tensor, log_scales: Tensor, means: Tensor, eye: Tensor) -> Tensor:
-    """Return the axis of each Gaussian's smallest scale, pointing to ``eye`` [3]; float32 on the CPU, gradient for
-    quats only."""
+    """Compute `regularizers._normals`; float32 on the CPU, gradient for quats only."""
     return _SmallestAxes.apply(quats, log_scales, means, eye)
 
 
@@ -158,8 +157,7 @@ def _agreement(image: np.ndarray, matte: np.ndarray, grad: np.ndarray) -> tuple:
 
 
 def disagreement(image: Tensor, matte: Tensor) -> Tensor:
-    """Return the mean of 1 - |cos| over pairs of neighbouring pixels' vectors [3, h, w], weighted by both mattes [h,
-    w]."""
+    """Compute `regularizers._disagreement`; float32 on the CPU, gradient for the image only."""
     return _Disagreement.apply(image, matte)
 
 

@@ -84,8 +84,7 @@ def outputs(kept: np.ndarray, s: Sizes) -> np.ndarray:
 
 @kernel
 def _block(kept: np.ndarray, s: Sizes, block: int) -> tuple:
-    """Return views of what a unit keeps of a block: norms, inverse deviations, attention, perceptron and its
-    derivative."""
+    """Return views of what a unit keeps of a block: norms, inverse deviations, attention, perceptron, derivative."""
     of_block = (10 * s.width + 2) * s.wide + s.shares
     own = kept[len(kept) - (s.blocks - block) * of_block :]
     layer, inverse, spare = s.width * s.wide, 10 * s.width * s.wide, (10 * s.width + 2) * s.wide

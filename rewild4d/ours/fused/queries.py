@@ -86,8 +86,7 @@ def mix_back(
 def read_query(
     begin: int, end: int, scales: Scales, weights: np.ndarray, anchors: np.ndarray, posed: tuple, query: np.ndarray
 ) -> None:
-    """Set rows of part mixture, position code, orientation (w >= 0) and log scale of Gaussians begin..end; the rest is
-    zero."""
+    """Set rows of part mixture, position code, orientation (w >= 0), log scale of Gaussians begin..end, else zero."""
     means, quats, log_scales = posed
     query[:] = 0
     code = scales.parts + 3

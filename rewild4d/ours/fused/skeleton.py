@@ -49,7 +49,7 @@ def _add(grad: tuple, target: np.ndarray) -> None:
 
 @kernel
 def _limits(quats: np.ndarray, parents: np.ndarray, weight: float, cosine: float, on_quats: np.ndarray) -> float:
-    """Compute the mean squared excess of a cosine over that of half the angle to the parent, and its gradient."""
+    """Compute the mean squared excess of a cosine over that of half the angle to the parent; add gradients."""
     count = len(quats) * max(1, (parents >= 0).sum())
     total = 0.0
     for item in range(len(quats)):
@@ -74,8 +74,8 @@ def _gaps(
     quats: np.ndarray, shifts: np.ndarray, pivots: np.ndarray, parents: np.ndarray, mirror: np.ndarray,
     weights: Weights, on_quats: np.ndarray, on_shifts: np.ndarray,
 ) -> float:  # fmt: skip
-    """Compute the weighted mean squared gaps between joints and their parents' copies, and their x for limbs; and the
-    gradient."""
+    """Compute the weighted mean squared gaps between joints and their parents' copies, and x of limbs' gaps; add
+    gradients."""
     limbs, square = (mirror != np.arange(len(mirror))).sum(), weights.unit * weights.unit
     share = weights.attach / (len(quats) * max(1, (parents >= 0).sum()) * square)
     sideways = weights.sideways / (len(quats) * max(1, limbs) * square)
@@ -110,8 +110,7 @@ def _gaps(
 def _out_of_plane(
     quats: np.ndarray, parents: np.ndarray, mirror: np.ndarray, weights: Weights, on_quats: np.ndarray
 ) -> float:
-    """Compute the weighted mean squared y and z of rotations against the parent, for limbs and other bones; and the
-    gradient."""
+    """Compute the weighted mean squared y and z of rotations against the parent, of limbs and others; add gradients."""
     limbs = (mirror != np.arange(len(mirror))).sum()
     of_limb = weights.limb_plane / (len(quats) * max(1, limbs))
     of_body = weights.body_plane / (len(quats) * max(1, len(mirror) - limbs))
@@ -139,7 +138,7 @@ def _combined(p: float, a: tuple, q: float, b: tuple) -> tuple:
 def _second_differences(
     quats: np.ndarray, shifts: np.ndarray, weight: float, unit: float, on_quats: np.ndarray, on_shifts: np.ndarray
 ) -> float:
-    """Compute the mean squared second difference of rotations and shifts over triples, and its gradient."""
+    """Compute the mean squared second difference of rotations and shifts over triples; add gradients."""
     joints, total = quats.shape[1], 0.0
     share = 3 * weight / (len(quats) * joints)
     by_length = share / (unit * unit)
@@ -169,8 +168,7 @@ def _steps(
     quats: np.ndarray, shifts: np.ndarray, weight: float, step: float, unit: float, on_quats: np.ndarray,
     on_shifts: np.ndarray,
 ) -> float:  # fmt: skip
-    """Compute the mean of s v^2 / (v^2 + s^2) over steps v of rotations in triples, plus that of shifts; and the
-    gradient."""
+    """Compute the mean of s v^2 / (v^2 + s^2) over steps v of rotations and of shifts in triples; add gradients."""
     joints, square, total = quats.shape[1], step * step, 0.0
     share = 3 * weight * step / (2 * len(quats) * joints)
     for item in range(len(quats)):
@@ -269,8 +267,7 @@ def posture_and_losses(
     mirror: Tensor,
     weights: Weights,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Select rows of a batch of poses with their transforms [k, J, 4, 4], and sum the regularizers of all; float32,
-    CPU."""
+    """Select rows of poses with their transforms [k, J, 4, 4], and sum the regularizers of all; float32 on the CPU."""
     return _Posture.apply(quats, shifts, features, rows, pivots, parents, mirror, weights)
 
 

@@ -65,8 +65,7 @@ def _blend_block(
     begin: int, end: int, weights: np.ndarray, joints: Joints, shares: np.ndarray, signed: np.ndarray,
     scratch: np.ndarray, blended: np.ndarray,
 ) -> None:  # fmt: skip
-    """Set the weights by rows, shares [J, BLOCK], and the Gaussians' blended numbers, [16, BLOCK]; ``signed`` where
-    signs differ."""
+    """Set the weights by rows, shares [J, BLOCK], the blended numbers, [16, BLOCK], and ``signed`` if signs differ."""
     count = weights.shape[1]
     read_columns(weights, begin, end, shares, BLOCK)
     blended[:] = 0

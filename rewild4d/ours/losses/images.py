@@ -23,8 +23,7 @@ Window = tuple[slice, slice]
 
 
 def union_window(alphas: list[Tensor], margin: int) -> Window:
-    """Return rows and columns of all pixels where any matte [1, h, w] is above zero, with a margin, clipped to the
-    image."""
+    """Return rows and columns of pixels where any matte [1, h, w] is above zero, with a margin inside the image."""
     slices = []
     for (first, last), length in zip(_extent(alphas), alphas[0].shape[1:], strict=True):
         slices.append(slice(max(0, first - margin), min(length, last + 1 + margin)))
