@@ -44,7 +44,7 @@ def kid(
     few: int = FEW_IMAGES,
     seed: int = 0,
 ) -> Distance:
-    """Compute the kernel distance: MMD^2 with k(a, b) = (a.b / D + 1)^3 over the full sets, and a bootstrap over sequences.
+    """Compute the kernel distance: MMD^2 over the full sets, k(a, b) = (a.b / D + 1)^3, with a bootstrap interval.
 
     Args:
         prediction: features of the predicted images.
@@ -113,7 +113,7 @@ def kid_v(
 
 
 def fid(prediction: Features, truth: Features, *, conditions: Conditions = Conditions()) -> Distance:
-    """Compute the Fréchet distance of image features (Heusel et al. 2017). Biased: compare equal n and m only; no interval.
+    """Compute the Fréchet distance of image features (Heusel et al. 2017). Biased: compare equal n and m only.
 
     Example:
         >>> groups = torch.zeros(2, dtype=torch.int64)

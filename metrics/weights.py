@@ -7,7 +7,7 @@ before it is parsed, at every load. Networks:
     inception-fid            the Inception-v3 of December 2015, without its classifier
     i3d-k400                 I3D trained on Kinetics-400, TF-hub's i3d-kinetics-400/1
 
-Nothing is downloaded unasked. A network that is found nowhere raises `WeightsMissing`, with the command that fetches it.
+Nothing is downloaded unasked. A network that is not found raises `WeightsMissing`, with the command that fetches it.
 """
 
 import contextlib
@@ -198,7 +198,7 @@ def by_name(folder: Path, file: str) -> Iterator[Path]:
 
 
 def make(name: str, copies: dict[str, Copy]) -> bytes:
-    """Make a network's safetensors file from copies of published files; UserError unless all bytes are the known ones."""
+    """Make a network's safetensors file from copies of published files; UserError unless all bytes are known."""
     tensors: Tensors = {}
     for file, copy in copies.items():
         known = table().files[file]

@@ -21,7 +21,7 @@ from rewild4d.config import parse_flags
 from rewild4d.contracts import DatasetReader
 from rewild4d.datasets.video.parts import Parts
 from rewild4d.errors import UserError
-from rewild4d.evaluation.protocol import Protocol
+from rewild4d.evaluation.protocol import Protocol, find_protocol
 from rewild4d.leaderboard.formats import markdown
 from rewild4d.leaderboard.layout import Table
 from rewild4d.leaderboard.records import RunRecord, to_json
@@ -123,7 +123,7 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
     device = pick_device(options.device)
     rasterizer = pick_rasterizer(options.rasterizer, device)
     load_dataset(spec.dataset)
-    protocols = {one.protocol: planning.protocol_of(spec, one.protocol) for one in spec.conditions}
+    protocols = {one.protocol: find_protocol(spec.dataset, one.protocol) for one in spec.conditions}
     entries = planning.entries(options.table, spec, tuple(dict.fromkeys(options.seeds or spec.seeds)))
     require_writable(options.out)
     root, reader = open_dataset(spec.dataset, options.data, options)

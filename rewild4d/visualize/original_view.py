@@ -1,7 +1,7 @@
-"""A reconstruction back in the frames that its clip was cut from: what a person filmed beside what was made of it.
+"""Draw a reconstruction in the original frames that its clip was cut from, beside these.
 
-The animal itself is taken out of the frame before the render is laid on it, so that whatever the reconstruction lacks
-shows white, and not the filmed animal behind it.
+The animal itself is removed from the frame before the render is laid on it, so that what the reconstruction lacks is
+white, and not the filmed animal.
 """
 
 from collections.abc import Iterable, Iterator
@@ -21,16 +21,16 @@ from rewild4d.types import Clip, Crop, Frame
 from rewild4d.visualize.pictures import beside, even, film_rate, header, over, save_mp4, save_png
 
 LONGEST = 960
-"""Longer sides of original frames are shown reduced to so many pixels."""
+"""Longer side of shown original frames in pixels."""
 QUALITY = 6
 """Of the film: frames with their background are large files."""
 SHEET = 6
-"""Moments on the contact sheet, two a row."""
+"""Times on the contact sheet, two a row."""
 SHEET_WIDTH = 360
 
 
 def original_frames(reader: DatasetReader, clip: Clip, selection: Selection) -> Iterable[np.ndarray] | None:
-    """The whole frames that a clip and its truth were cut from, where the reader has them; never for a method."""
+    """Read the whole frames of a clip and its truth, where the reader has them; never for a method."""
     read = getattr(reader, "originals", None)
     return None if read is None else read(clip.name, selection)
 
@@ -42,8 +42,8 @@ def save_original_view(
 
     Args:
         reconstruction: of the clip.
-        clip: crops of a video, with the held-out moments (`recropping.all_moments`); of other data nothing is written.
-        originals: the whole frames in the clip's order, uint8 [h, w, 3]; None: the render is laid on white alone.
+        clip: crops of a video, with the held-out frames (`recropping.all_moments`); of other data nothing is written.
+        originals: the whole frames in the clip's order, uint8 [h, w, 3]; None: the render alone, on white.
         folder: of the run.
 
     Returns:
@@ -69,7 +69,7 @@ def save_original_view(
 def _moments(
     reconstruction: Reconstruction, clip: Clip, originals: Iterable[np.ndarray] | None
 ) -> Iterator[tuple[float, Tensor]]:
-    """Time and picture of each frame of the clip."""
+    """Iterate over time and picture of each frame of the clip."""
     count = 0
     for frame, whole in zip(clip.frames, repeat(None) if originals is None else originals, strict=False):
         count += 1
@@ -79,7 +79,7 @@ def _moments(
 
 
 def _beside(reconstruction: Reconstruction, frame: Frame, whole: np.ndarray | None) -> Tensor:
-    """The original frame and the render in its place, or the render alone, on white, [3, h, w]."""
+    """Draw the original frame and the render in it, or the render alone, on white, [3, h, w]."""
     place = _Place.of(frame)
     camera, background = input_camera(reconstruction, frame), torch.ones(3, place.height, place.width)
     if whole is not None:
@@ -94,7 +94,7 @@ def _beside(reconstruction: Reconstruction, frame: Frame, whole: np.ndarray | No
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a crop lies in its original frame, at the size at which that is shown."""
+    """Position of a crop in its original frame, at the shown size."""
 
     crop: Crop
     width: int
@@ -107,7 +107,7 @@ class _Place:
         return _Place(frame.crop, even(scale * frame.crop.width), even(scale * frame.crop.height))
 
     def mask(self, frame: Frame) -> Tensor:
-        """The frame's matte in the original frame, [1, h, w]."""
+        """Return the frame's matte in the original frame, [1, h, w]."""
         size = frame.mask.shape[2]
         x, y = self.width / self.crop.width, self.height / self.crop.height
         a, b = x * self.crop.side / size, y * self.crop.side / size
@@ -118,13 +118,13 @@ class _Place:
 
 
 def _reduced(image: Tensor, width: int) -> Tensor:
-    """A picture of the film at a width of the contact sheet."""
+    """Resize a picture of the film to a width of the contact sheet."""
     size = (width, even(image.shape[1] * width / image.shape[2]))
     small = cv2.resize(image.permute(1, 2, 0).numpy(), size, interpolation=cv2.INTER_AREA)
     return torch.from_numpy(small).permute(2, 0, 1)
 
 
 def _sheet(images: list[Tensor], titles: list[str]) -> Tensor:
-    """Pictures of one size, two a row in the order of time, [3, H, W]."""
+    """Lay out pictures of one size, two a row in the order of time, [3, H, W]."""
     rows = [torch.cat(images[i : i + 2], dim=2) for i in range(0, len(images), 2)]
     return torch.cat([header(2 * titles, rows[0].shape[2]), *rows], dim=1)
