@@ -99,9 +99,7 @@ def kid_v(
         reference: one entry a sequence: the frames of the input video, or with ``paired`` the true images of the same
             cameras and times in the same order (then KID-V-u), [m, 3, H, W].
         extractor: [B, 3, H, W] in [0, 1] -> [B, D].
-        paired: see `kid`.
-        conditions: background, crop and fps that both sets share.
-        seed: of the bootstrap.
+        paired, conditions, seed: see `kid`.
 
     Example:
         >>> from rewild4d.metrics.samples import MeanColor

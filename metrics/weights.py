@@ -14,7 +14,6 @@ import contextlib
 import hashlib
 import os
 import tarfile
-import tomllib
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -98,8 +97,7 @@ class Copy:
 @cache
 def table() -> Table:
     """Read the known networks, archives and files."""
-    text = (resources.files("rewild4d.metrics") / "weights.toml").read_text(encoding="utf-8")
-    return msgspec.convert(tomllib.loads(text), Table)
+    return msgspec.toml.decode((resources.files("rewild4d.metrics") / "weights.toml").read_bytes(), type=Table)
 
 
 def network(name: str) -> Network:

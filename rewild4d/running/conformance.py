@@ -6,6 +6,7 @@ A method that passes can be run, resumed, evaluated again and compared.
 import math
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -52,13 +53,10 @@ def _checks(
     fitted: list[Reconstruction] = []
 
     def fit(clip: Clip = case.clip, workdir: Path | None = None) -> Reconstruction:
-        progress = Progress(f"check {name}")
-        try:
+        with closing(Progress(f"check {name}")) as log:
             return method.fit(
-                clip, case.prior, config=config, seed=0, device=torch.device("cpu"), log=progress, workdir=workdir
+                clip, case.prior, config=config, seed=0, device=torch.device("cpu"), log=log, workdir=workdir
             )
-        finally:
-            progress.close()
 
     def fits() -> str:
         (folder / "work").mkdir()

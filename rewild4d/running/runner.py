@@ -190,12 +190,9 @@ def _jobs(plan: Plan, name: str, clip: Clip, truth: Truth) -> list["Job"]:
 
 
 def _prior(plan: Plan, clip: Clip, truth: Truth) -> Prior:
-    progress = Progress(f"{clip.name}: prior")
-    try:
-        path = plan.out / "priors" / f"{plan.prior.identity(clip, truth)}.npz"
+    path = plan.out / "priors" / f"{plan.prior.identity(clip, truth)}.npz"
+    with contextlib.closing(Progress(f"{clip.name}: prior")) as progress:
         return make_prior(plan.prior, clip, truth, path, progress)
-    finally:
-        progress.close()
 
 
 class Job:
@@ -235,12 +232,10 @@ class Job:
             reconstruction, fit_seconds = self._fit(case)
             begin = time.perf_counter()
             whole = with_cameras(self.clip, case.prior)  # also the frames that the fit was not shown
-            progress = Progress(f"{self.title}: refine on held-out frames")
-            reconstruction, clip, truth = ready_to_score(reconstruction, whole, case.truth, case.clip, progress)
-            progress.close()
-            progress = Progress(f"{self.title}: evaluate")
-            found = evaluate(reconstruction, clip, truth, self.plan.protocol, progress, self.plan.device)
-            progress.close()
+            with contextlib.closing(Progress(f"{self.title}: refine on held-out frames")) as log:
+                reconstruction, clip, truth = ready_to_score(reconstruction, whole, case.truth, case.clip, log)
+            with contextlib.closing(Progress(f"{self.title}: evaluate")) as log:
+                found = evaluate(reconstruction, clip, truth, self.plan.protocol, log, self.plan.device)
             seconds = time.perf_counter() - begin
             pictures = save_pictures(
                 reconstruction, clip, truth, self.folder,

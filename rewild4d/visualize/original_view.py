@@ -5,7 +5,6 @@ white, and not the filmed animal.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from itertools import repeat
 from pathlib import Path
 
@@ -80,41 +79,29 @@ def _moments(
 
 def _beside(reconstruction: Reconstruction, frame: Frame, whole: np.ndarray | None) -> Tensor:
     """Draw the original frame and the render in it, or the render alone, on white, [3, h, w]."""
-    place = _Place.of(frame)
-    camera, background = input_camera(reconstruction, frame), torch.ones(3, place.height, place.width)
+    assert frame.crop is not None
+    matte = _original_matte(frame.mask, frame.crop)
+    height, width = matte.shape[1:]
+    camera, background = input_camera(reconstruction, frame), torch.ones(3, height, width)
     if whole is not None:
-        image = cv2.resize(whole, (place.width, place.height), interpolation=cv2.INTER_AREA)
+        image = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
         background = torch.from_numpy(image).permute(2, 0, 1).float() / 255
-    empty = background + place.mask(frame) * (1 - background)
+    empty = background + matte * (1 - background)
     if camera is not None:
-        camera = place.crop.original_camera(camera).resized(place.width, place.height)
+        camera = frame.crop.original_camera(camera).resized(width, height)
         empty = over(reconstruction.at(frame.time), camera, empty)
     return empty if whole is None else beside(background, empty)
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Position of a crop in its original frame, at the shown size."""
-
-    crop: Crop
-    width: int
-    height: int
-
-    @staticmethod
-    def of(frame: Frame) -> "_Place":
-        assert frame.crop is not None
-        scale = min(1.0, LONGEST / max(frame.crop.width, frame.crop.height))
-        return _Place(frame.crop, even(scale * frame.crop.width), even(scale * frame.crop.height))
-
-    def mask(self, frame: Frame) -> Tensor:
-        """Return the frame's matte in the original frame, [1, h, w]."""
-        size = frame.mask.shape[2]
-        x, y = self.width / self.crop.width, self.height / self.crop.height
-        a, b = x * self.crop.side / size, y * self.crop.side / size
-        # OpenCV counts from the middle of the first pixel
-        moved = np.array(((a, 0, x * self.crop.left + a / 2 - 0.5), (0, b, y * self.crop.top + b / 2 - 0.5)))
-        matte = cv2.warpAffine(frame.mask[0].numpy(), moved, (self.width, self.height), flags=cv2.INTER_LINEAR)
-        return torch.from_numpy(matte)[None]
+def _original_matte(mask: Tensor, crop: Crop) -> Tensor:
+    """Resample a crop's matte to the original frame at its shown size, [1, h, w]."""
+    scale = min(1.0, LONGEST / max(crop.width, crop.height))
+    width, height = even(scale * crop.width), even(scale * crop.height)
+    x, y, size = width / crop.width, height / crop.height, mask.shape[2]
+    a, b = x * crop.side / size, y * crop.side / size
+    # OpenCV counts from the middle of the first pixel.
+    moved = np.array(((a, 0, x * crop.left + a / 2 - 0.5), (0, b, y * crop.top + b / 2 - 0.5)))
+    return torch.from_numpy(cv2.warpAffine(mask[0].numpy(), moved, (width, height), flags=cv2.INTER_LINEAR))[None]
 
 
 def _reduced(image: Tensor, width: int) -> Tensor:

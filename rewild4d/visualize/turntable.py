@@ -86,9 +86,9 @@ def find_framing(reconstruction: Reconstruction, clip: Clip, up: Tensor | None) 
     axes, known = _axes(reconstruction, clip, cameras, middles, up)
     extents = [(means - middle).norm(dim=1) + size for (means, size), middle in zip(clouds, middles, strict=True)]
     radius = max(float(torch.quantile(extent, INSIDE)) for extent in extents)
-    offsets = torch.stack(
-        [axes[i] @ (camera.center - middles[i]) for i, camera in enumerate(_per_moment(cameras, clip))]
-    )
+    if len(cameras) < len(clip.times):  # some are unknown: the first represents them
+        cameras = cameras[:1]
+    offsets = torch.stack([axes[i] @ (camera.center - middles[i]) for i, camera in enumerate(cameras)])
     offset = normalize(offsets, dim=1).mean(0)
     elevation = math.atan2(float(offset[1]), float(offset[[0, 2]].norm()))
     azimuth = math.atan2(float(offset[0]), float(offset[2]))
@@ -150,11 +150,6 @@ def _axes(
     toward = first_across((cameras[0].center - middles[0])[None], up)
     ahead = normalize(toward - (toward @ up) * up, dim=0)
     return torch.stack((torch.linalg.cross(up, ahead), up, ahead)).expand(count, 3, 3), False
-
-
-def _per_moment(cameras: list[Camera], clip: Clip) -> list[Camera]:
-    """Return a camera for each time; the first one for all where some are unknown."""
-    return cameras if len(cameras) == len(clip.times) else [cameras[0]]
 
 
 def _solid(splats: Splats) -> tuple[Tensor, Tensor]:
