@@ -44,7 +44,7 @@ def kid(
     few: int = FEW_IMAGES,
     seed: int = 0,
 ) -> Distance:
-    """Compute the kernel distance: MMD^2 with k(a, b) = (a.b / D + 1)^3 over the full sets, with a bootstrap.
+    """Compute the kernel distance: MMD^2 over the full sets, k(a, b) = (a.b / D + 1)^3, with a bootstrap interval.
 
     Args:
         prediction: features of the predicted images.
@@ -99,9 +99,7 @@ def kid_v(
         reference: one entry a sequence: the frames of the input video, or with ``paired`` the true images of the same
             cameras and times in the same order (then KID-V-u), [m, 3, H, W].
         extractor: [B, 3, H, W] in [0, 1] -> [B, D].
-        paired: see `kid`.
-        conditions: background, crop and fps that both sets share.
-        seed: of the bootstrap.
+        paired, conditions, seed: see `kid`.
 
     Example:
         >>> from rewild4d.metrics.samples import MeanColor

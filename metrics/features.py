@@ -31,16 +31,33 @@ BATCH = 8
 
 
 class InceptionFeatures:
-    """The FID Inception-v3 of December 2015, averaged over the pixels of a layer; see `inception`.
+    """The extractor of FID and KID (Heusel et al. 2017, Binkowski et al. 2018): Inception-v3 of December 2015.
 
     Images are rounded to 8 bits first, so that a rendering scores the same in memory as from a PNG file; then they are
-    resized in float, and the network reads (pixel - 128) / 128.
+    resized in float, and the network reads (pixel - 128) / 128. Features are averaged over the pixels of a layer.
+
+    Args:
+        resize: to 299x299: "clean", "tf1" or "bilinear-antialias"; see `networks.resizing.resize_images`.
+        device: to compute on.
+        tap: layer by its dimension: 2048 ("pool3"), or 768, 192, 64, which are other metrics.
+
+    Raises:
+        ValueError: another resize or tap.
+        WeightsMissing: the weights are not here.
+
+    Example:
+        >>> InceptionFeatures("nearest")
+        Traceback (most recent call last):
+        ValueError: expected a resize out of clean, tf1, bilinear-antialias, got nearest
     """
 
-    def __init__(self, weights: LoadedWeights, tap: int, resize: str, device: torch.device) -> None:
+    def __init__(self, resize: str = "clean", device: torch.device | str = CPU, tap: int = 2048) -> None:
+        _one_of("resize", resize, IMAGE_RESIZES)
+        _one_of("tap", tap, inception_network.TAPS)
+        weights = load_weights("inception-fid")
         self.name = "inception-fid" if tap == 2048 else f"inception-fid-{tap}"
-        self.digest, self.dimension, self.resize, self.device = weights.digest, tap, resize, device
-        self._network = inception_network.Inception(_on(weights, device))
+        self.digest, self.dimension, self.resize, self.device = weights.digest, tap, resize, torch.device(device)
+        self._network = inception_network.Inception(_on(weights, self.device))
 
     def __call__(self, images: Tensor) -> Tensor:
         """Compute features of images in [0, 1], [B, 3, H, W] -> float32, [B, dimension]."""
@@ -57,13 +74,32 @@ class InceptionFeatures:
 
 
 class I3dFeatures:
-    """The Kinetics-400 I3D that FVD is defined on; see `i3d`. Frames keep their rate and are not rounded to 8 bits."""
+    """The extractor of FVD (Unterthiner et al. 2019): logits of I3D, averaged over time, without a softmax.
 
-    def __init__(self, weights: LoadedWeights, resize: str, device: torch.device) -> None:
-        self.name, self.digest, self.resize, self.device = "i3d-k400", weights.digest, resize, device
+    Frames keep their rate and are not rounded to 8 bits.
+
+    Args:
+        resize: to 224x224: "short-side-crop" or "square"; see `networks.resizing.resize_clip`.
+        device: to compute on.
+
+    Raises:
+        ValueError: another resize.
+        WeightsMissing: the weights are not here.
+
+    Example:
+        >>> I3dFeatures("clean")
+        Traceback (most recent call last):
+        ValueError: expected a resize out of short-side-crop, square, got clean
+    """
+
+    def __init__(self, resize: str = "short-side-crop", device: torch.device | str = CPU) -> None:
+        _one_of("resize", resize, VIDEO_RESIZES)
+        weights = load_weights("i3d-k400")
+        self.name, self.digest, self.resize = "i3d-k400", weights.digest, resize
+        self.device = torch.device(device)
         self.dimension, self.minimum_frames = i3d_network.CLASSES, i3d_network.MINIMUM_FRAMES
         with exact_float32():
-            self._network = i3d_network.I3d(_on(weights, device))
+            self._network = i3d_network.I3d(_on(weights, self.device))
 
     def __call__(self, videos: Tensor) -> Tensor:
         """Compute logits of clips in [0, 1] of at least 9 frames, [B, T, 3, H, W] -> float32, [B, 400]."""
@@ -83,8 +119,8 @@ class I3dFeatures:
 class Lpips:
     """LPIPS v0.1 on the AlexNet or the VGG-16 trunk (Zhang et al. 2018): 0 for equal images, without an upper bound.
 
-    LPIPS-alex and LPIPS-vgg are two metrics whose values do not compare. Images are not resized: values of other sizes,
-    crops and backgrounds do not compare either.
+    LPIPS-alex and LPIPS-vgg are two metrics whose values do not compare. Images are not resized, so values of
+    other sizes, crops and backgrounds do not compare either.
 
     Args:
         net: "alex" or "vgg".
@@ -119,48 +155,6 @@ class Lpips:
             pairs = (x.to(self.device, torch.float32).split(1) for x in (prediction, target))
             values = [lpips_network.lpips(self.net, self._tensors, *pair) for pair in zip(*pairs, strict=True)]
         return torch.cat(values).to(target.device)
-
-
-def inception(resize: str = "clean", device: torch.device | str = CPU, tap: int = 2048) -> InceptionFeatures:
-    """Load the extractor of FID and KID (Heusel et al. 2017, Binkowski et al. 2018).
-
-    Args:
-        resize: to 299x299: "clean", "tf1" or "bilinear-antialias"; see `networks.resizing.resize_images`.
-        device: to compute on.
-        tap: layer by its dimension: 2048 ("pool3"), or 768, 192, 64, which are other metrics.
-
-    Raises:
-        ValueError: another resize or tap.
-        WeightsMissing: the weights are not here.
-
-    Example:
-        >>> inception("nearest")
-        Traceback (most recent call last):
-        ValueError: expected a resize out of clean, tf1, bilinear-antialias, got nearest
-    """
-    _one_of("resize", resize, IMAGE_RESIZES)
-    _one_of("tap", tap, inception_network.TAPS)
-    return InceptionFeatures(load_weights("inception-fid"), tap, resize, torch.device(device))
-
-
-def i3d(resize: str = "short-side-crop", device: torch.device | str = CPU) -> I3dFeatures:
-    """Load the extractor of FVD (Unterthiner et al. 2019): logits of I3D, averaged over time, without a softmax.
-
-    Args:
-        resize: to 224x224: "short-side-crop" or "square"; see `networks.resizing.resize_clip`.
-        device: to compute on.
-
-    Raises:
-        ValueError: another resize.
-        WeightsMissing: the weights are not here.
-
-    Example:
-        >>> i3d("clean")
-        Traceback (most recent call last):
-        ValueError: expected a resize out of short-side-crop, square, got clean
-    """
-    _one_of("resize", resize, VIDEO_RESIZES)
-    return I3dFeatures(load_weights("i3d-k400"), resize, torch.device(device))
 
 
 def _one_of(what: str, value: object, known: tuple[object, ...]) -> None:

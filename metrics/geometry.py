@@ -89,14 +89,8 @@ def distances(prediction: Tensor, truth: Tensor) -> Distances:
 def chamfer(prediction: Tensor, truth: Tensor) -> Chamfer:
     """Compute the Chamfer distance: mean_p min_g |p - g| and mean_g min_p |p - g|, not squared.
 
-    Papers differ by the square and by a factor of two; `Chamfer.symmetric` is the mean of the two directions.
-
-    Args:
-        prediction: finite, at least one point, [n, 3].
-        truth: finite, at least one point, [m, 3].
-
-    Raises:
-        ValueError: another shape, a NaN or an infinite value, an empty cloud.
+    Papers differ by the square and by a factor of two; `Chamfer.symmetric` is the mean of the two directions. Arguments
+    and errors are those of `distances`, but the prediction may not be empty.
 
     Example:
         >>> found = chamfer(torch.tensor([[0.0, 0, 0], [3, 0, 0]]), torch.tensor([[0.0, 0, 0], [1, 0, 0]]))
@@ -108,21 +102,11 @@ def chamfer(prediction: Tensor, truth: Tensor) -> Chamfer:
 
 
 def fscore(prediction: Tensor, truth: Tensor, threshold: float) -> float:
-    """Compute the F-score (Knapitsch et al. 2017): harmonic mean of precision and recall at a distance.
+    """Compute the F-score (Knapitsch et al. 2017): harmonic mean of precision and recall at a distance, in [0, 1].
 
     Precision is the share of the prediction's points nearer to the truth than the threshold, recall the share of the
-    truth's points nearer to the prediction. Zero where both are zero, and for an empty prediction.
-
-    Args:
-        prediction: finite, [n, 3].
-        truth: finite, at least one point, [m, 3].
-        threshold: in the clouds' unit.
-
-    Returns:
-        In [0, 1].
-
-    Raises:
-        ValueError: another shape, a NaN or an infinite value, an empty truth.
+    truth's points nearer to the prediction. Zero where both are zero, and for an empty prediction. The threshold is in
+    the clouds' unit; other arguments and errors are those of `distances`.
 
     Example:
         >>> fscore(torch.tensor([[0.0, 0, 0], [3, 0, 0]]), torch.tensor([[0.0, 0, 0], [1, 0, 0]]), threshold=0.5)

@@ -123,9 +123,10 @@ def psnr(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tens
 
 
 def ssim(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Compute structural similarity (Wang et al. 2004): 11x11 Gaussian window, sigma 1.5, valid region.
+    """Compute structural similarity (Wang et al. 2004) over the valid region.
 
-    Equals scikit-image with gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.
+    11x11 Gaussian window, sigma 1.5, population covariance. Equals scikit-image with gaussian_weights=True, sigma=1.5,
+    use_sample_covariance=False, data_range=1.
 
     Args:
         prediction: in [0, 1], [B, C, H, W], at least 11 pixels each way.

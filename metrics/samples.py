@@ -23,11 +23,32 @@ Progress = Callable[[int, int], None]
 
 
 class Images(Protocol):
-    """Images in order, each [3, H, W] in [0, 1], read when asked for: a tensor [n, 3, H, W], a list, a lazy reader."""
+    """Images in order, each [3, H, W] in [0, 1], read when asked for: a tensor [n, 3, H, W], a list, `LazyImages`."""
 
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int, /) -> Tensor: ...
+
+
+class LazyImages:
+    """A number of images, each made by a function of its index when asked for.
+
+    Example:
+        >>> images = LazyImages(2, lambda i: torch.full((3, 4, 4), i / 2))
+        >>> len(images), images[1].mean().item()
+        (2, 0.5)
+    """
+
+    def __init__(self, count: int, make: Callable[[int], Tensor]) -> None:
+        self.count, self.make = count, make
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int, /) -> Tensor:
+        if not 0 <= index < self.count:
+            raise IndexError(index)
+        return self.make(index)
 
 
 class ImageExtractor(Protocol):

@@ -67,7 +67,7 @@ def frame_clips(matrix: ImageMatrix) -> list[MatrixClip]:
 
 
 def diagonal_clips(matrix: ImageMatrix) -> list[MatrixClip]:
-    """Return the clips of FVD-Diag: from every view, one view further a frame, M[(v0 + i) mod V, i].
+    """Return the clips of FVD-Diag: one view further a frame, M[(v0 + i) mod V, i]; the orbit must close.
 
     Example:
         >>> [clip.views for clip in diagonal_clips(torch.zeros(2, 3, 3, 4, 4))]
@@ -219,7 +219,7 @@ def fvd_diag(
 
 
 def i3d_dist(prediction: Features, truth: Features, *, conditions: Conditions = Conditions()) -> Distance:
-    """Compute what Consistent4D's script (Jiang et al. 2024) prints as "FVD": one clip a set, then the mean.
+    """Compute the "FVD" of Consistent4D's script (Jiang et al. 2024): one clip a set, clip by clip, then the mean.
 
     |f - g|^2 + (s_f - s_g)^2 for the features f, g of one pair of clips, s the standard deviation over the features
     themselves (N-1). It is no Fréchet distance of distributions and is not comparable with FVD.

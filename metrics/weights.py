@@ -7,7 +7,7 @@ before it is parsed, at every load. Networks:
     inception-fid            the Inception-v3 of December 2015, without its classifier
     i3d-k400                 I3D trained on Kinetics-400, TF-hub's i3d-kinetics-400/1
 
-Nothing is downloaded unasked. A network that is found nowhere raises `WeightsMissing`, which names the command to run.
+Nothing is downloaded unasked. A network that is not found raises `WeightsMissing`, with the command that fetches it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import contextlib
 import hashlib
 import os
 import tarfile
-import tomllib
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -102,8 +101,7 @@ class Copy:
 @cache
 def table() -> Table:
     """Read the known networks, archives and files."""
-    text = (resources.files("rewild4d.metrics") / "weights.toml").read_text(encoding="utf-8")
-    return msgspec.convert(tomllib.loads(text), Table)
+    return msgspec.toml.decode((resources.files("rewild4d.metrics") / "weights.toml").read_bytes(), type=Table)
 
 
 def network(name: str) -> Network:
@@ -206,7 +204,7 @@ def by_name(folder: Path, file: str) -> Iterator[Path]:
 
 
 def make(name: str, copies: dict[str, Copy]) -> bytes:
-    """Make a network's safetensors file from published files; UserError unless all bytes are the known ones."""
+    """Make a network's safetensors file from copies of published files; UserError unless all bytes are known."""
     import safetensors.torch
 
     from rewild4d.metrics.carriers import convert

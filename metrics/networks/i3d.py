@@ -33,11 +33,7 @@ class I3d:
         self.tensors = _fold_normalisation(tensors)
 
     def __call__(self, x: Tensor) -> Tensor:
-        """.
-
-        Ompute logits averaged over time, [B, 3, T, 224, 224] in [-1, 1] with T of at least 9 -> float32, [B,
-        400].
-        """
+        """Compute logits averaged over time, [B, 3, T, 224, 224] in [-1, 1], T at least 9 -> float32, [B, 400]."""
         x = _pool(self._unit("Conv3d_1a_7x7", x, 2), (1, 3, 3), (1, 2, 2))
         x = self._unit("Conv3d_2c_3x3", self._unit("Conv3d_2b_1x1", x))
         for (window, stride), names in zip(POOLS, BLOCKS, strict=True):

@@ -11,11 +11,7 @@ from rewild4d.types import Camera, Clip, Frame, Splats
 
 
 def finite_at(reconstruction: Reconstruction, time: float) -> Splats:
-    """The Gaussians at a time.
-
-    Raises:
-        UserError: a NaN or an infinite value among their numbers.
-    """
+    """Return the Gaussians at a time; UserError where they hold a NaN or an infinite value."""
     splats = reconstruction.at(time)
     for name in ("means", "quats", "scales", "opacities", "colors"):
         if not bool(torch.isfinite(getattr(splats, name)).all()):
@@ -24,7 +20,7 @@ def finite_at(reconstruction: Reconstruction, time: float) -> Splats:
 
 
 def input_camera(reconstruction: Reconstruction, frame: Frame) -> Camera | None:
-    """The world camera of a frame, from the data set or else from the reconstruction, at the frame's size."""
+    """Return the world camera of a frame, from the data set or else the reconstruction, at the frame's size."""
     camera = frame.camera or reconstruction.camera(frame.time)
     height, width = frame.mask.shape[1:]
     if camera is None or (camera.width, camera.height) == (width, height):
@@ -33,13 +29,13 @@ def input_camera(reconstruction: Reconstruction, frame: Frame) -> Camera | None:
 
 
 def world_up(clip: Clip, cameras: Sequence[Camera], known: Tensor | None) -> Tensor:
-    """The direction that points up in the world, unit, float64, [3].
+    """Return the direction that points up in the world, unit, float64, [3].
 
-    Of footage the world is the prior's object frame, whose y points up. Where nobody knows it, it is the mean of the
-    cameras' own: right for a ring of them, tilted by its elevation for one alone.
+    Of footage the world is the prior's object frame, whose y points up. Where unknown, it is the mean of the cameras'
+    own up: right for a ring of cameras, tilted by its elevation for a single one.
 
     Args:
-        clip: what the cameras saw.
+        clip: input of the cameras.
         cameras: of its frames, at least one.
         known: by the data set, [3].
     """

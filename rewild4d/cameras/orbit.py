@@ -21,21 +21,21 @@ def orbit_cameras(
     ahead: Tensor,
     views: int = 16,
 ) -> list[Camera]:
-    """Cameras at azimuths 2 pi i / views on one closed circle, all looking at its middle.
+    """Return cameras at azimuths 2 pi i / views on one closed circle, all looking at its centre.
 
-    View 0 stands in the direction ``ahead``; azimuths turn about ``up`` by the right-hand rule. The step from the last
+    View 0 is in the direction ``ahead``; azimuths rotate about ``up`` by the right-hand rule. The step from the last
     view to the first is as large as any other, which FVD-Diag needs.
 
     Args:
-        center: what they look at, world, [3].
+        center: world, [3].
         radius: distance of every camera from the centre, positive.
         elevation: radians above the plane through the centre, between -pi/2 and pi/2.
         intrinsics: pixels, pixel centres at +0.5, [3, 3].
         width: of the images in pixels.
         height: of the images in pixels.
         up: the world's up, [3].
-        ahead: azimuth 0; only its part across ``up`` counts, [3].
-        views: how many.
+        ahead: azimuth 0; only its part orthogonal to ``up`` counts, [3].
+        views: number of cameras.
     """
     up = torch.nn.functional.normalize(up.double(), dim=0)
     level = ahead.double() - (ahead.double() @ up) * up
@@ -54,10 +54,10 @@ def orbit_cameras(
 
 
 def first_across(offsets: Tensor, up: Tensor) -> Tensor:
-    """The first of some directions that is not along ``up``; where all are, any across it: an azimuth 0, [3].
+    """Return the first direction that is not along ``up``; where all are, any orthogonal to it, [3].
 
     Args:
-        offsets: not of unit length, float64, [n, 3].
+        offsets: of any length, float64, [n, 3].
         up: of unit length, float64, [3].
     """
     for offset in offsets:

@@ -1,8 +1,7 @@
-"""Cameras at moments that a method was not shown, for images that squares cut from a video as they follow the animal.
+"""Cameras at times that a method was not shown, for square crops that follow the animal through a video.
 
-A method knows the cameras of the images that it was shown and answers between them for an image in between
-(`contracts.Reconstruction.camera`). Where the prior's filter has left frames out, the image that is really there was
-cut by another square.
+A method knows the cameras of the images that it was shown, and interpolates between them
+(`contracts.Reconstruction.camera`). Where the prior's filter left frames out, the real image has another crop.
 """
 
 from collections.abc import Sequence
@@ -16,11 +15,11 @@ from rewild4d.types import Camera, Clip, Crop, Frame, Truth
 
 
 def crop_between(shown: Clip, time: float) -> Crop | None:
-    """The square on the straight line between those of a clip's frames; None where the clip has none.
+    """Interpolate the crop between those of a clip's frames; None where the clip has none.
 
     Args:
         shown: frames in order.
-        time: seconds; before the first frame it is that one's, behind the last one that one's.
+        time: seconds; before the first or after the last frame its crop is returned.
     """
     crops = [frame.crop for frame in shown.frames if frame.crop is not None]
     if len(crops) < len(shown.frames):
@@ -33,11 +32,11 @@ def crop_between(shown: Clip, time: float) -> Crop | None:
 
 
 def recropped(camera: Camera, shown: Clip, frame: Frame) -> Camera:
-    """A camera for the image that a frame is, from one for the image that `shown` would hold at its time.
+    """Return the camera of a frame's image, from one for the interpolated crop at its time.
 
     Args:
         camera: of a square image.
-        shown: the frames that gave the camera.
+        shown: the frames behind the camera.
         frame: at any time.
     """
     expected = crop_between(shown, frame.time)
@@ -49,10 +48,10 @@ def recropped(camera: Camera, shown: Clip, frame: Frame) -> Camera:
 
 
 def all_moments(clip: Clip, truth: Truth) -> Clip:
-    """A video with its held-out moments in their places: for files and films of a finished run, never for a method.
+    """Merge a video with its held-out frames by time: for files and films of a finished run, never for a method.
 
     Args:
-        clip: of a video; of other data, whose held-out views add no moments, it is returned as it is.
+        clip: of a video; other data, whose held-out views add no times, is returned unchanged.
         truth: its held-out frames.
     """
     if any(frame.crop is None for frame in clip.frames):
@@ -62,12 +61,12 @@ def all_moments(clip: Clip, truth: Truth) -> Clip:
 
 
 def seen_by(reconstruction: Reconstruction, clip: Clip, truth: Truth, shown: Clip) -> tuple[Clip, Truth]:
-    """A clip and its truth with the reconstruction's cameras wherever the data set has none and the method knows one.
+    """Add the reconstruction's cameras to a clip and its truth wherever the data set has none and the method knows one.
 
     Args:
         reconstruction: of ``shown``.
         clip: all frames of the video.
-        truth: its held-out frames are decoded when they are asked for.
+        truth: its held-out frames are decoded when they are read.
         shown: the frames of the clip that the method saw.
     """
     placed = Placed(reconstruction, shown, clip.frames)
@@ -76,7 +75,7 @@ def seen_by(reconstruction: Reconstruction, clip: Clip, truth: Truth, shown: Cli
 
 @dataclass(frozen=True)
 class Placed(Sequence[Frame]):
-    """Frames, and a camera of the reconstruction for each that has none of its own."""
+    """Frames, with a camera of the reconstruction for each that has none of its own."""
 
     reconstruction: Reconstruction
     shown: Clip

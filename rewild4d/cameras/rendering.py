@@ -1,4 +1,4 @@
-"""Render Gaussians from a camera, as every score and picture sees them."""
+"""Render Gaussians from a camera, for every score and picture."""
 
 import torch
 from torch import Tensor

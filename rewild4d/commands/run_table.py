@@ -22,7 +22,7 @@ from rewild4d.commands.shared import (
 from rewild4d.config import parse_flags
 from rewild4d.contracts import DatasetReader, Parts
 from rewild4d.errors import UserError
-from rewild4d.evaluation.protocol import Protocol
+from rewild4d.evaluation.protocol import Protocol, find_protocol
 from rewild4d.leaderboard.specs import Spec, find_spec, load_specs
 from rewild4d.registry import require_name
 
@@ -137,7 +137,7 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
     choose_kernels(options.kernels)
     device = pick_device(options.device)
     rasterizer = pick_rasterizer(options.rasterizer, device)
-    protocols = {one.protocol: planning.protocol_of(spec, one.protocol) for one in spec.conditions}
+    protocols = {one.protocol: find_protocol(spec.dataset, one.protocol) for one in spec.conditions}
     entries = planning.entries(options.table, spec, tuple(dict.fromkeys(options.seeds or spec.seeds)))
     require_writable(options.out)
     root, reader = open_dataset(spec.dataset, options.data, options)

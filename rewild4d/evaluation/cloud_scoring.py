@@ -1,4 +1,4 @@
-"""Scores of a mesh or a cloud in a file beside the true one: aligned by one similarity, then Chamfer and F-scores."""
+"""Score a mesh or a cloud in a file: one similarity, then Chamfer distance and F-scores."""
 
 import sys
 import time
@@ -23,10 +23,10 @@ def score_clouds(
     """Compare two .ply files.
 
     Args:
-        prediction: a mesh, sampled over its surface, Gaussians, whose centres count, or points, taken as they are.
+        prediction: a mesh, sampled over its surface, Gaussians, whose centres count, or points.
         truth: the same.
         up: axis that points up in both files, for the alignment's starts.
-        points: that are sampled from a mesh; of a larger cloud so many are drawn.
+        points: sampled from a mesh; of a larger cloud so many are drawn.
         seed: of all draws.
 
     Raises:

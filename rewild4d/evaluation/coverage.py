@@ -1,10 +1,8 @@
-"""What a clip's cameras ever saw of the animal: the evidence behind a novel-view score.
+"""Compute how much of the animal a clip's cameras saw.
 
-A score under one fixed camera and a score under a sweeping one lean on different evidence (design note 9.2);
-these two numbers travel with each record so that nobody compares them by accident.
+A score under one fixed camera and a score under a sweeping one rest on different evidence, so these two numbers are
+recorded beside every novel-view score.
 """
-
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -14,18 +12,18 @@ from rewild4d.types import Camera, Clip, Truth
 GRID = 48
 """Cells along the longer side of the depth buffer: coarse, so that 10k surface points leave no holes."""
 VIEWS = 200
-"""Held-out images looked at, evenly spaced."""
+"""Held-out images used, evenly spaced."""
 
 
 def coverage(clip: Clip, truth: Truth) -> dict[str, float]:
-    """Coverage statistics of a case.
+    """Compute coverage statistics of a case.
 
     Returns:
         foreground: mean share of a held-out image that the animal fills, in [0, 1]; absent where none is held out.
         seen_surface: mean share of the surface visible in a held-out image that some input image showed, at any
             time, in [0, 1]; absent where the data set has no geometry.
     """
-    chosen = [truth.held_out[i] for i in _spread(len(truth.held_out), VIEWS)]
+    chosen = [truth.held_out[i] for i in evenly_spaced(len(truth.held_out), VIEWS)]
     if not chosen:
         return {}
     result = {"foreground": sum(float(frame.mask.mean()) for frame in chosen) / len(chosen)}
@@ -46,7 +44,7 @@ def coverage(clip: Clip, truth: Truth) -> dict[str, float]:
 
 
 def visible(points: Tensor, camera: Camera, tolerance: float = 0.03) -> Tensor:
-    """Which surface points a camera sees, by a coarse depth buffer.
+    """Find the surface points that a camera sees, by a coarse depth buffer.
 
     Args:
         points: in the world, [n, 3].
@@ -70,7 +68,6 @@ def visible(points: Tensor, camera: Camera, tolerance: float = 0.03) -> Tensor:
     return inside & (depth <= nearest[cell] + tolerance * extent)
 
 
-def _spread(count: int, most: int) -> Sequence[int]:
-    if count <= most:
-        return range(count)
-    return [i * count // most for i in range(most)]
+def evenly_spaced(count: int, most: int) -> list[int]:
+    """Choose at most so many indices below a count, evenly spaced."""
+    return list(range(count)) if count <= most else [i * count // most for i in range(most)]

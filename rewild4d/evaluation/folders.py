@@ -1,26 +1,24 @@
-"""Scores of anybody's results: two folders of images or of clips, or two point clouds, without our methods."""
+"""Score anybody's results: two folders of images or of clips."""
 
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from rewild4d.datasets.video.footage import open_footage
 from rewild4d.evaluation.image_scores import (
     SILHOUETTES,
-    PairDistance,
     measure,
     needs,
     summarize,
     without_value,
 )
 from rewild4d.evaluation.networks import FAMILIES, Networks
-from rewild4d.evaluation.pairing import Inputs, Match, Shown, images_beside, match_inputs
+from rewild4d.evaluation.pairing import Inputs, Match, images_beside, match_inputs, on_background
 from rewild4d.evaluation.reports import SCHEMA, Report
 from rewild4d.machine import code_version, machine
+from rewild4d.metrics.caching import CachedNetwork
 from rewild4d.metrics.distribution import kid
 from rewild4d.metrics.names import IMAGES, split_name
 from rewild4d.metrics.samples import Conditions, Distance, Images, Progress, image_features
@@ -35,7 +33,7 @@ ONE_SIDED = {
 }
 
 Stage = Callable[[str], Progress]
-"""Begins a stage of the work by its title and gives what shows its progress."""
+"""Start a stage by its title, and return its progress function."""
 
 
 @torch.no_grad()
@@ -80,7 +78,7 @@ def score_pictures(
     if len(rates) > 1:
         notes.append(f"frame rates differ: {', '.join(f'{rate:g}' for rate in sorted(rates))}")
     conditions = Conditions(f"{background:g} behind alpha", fps=min(rates) if len(rates) == 1 else None)
-    shown = [[Shown(reel, background) for reel in side] for side in sides]
+    shown = [[on_background(reel, background) for reel in side] for side in sides]
     distances = image_distances(shown, paired, families, networks, conditions, stage)
     if truth.clips and prediction.clips:
         distances += video_distances(shown, paired, families, networks, conditions, stage)
@@ -104,11 +102,12 @@ def score_pictures(
 def image_scores(
     matches: Sequence[Match], families: Sequence[str], networks: Networks, background: float, progress: Progress
 ) -> tuple[dict[str, Score], list[str], list[str]]:
-    """Scores by name, the label of each image, and what to beware of."""
+    """Compute scores by name, the label of each image, and warnings."""
     names = [name for name in IMAGES if _family(name) in families]
     reasons = {name: networks.missing.get(_family(name), "") for name in names}
     values: dict[str, list[float | None]] = {name: [] for name in names if not reasons[name]}
-    lpips = {name: _Remembering(network) for name, network in networks.lpips.items()}
+    # Two pairs: the union of two images with alpha is the full frame.
+    lpips = {name: CachedNetwork(network, 2) for name, network in networks.lpips.items()}
     total, labels = sum(len(match.truth) for match in matches), list[str]()
     alphas, mattes = set[tuple[bool, bool]](), set[int]()
     for label, shown, alpha in images_beside(matches, background):
@@ -130,7 +129,7 @@ def image_distances(
     shown: Sequence[Sequence[Images]], paired: bool, families: Sequence[str], networks: Networks,
     conditions: Conditions, stage: Stage,
 ) -> list[Distance]:  # fmt: skip
-    """KID of all images of the two sides, and KID-u where they are paired; a clip is a sequence."""
+    """Compute KID of all images of the two sides, and KID-u where they are paired; a clip is a sequence."""
     if "kid" not in families:
         return []
     if networks.images is None:
@@ -148,7 +147,7 @@ def image_distances(
 
 
 def _numbered(shown: Sequence[Sequence[Images]], paired: bool) -> Sequence[Sequence[Images]]:
-    """The clips of both sides; unpaired truths are numbered after the predictions, for they are other sequences."""
+    """Number unpaired truths after the predictions, for they are other sequences."""
     prediction, truth = shown
     return shown if paired else (prediction, [*([] for _ in prediction), *truth])
 
@@ -157,7 +156,7 @@ def video_distances(
     shown: Sequence[Sequence[Images]], paired: bool, families: Sequence[str], networks: Networks,
     conditions: Conditions, stage: Stage,
 ) -> list[Distance]:  # fmt: skip
-    """FVD, KVD and their companions, each clip a sequence of its own."""
+    """Compute FVD, KVD and their companions, each clip a sequence of its own."""
     if "fvd" not in families:
         return []
     if networks.videos is None:
@@ -169,30 +168,14 @@ def video_distances(
     )
 
 
-class _Remembering:
-    """A pair distance that knows the last pairs again: the union of two images with alpha is the full frame."""
-
-    def __init__(self, network: PairDistance):
-        self.network = network
-        self.seen: deque[tuple[Tensor, Tensor, Tensor]] = deque(maxlen=2)
-
-    def __call__(self, prediction: Tensor, truth: Tensor) -> Tensor:
-        for x, y, value in self.seen:
-            if torch.equal(x, prediction) and torch.equal(y, truth):
-                return value
-        self.seen.append((prediction, truth, self.network(prediction, truth)))
-        return self.seen[-1][2]
-
-
 def _family(name: str) -> str:
     metric, _ = split_name(name)
     return "silhouette" if metric in SILHOUETTES else metric.replace("_", "-")
 
 
 def _absent(name: str, counts: Sequence[int], reason: str, conditions: Conditions) -> Distance:
-    """A distance that has no network to be computed with."""
+    """Return a distance without a value, for want of a network."""
     return Distance(
         name=name, value=None, n=counts[0], m=counts[1], sequences=0, estimator="", interval=None,
-        note=f"not computed: {reason}", extractor="", digest="", resize="", background=conditions.background,
-        crop=conditions.crop, frames=None, fps=conditions.fps,
+        note=f"not computed: {reason}", extractor="", digest="", resize="", frames=None, **vars(conditions),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Scores of a reconstruction's shape: points of its Gaussians against the true surface, over the moments of a clip."""
+"""Score a reconstruction's shape: points of its Gaussians against the true surface, over the times of a clip."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -19,14 +19,14 @@ def score_geometry(
     """Compare shapes.
 
     Args:
-        reconstruction: what is scored; `io.sampling.sample_gaussians` says which points stand for it.
+        reconstruction: to score; its points are `io.sampling.sample_gaussians`.
         truth: with a surface.
-        times: moments, seconds.
+        times: seconds.
         names: out of `metrics.names.GEOMETRY`.
         points: drawn from each cloud.
 
     Returns:
-        The scores by name, each with its sampling floor, and the alignments that they stand on.
+        The scores by name, each with its sampling floor, and the alignments.
     """
     if not names:
         return {}, []
@@ -55,7 +55,7 @@ def score_geometry(
 
 
 def _parts(name: str) -> tuple[str, str]:
-    """The ends of a name: how predictions were laid on the truth, and how many points."""
+    """Split off the ends of a name: alignment and number of points."""
     dense = next((end for end in DENSE if end and name.endswith(end)), "")
     short = name.removesuffix(dense)
     return next((suffix for suffix in ALIGNMENTS.values() if suffix and short.endswith(suffix)), ""), dense

@@ -1,6 +1,6 @@
-"""Scores of rendered images beside true ones, by name: the metric, the region it looks at, its unit.
+"""Score rendered images against true ones by name: a metric, a region, a unit.
 
-The regions are those of `rewild4d.metrics.image`; LPIPS has no value per pixel and is held to a mask by `fill_outside`.
+The regions are those of `rewild4d.metrics.image`; LPIPS has no value per pixel and uses `fill_outside`.
 """
 
 import math
@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import msgspec
 from torch import Tensor
 
+from rewild4d.evaluation.networks import LpipsNetwork
 from rewild4d.metrics.image import PSNR_CAP, WINDOW, crop_to_box, fill_outside, mask_box, psnr, ssim
 from rewild4d.metrics.names import COLOR_METRICS, split_name
 from rewild4d.metrics.score import Score
@@ -23,22 +24,19 @@ SILHOUETTES: dict[str, Callable[[Tensor, Tensor, float], Tensor]] = {
     "boundary_f": boundary_f,
 }
 _LEAST = {"ssim": WINDOW, "lpips_alex": 31, "lpips_vgg": 16}
-"""Images with a shorter side, in pixels, leave nothing of the metric's map."""
-
-PairDistance = Callable[[Tensor, Tensor], Tensor]
-"""Two batches [B, 3, H, W] in [0, 1] -> [B], such as `rewild4d.metrics.features.Lpips`."""
+"""Least side of an image in pixels."""
 
 
 @dataclass(frozen=True)
 class Beside:
-    """Predictions beside truths, of one size and on one background.
+    """Predictions and truths of one size on one background.
 
     Attributes:
         prediction: in [0, 1], [B, 3, H, W].
         truth: in [0, 1], [B, 3, H, W].
         prediction_matte: in [0, 1], [B, 1, H, W], or None.
         truth_matte: in [0, 1], [B, 1, H, W], or None.
-        background: grey level in [0, 1] that both lie on.
+        background: grey level in [0, 1] of both.
     """
 
     prediction: Tensor
@@ -49,18 +47,18 @@ class Beside:
 
 
 def needs(name: str) -> tuple[bool, bool]:
-    """Whether a score needs the matte of the truth, and of the prediction."""
+    """Return whether a score needs the matte of the truth, and of the prediction."""
     metric, region = split_name(name)
     return metric in SILHOUETTES or region != "full", metric in SILHOUETTES or region == "union"
 
 
-def measure(name: str, shown: Beside, networks: Mapping[str, PairDistance]) -> list[float | None]:
-    """One score of every image.
+def measure(name: str, shown: Beside, networks: Mapping[str, LpipsNetwork]) -> list[float | None]:
+    """Compute one score of every image.
 
     Args:
         name: one of `metrics.names.IMAGES`.
         shown: the images.
-        networks: what computes "lpips_alex" and "lpips_vgg".
+        networks: "lpips_alex" and "lpips_vgg".
 
     Returns:
         One value an image; None where a matte is missing or empty, or the image is too small for the metric.
@@ -79,7 +77,7 @@ def measure(name: str, shown: Beside, networks: Mapping[str, PairDistance]) -> l
 
 
 def summarize(name: str, items: Sequence[float | None]) -> Score:
-    """The mean over the images that have a value; a score without any says so instead of a number."""
+    """Average over the images that have a value; a score without any says why."""
     metric, _ = split_name(name)
     unit, better = ("1", "higher") if metric in SILHOUETTES else COLOR_METRICS[metric]
     present = [item for item in items if item is not None]
@@ -95,12 +93,12 @@ def summarize(name: str, items: Sequence[float | None]) -> Score:
 
 
 def without_value(name: str, reason: str) -> Score:
-    """A score that could not be computed on any image, and why."""
+    """Return a score that could not be computed on any image, with its reason."""
     return msgspec.structs.replace(summarize(name, []), note=f"not computed: {reason}")
 
 
 def _compare(
-    metric: str, shown: Beside, mask: Tensor | None, networks: Mapping[str, PairDistance]
+    metric: str, shown: Beside, mask: Tensor | None, networks: Mapping[str, LpipsNetwork]
 ) -> list[float | None]:
     if min(shown.truth.shape[2:]) < _LEAST.get(metric, 1):
         return [None] * len(shown.truth)
@@ -125,7 +123,7 @@ def _region_mask(shown: Beside, region: str) -> Tensor | None:
 
 
 def _truth_crop(shown: Beside, index: int) -> Beside | None:
-    """One image cut to its truth's box, or None where the truth is empty."""
+    """Cut one image to its truth's box; None where the truth is empty."""
     assert shown.truth_matte is not None
     box = mask_box(shown.truth_matte[index] >= FOREGROUND)
     if box is None:

@@ -15,21 +15,22 @@ from rewild4d.evaluation import geometry_scores, image_scores, novel_views
 from rewild4d.evaluation.networks import Networks, families_of, load_networks
 from rewild4d.evaluation.protocol import Protocol
 from rewild4d.metrics import names
+from rewild4d.metrics.samples import batches
 from rewild4d.metrics.score import Distance, Score
 from rewild4d.metrics.sets import FILE, Compared, write_features
 from rewild4d.types import Clip, Frame, Truth
 
 
 class Evaluation(NamedTuple):
-    """What was measured.
+    """Result of an evaluation.
 
     Attributes:
         scores: by name.
         items: label of each held-out image, as in ``Score.per_item`` of image scores.
-        distances: between sets of images or clips, with all that decides their values.
-        alignments: by which shapes were laid on the truth.
-        networks: SHA-256 of the weights that scores leaned on.
-        sets: the features that ``distances`` were computed from.
+        distances: between sets of images or clips.
+        alignments: of the shapes with the truth.
+        networks: SHA-256 of the weights of every network used.
+        sets: the features behind ``distances``.
     """
 
     scores: dict[str, Score]
@@ -40,7 +41,7 @@ class Evaluation(NamedTuple):
     sets: list[Compared]
 
     def keep(self, folder: Path) -> dict[str, Any]:
-        """The fields of a record; features of sets are written into its folder, for scores pooled over cases."""
+        """Return the fields of a record, and write the features of sets into its folder (`metrics.sets.pool`)."""
         fields = self._asdict()
         sets = fields.pop("sets")
         return fields | {"features": write_features(sets, folder / FILE) if sets else ""}
@@ -53,11 +54,11 @@ def evaluate(
 
     Args:
         reconstruction: of the clip.
-        clip: what the method saw: the reference of novel views, and the moments at which shapes are compared.
-        truth: what it did not see.
+        clip: input of the method: the reference of novel views, and the times at which shapes are compared.
+        truth: held out from the method.
         protocol: what is measured.
         log: progress.
-        device: where the metric networks compute.
+        device: of the metric networks.
     """
     networks = load_networks(families_of(protocol.scores), device)
     scores, items = _score_images(reconstruction, truth, protocol, networks, log)
@@ -69,7 +70,7 @@ def evaluate(
     compared: list[Compared] = []
     if protocol.novel is not None and sets:
         distances, compared = novel_views.novel_view_distances(
-            reconstruction, clip, protocol.novel, names=sets, background=protocol.background, render=render,
+            reconstruction, clip, protocol.novel, names=sets, background=protocol.background,
             images=networks.images, videos=networks.videos, log=log, up=truth.up,
         )  # fmt: skip
         scores |= novel_views.as_scores(distances, sets, dict(networks.missing))
@@ -80,16 +81,15 @@ def evaluate(
 
 @torch.no_grad()
 def input_psnr(reconstruction: Reconstruction, shown: Clip, background: float) -> Score:
-    """PSNR of the frames that the method was shown, over the full frame: how closely it fits them, which tells nothing
-    of what it was not shown, and beside the held-out PSNR whether it lacks freedom or evidence.
+    """Compute PSNR over the full input frames: with the held-out PSNR it tells lack of freedom from lack of evidence.
 
     Args:
         reconstruction: of the clip.
-        shown: what the method saw, with cameras where the reconstruction knows none.
+        shown: input of the method, with cameras where the reconstruction knows none.
         background: grey level in [0, 1] behind prediction and truth alike.
     """
     values: list[float | None] = []
-    for batch in _batches(shown.frames, 16):
+    for batch in batches(shown.frames, 16, _size):
         beside = _beside(batch, list(_render_frames(reconstruction, batch)), background)
         values += image_scores.measure("psnr", beside, {})
     return image_scores.summarize("psnr", values)
@@ -98,13 +98,13 @@ def input_psnr(reconstruction: Reconstruction, shown: Clip, background: float) -
 def _score_images(
     reconstruction: Reconstruction, truth: Truth, protocol: Protocol, networks: Networks, log: Log
 ) -> tuple[dict[str, Score], list[str]]:
-    """The scores of held-out images, and the label of each image."""
+    """Compute the scores of held-out images, and the label of each image."""
     asked = [name for name in protocol.scores if name in names.IMAGES]
     absent = {name: networks.missing.get(names.split_name(name)[0].replace("_", "-")) for name in asked}
     values: dict[str, list[float | None]] = {name: [] for name in asked if not absent[name]}
     labels = []
     total = len(truth.held_out) if asked else 0
-    for batch in _batches(truth.held_out if asked else (), 16):
+    for batch in batches(truth.held_out if asked else (), 16, _size):
         rendered = list(_render_frames(reconstruction, batch))
         shown = _beside(batch, rendered, protocol.background)
         for name in values:
@@ -117,7 +117,7 @@ def _score_images(
 
 
 def _render_frames(reconstruction: Reconstruction, frames: Iterable[Frame]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Render each frame's camera at its time; the Gaussians of one time are asked for once."""
+    """Render each frame's camera at its time; the Gaussians of one time are computed once."""
     time, splats = None, None
     for frame in frames:
         if splats is None or frame.time != time:
@@ -142,13 +142,5 @@ def _beside(frames: list[Frame], rendered: list[tuple[Tensor, Tensor]], backgrou
     return image_scores.Beside(image, target.clamp(0, 1), alpha, mask, background)
 
 
-def _batches(frames: Iterable[Frame], size: int) -> Iterator[list[Frame]]:
-    """Groups of equally sized frames, in order."""
-    batch: list[Frame] = []
-    for frame in frames:
-        if batch and (len(batch) == size or frame.mask.shape != batch[0].mask.shape):
-            yield batch
-            batch = []
-        batch.append(frame)
-    if batch:
-        yield batch
+def _size(frame: Frame) -> torch.Size:
+    return frame.mask.shape

@@ -1,7 +1,8 @@
-"""Load the networks that learned metrics need, or say which weights are missing."""
+"""Load the networks of learned metrics, or say which weights are missing."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Protocol
 
 import torch
@@ -13,13 +14,13 @@ from rewild4d.metrics.score import Score
 from rewild4d.metrics.weights import WeightsMissing, is_here
 
 FAMILIES = ("psnr", "ssim", "lpips-alex", "lpips-vgg", "silhouette", "kid", "fvd")
-"""What may be asked for; `score --only` chooses from these."""
+"""Metrics that `score --only` chooses from."""
 NETWORKS = {"lpips-alex": "lpips-alex", "lpips-vgg": "lpips-vgg", "kid": "inception-fid", "fvd": "i3d-k400"}
-"""Families that need a network, and whose weights they are (`metrics.weights`)."""
+"""Families with a network -> its weights (`metrics.weights`)."""
 
 
 class LpipsNetwork(Protocol):
-    """What `rewild4d.metrics.features.Lpips` is, as far as it is needed here."""
+    """Distance of image pairs, such as `rewild4d.metrics.features.Lpips`."""
 
     digest: str
 
@@ -29,13 +30,13 @@ class LpipsNetwork(Protocol):
 
 @dataclass(frozen=True)
 class Networks:
-    """What the learned metrics need; a user's own extractor takes the place of any.
+    """Networks of the learned metrics; any can be a user's own extractor.
 
     Attributes:
         lpips: "lpips_alex", "lpips_vgg" -> distance of two batches.
         images: of KID, or None.
         videos: of FVD and KVD, or None.
-        missing: why one is not there, by family ("lpips-alex", "kid", "fvd").
+        missing: why one is missing, by family ("lpips-alex", "kid", "fvd").
     """
 
     lpips: Mapping[str, LpipsNetwork] = field(default_factory=dict)
@@ -45,24 +46,24 @@ class Networks:
 
 
 def load_networks(families: Sequence[str], device: torch.device) -> Networks:
-    """The networks that some families need; one whose weights are not here is named in ``missing``.
+    """Load the networks of some families; those without weights are listed in ``missing``.
 
     Raises:
-        UserError: a weight file that is there is not the one it should be.
+        UserError: a weight file has other bytes than it should.
     """
-    from rewild4d.metrics.features import Lpips, i3d, inception
+    from rewild4d.metrics.features import I3dFeatures, InceptionFeatures, Lpips
 
-    makers: dict[str, Callable[[], Any]] = {
-        "lpips-alex": lambda: Lpips("alex", device=device),
-        "lpips-vgg": lambda: Lpips("vgg", device=device),
-        "kid": lambda: inception(device=device),
-        "fvd": lambda: i3d(device=device),
+    makers: dict[str, Callable[..., Any]] = {
+        "lpips-alex": partial(Lpips, "alex"),
+        "lpips-vgg": partial(Lpips, "vgg"),
+        "kid": InceptionFeatures,
+        "fvd": I3dFeatures,
     }
     made: dict[str, Any] = {}
     missing: dict[str, str] = {}
-    for family in [family for family in makers if family in families]:
+    for family in filter(families.__contains__, makers):
         try:
-            made[family] = makers[family]()
+            made[family] = makers[family](device=device)
         except WeightsMissing as error:
             missing[family] = str(error)
     lpips = {family.replace("-", "_"): made[family] for family in ("lpips-alex", "lpips-vgg") if family in made}

@@ -1,12 +1,11 @@
-"""Novel views without truth: sixteen cameras around the animal, compared as a set with the frames of the input video.
+"""Compare sixteen novel views around the animal, as a set, with the frames of the input video.
 
-KID-V looks at single images; FVD-F and FVD-Diag, with their kernel companions KVD, at clips (METRICS, sections 4 and
-5). None of them needs a true view, so they score any reconstruction; all of them need many samples, so every result
-carries how many there were.
+KID-V uses single images; FVD-F and FVD-Diag, with their kernel companions KVD, use clips. None of them needs a true
+view, so they score any reconstruction; all of them need many samples, so every result carries their number.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 
@@ -15,24 +14,30 @@ from torch import Tensor
 
 from rewild4d.cameras.input_view import finite_at, input_camera, mean_up, world_up
 from rewild4d.cameras.orbit import first_across, orbit_cameras
+from rewild4d.cameras.rendering import render
 from rewild4d.contracts import Log, Reconstruction
 from rewild4d.errors import UserError
+from rewild4d.evaluation.coverage import evenly_spaced
 from rewild4d.evaluation.protocol import NovelViews
 from rewild4d.metrics.caching import CachedNetwork, cached_features
 from rewild4d.metrics.distribution import VIEWS
 from rewild4d.metrics.names import KINDS
-from rewild4d.metrics.samples import Conditions, Distance, ImageExtractor, Images, VideoExtractor, image_features
+from rewild4d.metrics.samples import (
+    Conditions,
+    Distance,
+    ImageExtractor,
+    Images,
+    LazyImages,
+    VideoExtractor,
+    image_features,
+)
 from rewild4d.metrics.score import Score
 from rewild4d.metrics.sets import Compared, distances, suffix_of
 from rewild4d.metrics.video import clip_distances, diagonal_clips, frame_clips, unfit, video_features
-from rewild4d.types import Camera, Clip, Frame, Splats
+from rewild4d.types import Camera, Clip, Frame
 
 TITLES = {title: name for scores in KINDS.values() for name, title in scores.items()}
-"""What a distance calls itself -> its name among the scores."""
-
-
-Render = Callable[[Splats, Camera], tuple[Tensor, Tensor]]
-"""Gaussians and a camera -> colour premultiplied by alpha [3, h, w] and alpha [1, h, w]."""
+"""Title of a distance -> its name among the scores."""
 
 
 def novel_view_distances(
@@ -42,7 +47,6 @@ def novel_view_distances(
     *,
     names: Sequence[str],
     background: float,
-    render: Render,
     images: ImageExtractor | None,
     videos: VideoExtractor | None,
     log: Log,
@@ -50,28 +54,27 @@ def novel_view_distances(
 ) -> tuple[list[Distance], list[Compared]]:
     """Compare sixteen novel views with the input video.
 
-    The orbit's middle is the median Gaussian over the clip; its radius and elevation are the medians of the input
-    cameras', its first view stands where the first input camera does, and it has that camera's focal lengths and size.
+    The orbit's centre is the median Gaussian over the clip; its radius and elevation are the medians of the input
+    cameras', its first view is in the direction of the first input camera, with that camera's focal lengths and size.
 
     Args:
-        reconstruction: what is scored.
+        reconstruction: to score.
         clip: the input video, the reference: masked, on the same background, at its own size.
         settings: of the protocol.
         names: out of `metrics.names.SETS`.
         background: grey level in [0, 1] behind both sets.
-        render: draws one view.
         images: network of KID-V; None leaves it out.
         videos: network of FVD and KVD; None leaves them out.
         log: progress.
         up: of the world, where the data set knows it, see `world_up`, [3].
 
     Returns:
-        The distances, and the sets of features that they were computed from: what pooling over sequences needs.
+        The distances, and the sets of features behind them, for pooling over sequences.
 
     Raises:
         UserError: neither the clip nor the reconstruction has a camera.
     """
-    orbit = _Orbit(reconstruction, clip, background, render, settings, up)
+    orbit = _Orbit(reconstruction, clip, background, settings, up)
     reference = [frame.over(background).clamp(0, 1) for frame in clip.frames]
     conditions = Conditions(f"grey {background:g}", "full frame", clip.fps)
     found: list[Distance] = []
@@ -81,8 +84,8 @@ def novel_view_distances(
         log(done, total, {})
 
     if "kid_v" in names and images is not None:
-        chosen = _spread(len(clip.frames), settings.frames)
-        shown = _Lazy(len(chosen) * VIEWS, lambda i: orbit.image(i % VIEWS, chosen[i // VIEWS]))
+        chosen = evenly_spaced(len(clip.frames), settings.frames)
+        shown = LazyImages(len(chosen) * VIEWS, lambda i: orbit.image(i % VIEWS, chosen[i // VIEWS]))
         truth = cached_features(images, reference, lambda network: image_features([reference], network))
         sets.append(Compared("kid_v", image_features([shown], CachedNetwork(images)), truth, conditions))
     windows = _windows(len(clip.frames), settings)
@@ -103,7 +106,7 @@ def novel_view_distances(
 
 
 def as_scores(found: Sequence[Distance], names: Sequence[str], missing: dict[str, str]) -> dict[str, Score]:
-    """The distances as scores of a record; those that are missing say why, by family ("kid", "fvd")."""
+    """Convert distances to scores of a record; missing ones say why, by family ("kid", "fvd")."""
     by_name = {TITLES[distance.name.split(" [")[0]]: distance for distance in found}
     scores = {}
     for name in names:
@@ -121,13 +124,12 @@ def as_scores(found: Sequence[Distance], names: Sequence[str], missing: dict[str
 
 
 class _Orbit:
-    """Renders of the closed circle of cameras; the Gaussians of the last few moments are kept."""
+    """Renders from a closed circle of cameras; the Gaussians of the last few times are cached."""
 
     def __init__(
-        self, reconstruction: Reconstruction, clip: Clip, background: float, render: Render, settings: NovelViews,
-        up: Tensor | None,
-    ) -> None:  # fmt: skip
-        self.times, self.background, self.render = clip.times, background, render
+        self, reconstruction: Reconstruction, clip: Clip, background: float, settings: NovelViews, up: Tensor | None
+    ) -> None:
+        self.times, self.background = clip.times, background
         self.at = lru_cache(maxsize=24)(partial(finite_at, reconstruction))
         known = [input_camera(reconstruction, frame) for frame in clip.frames]
         if not any(known) and not len(self.at(self.times[0])):
@@ -143,44 +145,29 @@ class _Orbit:
         self.cameras = _cameras(cameras, self._middle(), axis)
 
     def _middle(self) -> Tensor:
-        """Median over all Gaussians of some moments, [3]; the origin where there are none."""
-        means = torch.cat([self.at(self.times[i]).means.double().cpu() for i in _spread(len(self.times), 8)])
+        """Return the median over all Gaussians of some times, [3]; the origin where there are none."""
+        means = torch.cat([self.at(self.times[i]).means.double().cpu() for i in evenly_spaced(len(self.times), 8)])
         return means.median(0).values if len(means) else torch.zeros(3, dtype=torch.float64)
 
     def image(self, view: int, frame: int) -> Tensor:
-        """One render on the background, [3, h, w]."""
+        """Render one view on the background, [3, h, w]."""
         splats, camera = self.at(self.times[frame]), self.cameras[view]
         if not len(splats):
             return torch.full((3, camera.height, camera.width), self.background)
-        color, alpha = self.render(splats, camera)
+        color, alpha = render(splats, camera)
         return (color + (1 - alpha) * self.background).clamp(0, 1)
 
-    def matrix(self, window: Sequence[int]) -> "list[Images]":
-        """The image matrix M[v][f] of a window of frames, rendered when read."""
+    def matrix(self, window: Sequence[int]) -> list[Images]:
+        """Return the image matrix M[v][f] of a window of frames, rendered when read."""
 
         def row(view: int) -> Images:
-            return _Lazy(len(window), lambda i: self.image(view, window[i]))
+            return LazyImages(len(window), lambda i: self.image(view, window[i]))
 
         return [row(view) for view in range(VIEWS)]
 
 
-class _Lazy:
-    """A sequence of images made when asked for."""
-
-    def __init__(self, count: int, make: Callable[[int], Tensor]) -> None:
-        self.count, self.make = count, make
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, index: int, /) -> Tensor:
-        if not 0 <= index < self.count:
-            raise IndexError(index)
-        return self.make(index)
-
-
 def _any_camera(frame: Frame) -> Camera:
-    """A camera of the frame's size: nothing looks alike from everywhere."""
+    """Return a camera of the frame's size, for a reconstruction without Gaussians."""
     height, width = frame.mask.shape[1:]
     intrinsics = torch.tensor(((width, 0, width / 2), (0, width, height / 2), (0, 0, 1)), dtype=torch.float64)
     pose = torch.eye(4, dtype=torch.float64)
@@ -189,14 +176,14 @@ def _any_camera(frame: Frame) -> Camera:
 
 
 def _centred(camera: Camera) -> Camera:
-    """The camera with its principal point in the middle of the image: a crop's lies where the original's was."""
+    """Move the principal point to the middle of the image: a crop's lies where the original's was."""
     intrinsics = camera.intrinsics.clone()
     intrinsics[0, 2], intrinsics[1, 2] = camera.width / 2, camera.height / 2
     return replace(camera, intrinsics=intrinsics)
 
 
 def _cameras(known: Sequence[Camera], middle: Tensor, up: Tensor) -> list[Camera]:
-    """The sixteen views of a clip, from its input cameras."""
+    """Return the sixteen views of a clip, from its input cameras."""
     offsets = torch.stack([camera.center - middle for camera in known])
     radii = offsets.norm(dim=1)
     elevations = torch.asin((offsets @ up / radii.clamp_min(1e-9)).clamp(-1, 1))
@@ -210,12 +197,8 @@ def _cameras(known: Sequence[Camera], middle: Tensor, up: Tensor) -> list[Camera
 
 
 def _windows(frames: int, settings: NovelViews) -> list[list[int]]:
-    """Frames of each clip: windows of equal length, the last one ending with the video; a short video is padded."""
+    """Return the frames of each clip: windows of one length, the last at the video's end; a short video is padded."""
     starts = list(range(0, max(0, frames - settings.clip) + 1, settings.stride))
     if starts[-1] + settings.clip < frames:
         starts.append(frames - settings.clip)
     return [[min(start + i, frames - 1) for i in range(settings.clip)] for start in starts]
-
-
-def _spread(count: int, most: int) -> list[int]:
-    return list(range(count)) if count <= most else [i * count // most for i in range(most)]

@@ -1,4 +1,4 @@
-"""Two folders side by side: which image belongs to which truth and mask, and both on one background."""
+"""Match the images of two folders with their truths and masks, on one background."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ from torch import Tensor
 from rewild4d.datasets.video.footage import Footage, Picture, Reel, match_images, match_reels, open_footage
 from rewild4d.errors import UserError
 from rewild4d.evaluation.image_scores import Beside
+from rewild4d.metrics.samples import LazyImages
 
 
 @dataclass(frozen=True)
@@ -18,8 +19,8 @@ class Inputs:
     Attributes:
         prediction: a folder of images, a folder of clips, or a video.
         truth: the same.
-        masks: true masks, laid out like ``truth``; the truths' own alpha where it is left out.
-        prediction_masks: predicted masks, laid out like ``truth``; the predictions' own alpha where it is left out.
+        masks: true masks, laid out like ``truth``; the truths' own alpha where None.
+        prediction_masks: predicted masks, laid out like ``truth``; the predictions' own alpha where None.
     """
 
     prediction: Path
@@ -30,7 +31,7 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Match:
-    """A run of images and what belongs to it, all in the order of the truth."""
+    """A sequence of images with its truth and masks, all in the order of the truth."""
 
     prediction: Reel
     truth: Reel
@@ -38,22 +39,13 @@ class Match:
     prediction_masks: Reel | None
 
 
-@dataclass(frozen=True)
-class Shown:
-    """A reel's images on a background, read when asked for, [3, h, w] each."""
-
-    reel: Reel
-    background: float
-
-    def __len__(self) -> int:
-        return len(self.reel)
-
-    def __getitem__(self, index: int, /) -> Tensor:
-        return self.reel.picture(index).over(self.background)
+def on_background(reel: Reel, background: float) -> LazyImages:
+    """Return a reel's images on a background, read when asked for, [3, h, w] each."""
+    return LazyImages(len(reel), lambda index: reel.picture(index).over(background))
 
 
 def match_inputs(inputs: Inputs, prediction: Footage, truth: Footage) -> tuple[list[Match], list[str]]:
-    """Every truth with its prediction and masks, matched by name; and a note wherever order had to do.
+    """Match every truth with its prediction and masks by name, and note where only the order matched.
 
     Raises:
         UserError: kinds, names or counts that do not match.
@@ -74,7 +66,7 @@ def match_inputs(inputs: Inputs, prediction: Footage, truth: Footage) -> tuple[l
 
 
 def images_beside(matches: Sequence[Match], background: float) -> Iterator[tuple[str, Beside, tuple[bool, bool]]]:
-    """Image by image: its label, what is compared, and whether prediction and truth brought alpha of their own.
+    """Iterate over images: label, pair, and whether prediction and truth have alpha of their own.
 
     Raises:
         UserError: an image or a mask that cannot be read, or is of another size than its truth.
@@ -94,7 +86,7 @@ def images_beside(matches: Sequence[Match], background: float) -> Iterator[tuple
 
 
 def _matte(masks: Reel | None, index: int, picture: Picture, truth: Picture) -> Tensor | None:
-    """The matte from a folder of masks, or the picture's own alpha, [1, 1, h, w]."""
+    """Read the matte from a folder of masks, or the picture's own alpha, [1, 1, h, w]."""
     if masks is None:
         return None if picture.alpha is None else picture.alpha[None]
     matte = masks.matte(index)
@@ -103,11 +95,7 @@ def _matte(masks: Reel | None, index: int, picture: Picture, truth: Picture) -> 
 
 
 def require_size(label: str, image: Tensor, truth: Picture) -> None:
-    """Stop where an image [c, h, w] is not as large as its truth.
-
-    Raises:
-        UserError: nothing is resized here, because that would change the numbers.
-    """
+    """Raise UserError where an image [c, h, w] has another size than its truth: resizing would change the numbers."""
     if image.shape[1:] != truth.rgb.shape[1:]:
         sizes = [f"{shape[2]}x{shape[1]}" for shape in (truth.rgb.shape, image.shape)]
         raise UserError(f"{label}: expected {sizes[0]} pixels like {truth.label}, got {sizes[1]}.")

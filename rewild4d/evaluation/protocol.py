@@ -1,4 +1,4 @@
-"""Evaluation protocols: a TOML file names what is held out and what is measured."""
+"""Evaluation protocols: a TOML file states what is held out and what is measured."""
 
 from collections.abc import Mapping
 from importlib import metadata, resources
@@ -14,15 +14,14 @@ from rewild4d.metrics import names
 
 
 class NovelViews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How novel views are drawn and compared; a protocol holds one.
+    """Settings of novel views in a protocol.
 
     Attributes:
-        frames: moments, evenly spaced over the clip, that KID-V sees from every view.
-        clip: frames T of a clip that FVD sees; a shorter video is padded with its last frame.
+        frames: times, evenly spaced over the clip, that KID-V uses from every view.
+        clip: frames T of a clip of FVD; a shorter video is padded with its last frame.
         stride: frames from the start of one clip to that of the next.
-        upright: the circle is level in the world (`world_up`) and its middle is that of the images. Left out, as in
-            the first versions: up is the mean of the cameras' own, which tilts the circle of a camera that did not go
-            around the animal, and the images have the first one's principal point.
+        upright: the circle is level in the world (`world_up`), and principal points are the images' middles. Where left
+            out (first versions), up is the mean of the cameras' own, and the principal point that of the first image.
     """
 
     frames: int = 8
@@ -36,16 +35,16 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         name: equals the file's name; ends in the version.
-        dataset: which reader it is for.
+        dataset: name of its reader.
         title: for table captions.
-        description: one paragraph that travels with the numbers.
+        description: one paragraph that is shown with the numbers.
         background: grey level in [0, 1] behind prediction and truth alike.
-        scores: what is measured, out of `metrics.names.ALL`: on held-out images, on the shape, on novel views as a set.
-        floors: methods that are always printed beside the others.
-        selection: what a method gets and what is held out.
-        default: the data set's protocol where the user names none; the highest version where several say so.
+        scores: out of `metrics.names.ALL`: on held-out images, on the shape, on novel views as a set.
+        floors: methods that are always printed as lower-bound rows.
+        selection: input of a method, and what is held out.
+        default: whether it is the data set's default; of several, the highest version.
         points: drawn from each cloud for scores of the shape.
-        novel: how novel views are drawn for scores of sets.
+        novel: settings of novel views for scores of sets.
     """
 
     name: str
@@ -71,24 +70,20 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def digest(self) -> str:
-        """SHA-256 over every setting; one that is left out, and came later than the protocol, changes nothing."""
-        later = {"points": self.points, "novel": self.novel}
+        """SHA-256 over every setting; a setting newer than the protocol, left out, changes nothing."""
         given = msgspec.to_builtins(self)
-        for name, value in later.items():
-            if value is None:
-                del given[name]
-        if self.selection.split is None:
-            del given["selection"]["split"]
-        if self.novel is not None and self.novel.upright is None:
-            del given["novel"]["upright"]
+        novel, selection = given["novel"], given["selection"]
+        for part, name in ((given, "points"), (novel, "upright"), (given, "novel"), (selection, "split")):
+            if part is not None and part[name] is None:
+                del part[name]
         return digest(msgspec.json.encode(given))
 
 
 def load_protocols() -> dict[str, Protocol]:
-    """All protocols by name: our own, then those of packages that installed some (entry point `rewild4d.protocols`).
+    """Load all protocols by name: our own, then those of installed packages (entry point `rewild4d.protocols`).
 
     Raises:
-        UserError: a package's protocol cannot be read, or has a name that is taken.
+        UserError: a package's protocol cannot be read, or its name is taken.
     """
     folder = resources.files("rewild4d.leaderboard") / "protocols"
     found = {protocol.name: protocol for protocol in map(_decode, _tomls(folder))}
@@ -119,7 +114,7 @@ def default_name(dataset: str, protocols: Mapping[str, Protocol]) -> str | None:
 
 
 def find_protocol(dataset: str, name: str | None) -> Protocol:
-    """The protocol of that name, or the data set's default.
+    """Return the protocol of that name, or the data set's default.
 
     Raises:
         UserError: unknown, or made for another data set.

@@ -1,4 +1,4 @@
-"""What is scored: the reconstruction as it was fitted, or, where its kind has that, refined on the scored frames."""
+"""Prepare a reconstruction for scoring: as fitted, or refined on the scored frames."""
 
 from rewild4d.cameras.recropping import seen_by
 from rewild4d.contracts import Log, Reconstruction
@@ -8,20 +8,20 @@ from rewild4d.types import Clip, Truth
 def ready_to_score(
     reconstruction: Reconstruction, clip: Clip, truth: Truth, shown: Clip, log: Log
 ) -> tuple[Reconstruction, Clip, Truth]:
-    """A reconstruction, its clip and its truth as they are scored.
+    """Return a reconstruction, its clip and its truth as they are scored.
 
-    Frames without a camera get the reconstruction's. A held-out frame without one is a moment of the input view; a
+    Frames without a camera get the reconstruction's. A held-out frame without one is a time of the input view; a
     reconstruction that can be `refined` (contracts.Reconstruction) is fitted to those, and to nothing else.
 
     Args:
         reconstruction: of ``shown``.
         clip: all frames of the video.
-        truth: as the data set gives it.
+        truth: from the data set.
         shown: the frames of the clip that the method saw.
         log: progress.
 
     Raises:
-        ValueError: what is refined does not say so in its marks.
+        ValueError: a refined reconstruction without marks.
     """
     clip, placed = seen_by(reconstruction, clip, truth, shown)
     refine = getattr(reconstruction, "refined", None)

@@ -1,4 +1,4 @@
-"""What `score` found: image scores, distances between sets, geometry; as one JSON file or a Markdown table."""
+"""Report of `score`: image scores, distances between sets, geometry; as one JSON file or a Markdown table."""
 
 import math
 from collections import defaultdict
@@ -19,21 +19,21 @@ ARROWS = {"higher": "↑", "lower": "↓"}
 
 
 class Report(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What was compared, and what came of it.
+    """Inputs and results of a comparison.
 
     Attributes:
         schema: version of this layout.
-        kind: what the inputs held.
+        kind: of the inputs.
         inputs: the paths by flag.
         settings: background, fps, points, ...: all that decides the values.
         scores: by name, one value an image each; for geometry one value each.
         distances: between the two sets of images or clips.
-        networks: SHA-256 of the weights by network, of those that scores leaned on.
+        networks: name -> SHA-256 of the weights of every network used.
         items: label of each image, as in ``Score.per_item``.
-        notes: how files were matched, and what to beware of.
+        notes: how files were matched, and warnings.
         code: version and digest of the sources.
         machine: see `rewild4d.machine.machine`.
-        seconds: that it took.
+        seconds: duration.
     """
 
     schema: int
@@ -51,20 +51,20 @@ class Report(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def to_json(report: Report) -> str:
-    """The report as indented JSON."""
+    """Write the report as indented JSON."""
     return msgspec.json.format(msgspec.json.encode(report, order="sorted"), indent=1).decode()
 
 
 def markdown(report: Report) -> str:
-    """The report as Markdown: tables of what has a value, then every note and every reason for a missing value."""
+    """Write the report as Markdown: tables of all values, then every note and every reason for a missing value."""
     parts = [_region_table(report.scores), _single_table(report.scores), _distance_table(report.distances)]
     settings = ", ".join(f"{name} {value}" for name, value in report.settings.items())
-    lines = [f"- {note}" for note in [settings, *report.notes, *_remarks(report)] if note]
+    lines = [f"- {note}" for note in [settings, *report.notes, *_notes(report)] if note]
     return "\n\n".join([part for part in parts if part] + (["\n".join(lines)] if lines else []))
 
 
 def _region_table(scores: dict[str, Score]) -> str:
-    """Rows are metrics, columns are the regions in which any of them has a value."""
+    """Write a table with metrics as rows, and the regions in which any has a value as columns."""
     found = {name for name, score in scores.items() if score.value is not None}
     rows = [metric for metric in METRICS if any(f"{metric}{region}" in scores for region in list(REGIONS)[1:])]
     regions = [region for region in REGIONS if any(f"{metric}{region}" in found for metric in rows)]
@@ -79,7 +79,7 @@ def _region_table(scores: dict[str, Score]) -> str:
 
 
 def _single_table(scores: dict[str, Score]) -> str:
-    """Scores without regions, one a row."""
+    """Write scores without regions, one a row."""
     regional = {f"{metric}{region}" for metric in METRICS for region in list(REGIONS)[1:]}
     regional |= {name.rpartition("_")[0] for name in regional if name in scores}
     table = [["", "value", "items"]]
@@ -103,8 +103,8 @@ def _distance_table(distances: Sequence[Distance]) -> str:
     return _table(table)
 
 
-def _remarks(report: Report) -> Iterator[str]:
-    """Every note once, behind the names that it stands for."""
+def _notes(report: Report) -> Iterator[str]:
+    """Return every note once, after the names that it is about."""
     names: dict[str, list[str]] = defaultdict(list)
     for name, score in report.scores.items():
         names[score.note].append(_title(name))
@@ -117,7 +117,7 @@ def _remarks(report: Report) -> Iterator[str]:
 
 
 def _title(name: str) -> str:
-    """A score's name in words."""
+    """Return a score's name in words."""
     for region, words in list(REGIONS.items())[1:]:
         if name.endswith(region) and name.removesuffix(region) in METRICS:
             return f"{METRICS[name.removesuffix(region)].split(',')[0]} {words}"
@@ -131,13 +131,13 @@ def _cell(score: Score | None) -> str:
 
 
 def _digits(value: float) -> str:
-    """Four significant digits, without an exponent from 0.0001 on."""
-    places = max(0, 3 - math.floor(math.log10(abs(value)))) if value else 1
-    return f"{value:.{min(places, 7)}f}"
+    """Format four significant digits, without an exponent from 0.0001 on."""
+    digits = max(0, 3 - math.floor(math.log10(abs(value)))) if value else 1
+    return f"{value:.{min(digits, 7)}f}"
 
 
 def _table(rows: list[list[str]]) -> str:
-    """Markdown, the first row being the head; nothing where there is only a head."""
+    """Write a Markdown table, the first row being the head; nothing where there is only a head."""
     if len(rows) == 1:
         return ""
     ruler = ["---"] + ["---:"] * (len(rows[0]) - 1)

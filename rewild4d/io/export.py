@@ -20,7 +20,7 @@ from rewild4d.io.ply import write_splats
 from rewild4d.io.skinned_glb import SEEN, shown, write_glb
 from rewild4d.types import Camera, Clip, Frame
 from rewild4d.visualize.pictures import film_rate, over, save_mp4
-from rewild4d.visualize.turntable import find_stance, turn
+from rewild4d.visualize.turntable import find_framing, orbit_frames
 
 
 def parse_kinds(text: str) -> tuple[str, ...]:
@@ -124,8 +124,8 @@ def _write_cameras(reconstruction: Reconstruction, clip: Clip, folder: Path) -> 
 
 def _write_films(reconstruction: Reconstruction, clip: Clip, folder: Path) -> list[Path]:
     shown = [(frame, camera) for frame in clip.frames if (camera := input_camera(reconstruction, frame)) is not None]
-    fps, stance = film_rate(clip.fps), find_stance(reconstruction, clip, None)
+    fps, framing = film_rate(clip.fps), find_framing(reconstruction, clip, None)
     paths = [folder / "input_view.mp4", folder / "orbit.mp4"]
     save_mp4((over(reconstruction.at(frame.time), camera) for frame, camera in shown), paths[0], fps)
-    save_mp4(turn(reconstruction, clip, stance), paths[1], fps)
+    save_mp4(orbit_frames(reconstruction, clip, framing), paths[1], fps)
     return paths

@@ -1,1 +1,1 @@
-"""Turn a plan into records: plan, run, resume, and describe what was run."""
+"""Plan, run and resume fits, and describe them in records."""

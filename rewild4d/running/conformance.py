@@ -1,11 +1,12 @@
-"""What every method must keep, tested on a case small enough for any machine: `check --method NAME`.
+"""Check a method against the contract on a tiny case: `check --method NAME`.
 
-A plug-in that passes can be run, resumed, evaluated again and compared.
+A method that passes can be run, resumed, evaluated again and compared.
 """
 
 import math
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from rewild4d.types import Camera, Case, Clip, Frame, Splats, Truth
 
 
 def check_method(name: str, preset: str) -> list[Finding]:
-    """Fit the method twice on a tiny case and look whether it keeps the contract."""
+    """Fit the method twice on a tiny case and report every requirement that it breaks."""
     method = load_method(name)
     config = load_preset(name, method.Config, preset)
     case = tiny_case()
@@ -48,17 +49,14 @@ def check_method(name: str, preset: str) -> list[Finding]:
 def _checks(
     name: str, method: Method, config: Any, case: Case, folder: Path
 ) -> Iterator[tuple[str, Callable[[], str]]]:
-    """The checks in order: each gives an empty string where the promise is kept, or what came instead."""
+    """Yield the checks in order: each returns an empty string, or what came instead of what was expected."""
     fitted: list[Reconstruction] = []
 
     def fit(clip: Clip = case.clip, workdir: Path | None = None) -> Reconstruction:
-        progress = Progress(f"check {name}")
-        try:
+        with closing(Progress(f"check {name}")) as log:
             return method.fit(
-                clip, case.prior, config=config, seed=0, device=torch.device("cpu"), log=progress, workdir=workdir
+                clip, case.prior, config=config, seed=0, device=torch.device("cpu"), log=log, workdir=workdir
             )
-        finally:
-            progress.close()
 
     def fits() -> str:
         (folder / "work").mkdir()
@@ -103,15 +101,16 @@ def _difference(one: Reconstruction, other: Reconstruction, case: Case, what: st
 
 
 def tiny_case(frames: int = 4, width: int = 96, height: int = 64, views: int = 6) -> Case:
-    """A walking template seen from a ring of cameras in a turned, scaled world: the truth is known exactly."""
+    """Render a walking template from a ring of cameras in a rotated, scaled world: the truth is known exactly."""
     template = quadruped()
     times = torch.arange(frames, dtype=torch.float64) / 10
     angles = torch.zeros(frames, len(PARENTS), 3)
     for leg, phase in zip((10, 13, 16, 19), (0.0, 0.5, 0.0, 0.5), strict=True):
         angles[:, leg, 0] = 0.4 * torch.sin(2 * math.pi * (times.float() * 2 + phase))
     transforms = pose(angles, template.bones[:, 0], PARENTS)
-    turn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3)))[0]
-    world = similarity(0.3, turn * torch.linalg.det(turn), torch.tensor((0.4, -0.2, 0.7), dtype=torch.float64))
+    rotation = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3)))[0]
+    translation = torch.tensor((0.4, -0.2, 0.7), dtype=torch.float64)
+    world = similarity(0.3, rotation * torch.linalg.det(rotation), translation)
     ring = [_ring_camera(world, 2 * math.pi * view / views, width, height) for view in range(views)]
     cameras = [camera_in_object(ring[i % views], world) for i in range(frames)]
     prior = posed_prior(
@@ -135,9 +134,9 @@ def tiny_case(frames: int = 4, width: int = 96, height: int = 64, views: int = 6
 
 
 def _ring_camera(world: torch.Tensor, azimuth: float, width: int, height: int) -> Camera:
-    """A camera that looks at the animal from an azimuth, a little from above."""
-    place = torch.tensor((12 * math.sin(azimuth), 4.0, 12 * math.cos(azimuth), 1.0), dtype=torch.float64)
+    """Return a camera that looks at the animal from an azimuth, a little from above."""
+    eye = torch.tensor((12 * math.sin(azimuth), 4.0, 12 * math.cos(azimuth), 1.0), dtype=torch.float64)
     up = torch.nn.functional.normalize(world[:3, 1], dim=0)
     focal = 1.6 * width
     intrinsics = torch.tensor(((focal, 0, width / 2), (0, focal, height / 2), (0, 0, 1)), dtype=torch.float64)
-    return Camera(look_at((world @ place)[:3], world[:3, 3], up), intrinsics, width, height)
+    return Camera(look_at((world @ eye)[:3], world[:3, 3], up), intrinsics, width, height)

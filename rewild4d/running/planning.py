@@ -1,4 +1,4 @@
-"""From a table's file to what has to be run for it, and to which records are its rows."""
+"""Find what a table's file needs to run, and which records are its rows."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import msgspec
 
 from rewild4d.config import load_preset, preset_names
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.evaluation.protocol import Protocol, load_protocols
+from rewild4d.evaluation.protocol import load_protocols
 from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.specs import Condition, Line, Spec, load_reported
 from rewild4d.leaderboard.tables import Entrant, Frame
@@ -24,7 +24,7 @@ from rewild4d.running.runner import Entry
 
 @dataclass(frozen=True)
 class Choice:
-    """What the command line may change in a table.
+    """Changes of a table by the command line.
 
     Attributes:
         preset: of every row that names none; "" leaves the table's.
@@ -36,7 +36,7 @@ class Choice:
 
 
 def with_choice(name: str, spec: Spec, choice: Choice) -> Spec:
-    """The table after the command line's changes, protocols by their full names.
+    """Apply the command line's changes to a table, with full names of protocols.
 
     Raises:
         UserError: an unknown protocol, or one for a table of several conditions.
@@ -51,18 +51,14 @@ def with_choice(name: str, spec: Spec, choice: Choice) -> Spec:
 
 
 def newest_protocol(name: str) -> str:
-    """The full name of a protocol: of a family ("artemis-sweep-256") the highest version; unknown ones are left."""
+    """Return the full name of a protocol: of a family ("artemis-sweep-256") the highest version; others unchanged."""
     protocols = load_protocols()
     family = [known for known in protocols if known.rpartition("-v")[0] == name]
     return max(family, key=lambda known: int(known.rpartition("-v")[2])) if family else name
 
 
 def known_protocol(name: str, recorded: Iterable[str] = ()) -> str:
-    """The full name of a protocol or family that ships or is installed, or of which there are records.
-
-    Raises:
-        UserError: unknown.
-    """
+    """Return the full name of an available protocol or family, or of one in the records; UserError where unknown."""
     full, known = newest_protocol(name), {*load_protocols(), *recorded}
     if full not in known:
         raise unknown_name("protocol", name, known)
@@ -70,7 +66,7 @@ def known_protocol(name: str, recorded: Iterable[str] = ()) -> str:
 
 
 def row_entry(table: str, row: Line, spec: Spec, seeds: tuple[int, ...]) -> Entry:
-    """Method and full settings of a row.
+    """Return method and full settings of a row.
 
     Raises:
         UserError: an unknown method or preset, or settings that do not fit the method.
@@ -90,7 +86,7 @@ def row_entry(table: str, row: Line, spec: Spec, seeds: tuple[int, ...]) -> Entr
 
 
 def entries(name: str, spec: Spec, seeds: tuple[int, ...]) -> tuple[Entry, ...]:
-    """What to run for the rows of a table, equal ones once."""
+    """List what to run for the rows of a table, equal ones once."""
     found: list[Entry] = []
     for row in spec.rows:
         entry = row_entry(name, row, spec, seeds)
@@ -100,7 +96,7 @@ def entries(name: str, spec: Spec, seeds: tuple[int, ...]) -> tuple[Entry, ...]:
 
 
 def grounds(spec: Spec) -> dict[tuple[str, str], tuple[str, ...]]:
-    """(protocol, prior) of the conditions, each once, with the patterns of cases that any of them wants, () for all."""
+    """Return (protocol, prior) of the conditions, each once, with the patterns of their cases, () for all."""
     found: dict[tuple[str, str], tuple[str, ...]] = {}
     for one in spec.conditions:
         key = one.protocol, one.prior
@@ -110,7 +106,7 @@ def grounds(spec: Spec) -> dict[tuple[str, str], tuple[str, ...]]:
 
 
 def frame(name: str, spec: Spec) -> Frame:
-    """Titles and columns of a table."""
+    """Return titles and columns of a table."""
     several = len(spec.conditions) > 1
     titles = tuple(one.title or one.protocol if several else "" for one in spec.conditions)
     where = ", ".join(dict.fromkeys(f"`{one.protocol}`" for one in spec.conditions))
@@ -119,7 +115,7 @@ def frame(name: str, spec: Spec) -> Frame:
 
 
 def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[Entrant], list[str]]:
-    """The rows of a table with their records, then the floors of its protocols, and sentences on records left out."""
+    """Return the rows of a table with their records, then its lower-bound rows, and notes on records left out."""
     points = getattr(load_dataset(spec.dataset), "keypoint_use", "none")
     records = [record for record in records if record.prior.get("keypoints", "none") == points]
     kept, remarks = latest([r for r in records if any(_is_under(r, condition, spec) for condition in spec.conditions)])
@@ -151,22 +147,8 @@ def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[
 
 
 def reported(spec: Spec) -> Any:
-    """What the paper printed in this table's place, or None."""
+    """Load the paper's own numbers for this table, or None."""
     return load_reported(spec.paper) if spec.paper else None
-
-
-def protocol_of(spec: Spec, name: str) -> Protocol:
-    """The protocol of a condition.
-
-    Raises:
-        UserError: unknown, or made for another data set.
-    """
-    protocols = load_protocols()
-    if name not in protocols:
-        raise unknown_name("protocol", name, protocols)
-    if protocols[name].dataset != spec.dataset:
-        raise UserError(f"protocol '{name}' is for the data set '{protocols[name].dataset}', not for '{spec.dataset}'.")
-    return protocols[name]
 
 
 def _is_under(record: RunRecord, condition: Condition, spec: Spec) -> bool:
@@ -181,12 +163,7 @@ def _is_under(record: RunRecord, condition: Condition, spec: Spec) -> bool:
 
 
 def _missing(spec: Spec, cases: Sequence[Collection[str]]) -> list[str]:
-    """A sentence on the cases that the table's file names and no row has; conditions without any say so in the cells.
-
-    Args:
-        spec: the table.
-        cases: that the rows were run on, under each condition.
-    """
+    """Say which patterns of cases fit none of the rows' cases; conditions without any case say so in the cells."""
     absent = [
         pattern
         for condition, found in zip(spec.conditions, cases, strict=True)
@@ -198,12 +175,12 @@ def _missing(spec: Spec, cases: Sequence[Collection[str]]) -> list[str]:
 
 
 def _beside_equals(record: RunRecord) -> RunRecord:
-    """Without the mark of a prior made from the truth: a condition names its prior, and all rows have the same."""
+    """Drop the mark of a prior made from the truth: all rows of a condition have the same prior."""
     return msgspec.structs.replace(record, marks=[mark for mark in record.marks if mark != FROM_TRUTH])
 
 
 def _equals(settings: Any, wanted: msgspec.Struct) -> bool:
-    """Whether a record's settings are these; those that came later than the record have their defaults in it."""
+    """Compare a record's settings; those newer than the record have their defaults in it."""
     try:
         return msgspec.convert(settings, type=type(wanted)) == wanted
     except msgspec.ValidationError:
@@ -211,7 +188,7 @@ def _equals(settings: Any, wanted: msgspec.Struct) -> bool:
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested settings with some of them changed; a name that is not there is kept, so that reading it complains."""
+    """Deep-merge two nested mappings; the second wins. An unknown name is kept, so that decoding refuses it."""
     merged = dict(base)
     for name, value in changes.items():
         merged[name] = _merged(merged.get(name, {}), value) if isinstance(value, dict) else value

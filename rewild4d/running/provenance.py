@@ -1,4 +1,4 @@
-"""What a record says of a run beside its scores: data, prior, inputs, marks and the method's own figures."""
+"""Describe a run in its record: data, prior, inputs, marks and diagnostics."""
 
 import json
 from typing import Any
@@ -16,7 +16,7 @@ FROM_TRUTH = "upper bound: its prior was made from the truth"
 
 
 def reading(reader: DatasetReader, clip: Clip) -> dict[str, str]:
-    """How the data was read: the reader's settings, what it left out, what it was rendered from, if anything."""
+    """Return how the data was read: the reader's settings, notes of the clip, recipe of rendered data."""
     settings, recipe = getattr(reader, "settings", {}), getattr(reader, "recipe", None)
     found = {
         "settings": json.dumps(settings) if settings else "",
@@ -27,7 +27,7 @@ def reading(reader: DatasetReader, clip: Clip) -> dict[str, str]:
 
 
 def prior_of(prior: Prior | None) -> dict[str, Any]:
-    """The prior that was made, if any was."""
+    """Describe the prior."""
     if prior is None:
         return {"name": "none"}
     said = {"name": prior.name, "provenance": prior.provenance, "digest": prior.digest, "quality": prior.quality}
@@ -35,31 +35,31 @@ def prior_of(prior: Prior | None) -> dict[str, Any]:
 
 
 def left_out(clip: Clip, shown: Clip | None) -> dict[str, list[int]]:
-    """Rows of the frames that the method was not shown, because the prior does not know their cameras, if any."""
+    """Return rows of the frames that the method was not shown, because the prior does not know their cameras."""
     times = set(clip.times if shown is None else shown.times)
     rows = [row for row, time in enumerate(clip.times) if time not in times]
     return {"left_out": rows} if rows else {}
 
 
 def shown_of(clip: Clip, prior: dict[str, Any]) -> Clip:
-    """What a record's method was shown of its clip; ``prior`` as the record has it."""
+    """Return the part of its clip that a record's method was shown; ``prior`` as in the record."""
     missing = set(prior.get("left_out", ()))
     return clip.only([row for row in range(len(clip.frames)) if row not in missing]) if missing else clip
 
 
 def keypoints(choice: PriorChoice, clip: Clip) -> dict[str, str]:
-    """Which annotated keypoints the fit of the prior saw, where the clip has any."""
+    """Return which annotated keypoints the fit of the prior used, where the clip has any."""
     if choice.mapping is None or all(frame.keypoints is None for frame in clip.frames):
         return {}
     return {"keypoints": choice.use, "mapping": choice.mapping}
 
 
 def diagnostics(reconstruction: Reconstruction, shown: Clip, background: float) -> dict[str, Any]:
-    """What the method says of its result, if it does, and how closely that fits what the method was shown.
+    """Return the method's own diagnostics, and the PSNR of its input frames.
 
     Args:
         reconstruction: of the clip.
-        shown: what the method saw.
+        shown: input of the method.
         background: of the protocol.
     """
     describe = getattr(reconstruction, "diagnostics", None)
@@ -68,18 +68,18 @@ def diagnostics(reconstruction: Reconstruction, shown: Clip, background: float) 
 
 
 def inputs(method: str, config: msgspec.Struct, case: str) -> dict[str, str]:
-    """What decides a result beside the settings: files that a method reads, if it says so."""
+    """Return the digest of files that a method reads besides its settings, if any."""
     asked = getattr(load_method(method), "inputs", None)
     return {"inputs": asked(config, case)} if asked else {}
 
 
 def marks(method: str, prior: str, reconstruction: Reconstruction) -> list[str]:
-    """What stands beside the numbers in every table, and keeps a row out of the ranking.
+    """Return marks that are printed with the numbers in every table, and exclude a row from the ranking.
 
     Args:
         method: its name.
-        prior: what `--prior` said.
-        reconstruction: it may have marks of its own.
+        prior: the value of `--prior`.
+        reconstruction: may have marks of its own.
     """
     info = load_method(method).info
     found = [info.mark] if info.mark else []

@@ -1,4 +1,4 @@
-"""From a plan to records: load, prior, fit, evaluate, write; finished runs are skipped, killed ones resume."""
+"""Turn a plan into records: load, prior, fit, evaluate, write; finished runs are skipped, killed ones resume."""
 
 import contextlib
 import json
@@ -41,12 +41,12 @@ from rewild4d.visualize.original_view import original_frames
 from rewild4d.visualize.run_pictures import save_pictures
 
 STAMP = "fit.json"
-"""Beside a saved reconstruction: how long the fit took, written last."""
+"""Duration of the fit, written last, beside a saved reconstruction."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One row of a plan: a method with its settings, and the seeds to run it with."""
+    """One row of a plan: a method with its settings, and the seeds to run."""
 
     method: str
     preset: str
@@ -56,10 +56,12 @@ class Entry:
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything that decides what is run; the same plan gives the same run ids.
+    """Everything that decides what is run; the same plan has the same run ids.
 
-    `jobs` rows run at a time, each in a process where torch has `threads` threads; our kernels take the cores that no
-    fit needs. Two fits side by side finish sooner than one on two cores. `rasterizer`: rewild4d.rasterizer.BACKENDS.
+    Attributes:
+        jobs: rows at a time, each in a process of its own.
+        threads: of torch in each process; our kernels use the cores that no fit needs.
+        rasterizer: out of `rewild4d.rasterizer.BACKENDS`, or "auto".
     """
 
     dataset: str
@@ -77,7 +79,7 @@ class Plan:
 
 
 def choose_cases(names: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]:
-    """The cases that any of the wanted names or patterns ("wolf/*") names; all where none is given.
+    """Return the cases that fit any of the names or patterns ("wolf/*"); all where none is given.
 
     Raises:
         UserError: a name that fits no case.
@@ -89,10 +91,10 @@ def choose_cases(names: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]
 
 
 def execute(plan: Plan) -> list[RunRecord]:
-    """Run all that the plan lists and has no finished record; give every record, in the plan's order.
+    """Run every part of the plan that has no finished record; return every record, in the plan's order.
 
-    A run that fails leaves a record with its message and does not stop the others; nor does a case that cannot be read,
-    which has no records.
+    A run that fails leaves a record with its message and does not stop the others. A case that cannot be read is
+    skipped and has no records.
 
     Raises:
         UserError: none of the cases can be read or the rasterizer cannot be used, before anything is fitted.
@@ -122,11 +124,7 @@ def execute(plan: Plan) -> list[RunRecord]:
 
 
 def _readable(plan: Plan) -> Plan:
-    """The plan without the cases that cannot be read; notes and faults are told.
-
-    Raises:
-        UserError: none can be read.
-    """
+    """Drop the cases that cannot be read, and print notes and errors; UserError where none is left."""
     notes: list[str] = []
     faults: dict[str, UserError] = {}
     for name in plan.cases:
@@ -142,13 +140,13 @@ def _readable(plan: Plan) -> Plan:
 
 
 def pieces(plan: Plan) -> list["Job"]:
-    """All that the plan lists and can be read, in its order, finished or not; nothing is run."""
+    """List all jobs of the plan that can be read, in its order, finished or not; nothing is run."""
     plan = _readable(replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device)))
     return [job for name in plan.cases for job in _jobs(plan, name, *plan.reader.load(name, plan.protocol.selection))]
 
 
 def _prepare(plan: Plan, name: str) -> None:
-    """Make the prior of a case where a fit still needs it, and tell its notes; faults are told by those fits."""
+    """Make the prior of a case where a fit still needs it, and print its notes; its errors are reported by the fits."""
     clip, truth = plan.reader.load(name, plan.protocol.selection)
     if not all(job.finished() for job in _jobs(plan, name, clip, truth)):
         with contextlib.suppress(UserError, FloatingPointError):
@@ -162,7 +160,7 @@ def _run_part(plan: Plan, name: str, entry: Entry, seed: int) -> RunRecord:
 
 
 def _lost_part(plan: Plan, name: str, entry: Entry, seed: int) -> RunRecord:
-    """The record of a run whose process is gone without a word."""
+    """Return the record of a run whose process died."""
     (job,) = _jobs(_part(plan, entry, seed), name, *plan.reader.load(name, plan.protocol.selection))
     return job.fail("the process ended: killed, perhaps for memory")
 
@@ -192,12 +190,9 @@ def _jobs(plan: Plan, name: str, clip: Clip, truth: Truth) -> list["Job"]:
 
 
 def _prior(plan: Plan, clip: Clip, truth: Truth) -> Prior:
-    progress = Progress(f"{clip.name}: prior")
-    try:
-        path = plan.out / "priors" / f"{plan.prior.identity(clip, truth)}.npz"
+    path = plan.out / "priors" / f"{plan.prior.identity(clip, truth)}.npz"
+    with contextlib.closing(Progress(f"{clip.name}: prior")) as progress:
         return make_prior(plan.prior, clip, truth, path, progress)
-    finally:
-        progress.close()
 
 
 class Job:
@@ -215,18 +210,17 @@ class Job:
         self.started = datetime.now(UTC).isoformat(timespec="seconds")
 
     def finished(self) -> bool:
-        """Whether a good record is there: a failed one is tried again, and so is scoring that lacked a network that
-        has come since."""
+        """Return whether there is a good record; scoring that lacked a network is repeated once the network is here."""
         if not self._is_good():
             return False
         return not (self._is_fitted() and may_be_scored_now(self.record().scores))
 
     def record(self) -> RunRecord:
-        """The record that is there."""
+        """Read the record."""
         return read_record(self.folder / FILE)
 
     def run(self, case: Case, seen: dict[str, float]) -> RunRecord:
-        """What is there, if it is finished; else fit, evaluate, draw, record. One process at a time."""
+        """Return the record if finished; else fit, evaluate, draw, record. One process at a time."""
         with held(self.folder, f"{self.title}: waiting for another process that makes {self.folder.name}"):
             if self.finished():
                 return self.record()
@@ -238,12 +232,10 @@ class Job:
             reconstruction, fit_seconds = self._fit(case)
             begin = time.perf_counter()
             whole = with_cameras(self.clip, case.prior)  # also the frames that the fit was not shown
-            progress = Progress(f"{self.title}: refine on held-out frames")
-            reconstruction, clip, truth = ready_to_score(reconstruction, whole, case.truth, case.clip, progress)
-            progress.close()
-            progress = Progress(f"{self.title}: evaluate")
-            found = evaluate(reconstruction, clip, truth, self.plan.protocol, progress, self.plan.device)
-            progress.close()
+            with contextlib.closing(Progress(f"{self.title}: refine on held-out frames")) as log:
+                reconstruction, clip, truth = ready_to_score(reconstruction, whole, case.truth, case.clip, log)
+            with contextlib.closing(Progress(f"{self.title}: evaluate")) as log:
+                found = evaluate(reconstruction, clip, truth, self.plan.protocol, log, self.plan.device)
             seconds = time.perf_counter() - begin
             pictures = save_pictures(
                 reconstruction, clip, truth, self.folder,
@@ -265,7 +257,7 @@ class Job:
         return read_record(path)
 
     def fail(self, message: str, case: Case | None = None) -> RunRecord:
-        """Record a failure: it is a finding too, but not in the place of a good record."""
+        """Record a failure, but never replace a good record."""
         print(f"{self.title}: failed: {message}", file=sys.stderr)
         if self._is_good():
             return self.record()
@@ -273,7 +265,7 @@ class Job:
         return read_record(write_record(record, self.folder))
 
     def _fit(self, case: Case) -> tuple[Reconstruction, float]:
-        """The reconstruction, saved; a run killed while scoring reads it back instead of fitting again."""
+        """Fit and save; a run killed while scoring loads its reconstruction instead of fitting again."""
         method = load_method(self.entry.method)
         saved = self.folder / "reconstruction"
         if not self._is_fitted():
@@ -320,7 +312,7 @@ class Job:
 
 
 def fit_seconds(folder: Path) -> float:
-    """How long the finished fit in a run's folder took since its last start."""
+    """Read how long the finished fit in a run's folder took since its last start."""
     try:
         return float(json.loads((folder / STAMP).read_text(encoding="utf-8"))["seconds_since_last_start"])
     except (OSError, ValueError, KeyError, TypeError) as error:

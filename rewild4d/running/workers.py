@@ -1,4 +1,4 @@
-"""Pieces of work in processes of their own: one that is killed takes nothing but its piece with it."""
+"""Run parts of a plan in processes of their own: one that is killed loses only its part."""
 
 import multiprocessing
 import os
@@ -18,18 +18,18 @@ from rewild4d.running.interrupts import answer_interrupts, block_interrupts
 
 T = TypeVar("T")
 MOST_THREADS = 4
-"""That the kernels of one fit take unasked: what they gain from more has not been measured."""
+"""Most threads of the kernels of one fit, unless asked for."""
 
 
 class Threads(NamedTuple):
-    """Of one process: torch's, on whose number last digits depend, and our kernels', on whose number nothing does."""
+    """Threads of one process: torch's, which change last digits, and our kernels', which change nothing."""
 
     torch: int
     kernels: int
 
 
 def usable_cores(device: torch.device) -> int:
-    """Processes that a device can keep busy: one for each core that this process may use, one in all on a GPU."""
+    """Return how many processes a device can keep busy: one for each usable core, one in all on a GPU."""
     if device.type == "cuda":
         return 1
     if hasattr(os, "sched_getaffinity"):  # Linux alone can tell which cores a process may use
@@ -38,13 +38,13 @@ def usable_cores(device: torch.device) -> int:
 
 
 def share_cores(threads: int, fits: int, device: torch.device) -> Threads:
-    """Threads of each process where so many fits run at a time: the kernels take the cores that no fit needs."""
+    """Choose the threads of each process where so many fits run at a time: kernels use the cores that no fit needs."""
     return Threads(threads, max(threads, min(usable_cores(device) // max(fits, 1), MOST_THREADS)))
 
 
 @contextmanager
 def this_process(threads: Threads, rasterizer: str) -> Iterator[None]:
-    """Work here, as a worker would."""
+    """Work in this process with a worker's settings."""
     before = _settle(threads, rasterizer)
     try:
         yield
@@ -53,16 +53,16 @@ def this_process(threads: Threads, rasterizer: str) -> Iterator[None]:
 
 
 def _settle(threads: Threads, rasterizer: str) -> int | None:
-    """Set up this process; gives how many threads its kernels had."""
+    """Set up this process, and return the previous number of its kernels' threads."""
     torch.set_num_threads(threads.torch)
     set_default(rasterizer)
     return set_kernel_threads(threads.kernels)
 
 
 class Workers:
-    """Some processes that work side by side, each with threads of its own; they end with the `with` block.
+    """Processes side by side, each with threads of its own; they end with the `with` block.
 
-    Each is a pool of one: a pool of several is lost as a whole, with all that is under way, when one of them dies.
+    Each is a pool of one: a pool of several is lost as a whole when one of its processes dies.
     """
 
     def __init__(self, jobs: int, threads: Threads, rasterizer: str) -> None:
@@ -79,12 +79,12 @@ class Workers:
             self._free.get().shutdown()
 
     def map(self, function: Callable[..., T], pieces: Sequence[tuple[Any, ...]], lost: Callable[..., T]) -> list[T]:
-        """Results of function(*piece), in the order of the pieces; what a call raises ends the map.
+        """Return function(*piece) in the order of the pieces; an exception of a call ends the map.
 
         Args:
             function: called in a worker.
             pieces: arguments of each call.
-            lost: called here with the piece whose process ended under it; its result stands for the piece's.
+            lost: called here with a piece whose process died; its result is used instead.
         """
 
         stopped = Event()
@@ -110,7 +110,7 @@ class Workers:
                 raise
 
     def _pool(self) -> ProcessPoolExecutor:
-        """A process that starts with its first piece."""
+        """Return a process that starts with its first piece."""
         return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), start_worker, self._setup)
 
 
@@ -119,7 +119,7 @@ def _piece(function: Callable[..., T], piece: tuple[Any, ...]) -> T:
 
 
 def start_worker(threads: Threads, rasterizer: str) -> None:
-    """Threads of its own, and an end with its parent: an orphan would write into the folder of the next start."""
+    """Set up a worker that ends with its parent: an orphan would write into the folder of the next start."""
     answer_interrupts(_piece.__code__)
     block_interrupts(False)  # an interpreter that starts prints pages about it
     _settle(threads, rasterizer)

@@ -1,11 +1,10 @@
-"""A reconstruction back in the frames that its clip was cut from: what a person filmed beside what was made of it.
+"""Draw a reconstruction in the original frames that its clip was cut from, beside these.
 
-The animal itself is taken out of the frame before the render is laid on it, so that whatever the reconstruction lacks
-shows white, and not the filmed animal behind it.
+The animal itself is removed from the frame before the render is laid on it, so that what the reconstruction lacks is
+white, and not the filmed animal.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from itertools import repeat
 from pathlib import Path
 
@@ -21,16 +20,16 @@ from rewild4d.types import Clip, Crop, Frame
 from rewild4d.visualize.pictures import beside, even, film_rate, header, over, save_mp4, save_png
 
 LONGEST = 960
-"""Longer sides of original frames are shown reduced to so many pixels."""
+"""Longer side of shown original frames in pixels."""
 QUALITY = 6
 """Of the film: frames with their background are large files."""
 SHEET = 6
-"""Moments on the contact sheet, two a row."""
+"""Times on the contact sheet, two a row."""
 SHEET_WIDTH = 360
 
 
 def original_frames(reader: DatasetReader, clip: Clip, selection: Selection) -> Iterable[np.ndarray] | None:
-    """The whole frames that a clip and its truth were cut from, where the reader has them; never for a method."""
+    """Read the whole frames of a clip and its truth, where the reader has them; never for a method."""
     read = getattr(reader, "originals", None)
     return None if read is None else read(clip.name, selection)
 
@@ -42,8 +41,8 @@ def save_original_view(
 
     Args:
         reconstruction: of the clip.
-        clip: crops of a video, with the held-out moments (`recropping.all_moments`); of other data nothing is written.
-        originals: the whole frames in the clip's order, uint8 [h, w, 3]; None: the render is laid on white alone.
+        clip: crops of a video, with the held-out frames (`recropping.all_moments`); of other data nothing is written.
+        originals: the whole frames in the clip's order, uint8 [h, w, 3]; None: the render alone, on white.
         folder: of the run.
 
     Returns:
@@ -69,7 +68,7 @@ def save_original_view(
 def _moments(
     reconstruction: Reconstruction, clip: Clip, originals: Iterable[np.ndarray] | None
 ) -> Iterator[tuple[float, Tensor]]:
-    """Time and picture of each frame of the clip."""
+    """Iterate over time and picture of each frame of the clip."""
     count = 0
     for frame, whole in zip(clip.frames, repeat(None) if originals is None else originals, strict=False):
         count += 1
@@ -79,52 +78,40 @@ def _moments(
 
 
 def _beside(reconstruction: Reconstruction, frame: Frame, whole: np.ndarray | None) -> Tensor:
-    """The original frame and the render in its place, or the render alone, on white, [3, h, w]."""
-    place = _Place.of(frame)
-    camera, background = input_camera(reconstruction, frame), torch.ones(3, place.height, place.width)
+    """Draw the original frame and the render in it, or the render alone, on white, [3, h, w]."""
+    assert frame.crop is not None
+    matte = _original_matte(frame.mask, frame.crop)
+    height, width = matte.shape[1:]
+    camera, background = input_camera(reconstruction, frame), torch.ones(3, height, width)
     if whole is not None:
-        image = cv2.resize(whole, (place.width, place.height), interpolation=cv2.INTER_AREA)
+        image = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
         background = torch.from_numpy(image).permute(2, 0, 1).float() / 255
-    empty = background + place.mask(frame) * (1 - background)
+    empty = background + matte * (1 - background)
     if camera is not None:
-        camera = place.crop.original_camera(camera).resized(place.width, place.height)
+        camera = frame.crop.original_camera(camera).resized(width, height)
         empty = over(reconstruction.at(frame.time), camera, empty)
     return empty if whole is None else beside(background, empty)
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Where a crop lies in its original frame, at the size at which that is shown."""
-
-    crop: Crop
-    width: int
-    height: int
-
-    @staticmethod
-    def of(frame: Frame) -> "_Place":
-        assert frame.crop is not None
-        scale = min(1.0, LONGEST / max(frame.crop.width, frame.crop.height))
-        return _Place(frame.crop, even(scale * frame.crop.width), even(scale * frame.crop.height))
-
-    def mask(self, frame: Frame) -> Tensor:
-        """The frame's matte in the original frame, [1, h, w]."""
-        size = frame.mask.shape[2]
-        x, y = self.width / self.crop.width, self.height / self.crop.height
-        a, b = x * self.crop.side / size, y * self.crop.side / size
-        # OpenCV counts from the middle of the first pixel
-        moved = np.array(((a, 0, x * self.crop.left + a / 2 - 0.5), (0, b, y * self.crop.top + b / 2 - 0.5)))
-        matte = cv2.warpAffine(frame.mask[0].numpy(), moved, (self.width, self.height), flags=cv2.INTER_LINEAR)
-        return torch.from_numpy(matte)[None]
+def _original_matte(mask: Tensor, crop: Crop) -> Tensor:
+    """Resample a crop's matte to the original frame at its shown size, [1, h, w]."""
+    scale = min(1.0, LONGEST / max(crop.width, crop.height))
+    width, height = even(scale * crop.width), even(scale * crop.height)
+    x, y, size = width / crop.width, height / crop.height, mask.shape[2]
+    a, b = x * crop.side / size, y * crop.side / size
+    # OpenCV counts from the middle of the first pixel.
+    moved = np.array(((a, 0, x * crop.left + a / 2 - 0.5), (0, b, y * crop.top + b / 2 - 0.5)))
+    return torch.from_numpy(cv2.warpAffine(mask[0].numpy(), moved, (width, height), flags=cv2.INTER_LINEAR))[None]
 
 
 def _reduced(image: Tensor, width: int) -> Tensor:
-    """A picture of the film at a width of the contact sheet."""
+    """Resize a picture of the film to a width of the contact sheet."""
     size = (width, even(image.shape[1] * width / image.shape[2]))
     small = cv2.resize(image.permute(1, 2, 0).numpy(), size, interpolation=cv2.INTER_AREA)
     return torch.from_numpy(small).permute(2, 0, 1)
 
 
 def _sheet(images: list[Tensor], titles: list[str]) -> Tensor:
-    """Pictures of one size, two a row in the order of time, [3, H, W]."""
+    """Lay out pictures of one size, two a row in the order of time, [3, H, W]."""
     rows = [torch.cat(images[i : i + 2], dim=2) for i in range(0, len(images), 2)]
     return torch.cat([header(2 * titles, rows[0].shape[2]), *rows], dim=1)

@@ -1,4 +1,4 @@
-"""What every picture of a run is drawn with: a render on a background, panels side by side, PNG and MP4 files."""
+"""Draw a render on a background, lay panels side by side, write PNG and MP4 files."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -28,7 +28,11 @@ def save_png(image: Tensor, path: Path) -> None:
 def save_mp4(images: Iterable[Tensor], path: Path, fps: float, quality: int = 8) -> None:
     """Write RGB images in [0, 1], each [3, h, w] of one size, as H.264 atomically; odd sizes are padded.
 
-    Images are taken one at a time, so that a long film of large frames need not fit into memory; quality is 1 to 10.
+    Args:
+        images: read one at a time, so that a long film need not fit into memory.
+        path: of the film.
+        fps: frames a second.
+        quality: 1 to 10.
     """
     settings: Any = {"codec": "libx264", "quality": quality, "macro_block_size": 2, "ffmpeg_log_level": "error"}
     with atomic(path) as temporary:
@@ -39,29 +43,29 @@ def save_mp4(images: Iterable[Tensor], path: Path, fps: float, quality: int = 8)
 
 
 def film_rate(fps: float) -> float:
-    """Frames a second of a film: the clip's, between 5 and 30."""
+    """Return a film's frames a second: the clip's, between 5 and 30."""
     return max(5.0, min(fps, 30.0))
 
 
 def over(splats: Splats, camera: Camera, background: float | Tensor = 1.0) -> Tensor:
-    """A render composited on a background (a number, or an image [3, h, w]), [3, h, w]."""
+    """Render on a background (a number, or an image [3, h, w]), [3, h, w]."""
     color, alpha = render(splats, camera)
     return (color + (1 - alpha) * background).clamp(0, 1)
 
 
 def widen(image: Tensor) -> Tensor:
-    """Enlarged by a whole factor to at least `PANEL` pixels."""
+    """Enlarge by a whole factor to at least `PANEL` pixels."""
     factor = max(1, math.ceil(PANEL / image.shape[2]))
     return image.repeat_interleave(factor, 1).repeat_interleave(factor, 2)
 
 
 def beside(*images: Tensor) -> Tensor:
-    """Images of one height side by side, each at least `PANEL` wide."""
+    """Lay images of one height side by side, each at least `PANEL` wide."""
     return torch.cat([widen(image) for image in images], dim=2)
 
 
 def header(titles: Sequence[str], width: int) -> Tensor:
-    """A white strip with a title over each of as many equal columns, [3, 24, width]."""
+    """Draw a white strip with a title over each of as many equal columns, [3, 24, width]."""
     strip = np.full((24, width, 3), 255, np.uint8)
     for i, title in enumerate(titles):
         corner = (i * width // len(titles) + 6, 17)
@@ -70,7 +74,7 @@ def header(titles: Sequence[str], width: int) -> Tensor:
 
 
 def even(value: float, least: int = 2) -> int:
-    """The nearest even number, which films need, and at least the least."""
+    """Round to an even number, which films need, of at least the least."""
     return max(least, 2 * round(value / 2))
 
 

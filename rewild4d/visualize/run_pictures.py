@@ -1,4 +1,4 @@
-"""Pictures of a run: what went in, what came out, what the method never saw."""
+"""Draw the pictures of a run: input, renders, held-out views."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,10 +15,10 @@ from rewild4d.transforms import look_at
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Splats, Truth
 from rewild4d.visualize.original_view import save_original_view
 from rewild4d.visualize.pictures import PANEL, beside, film_rate, header, over, save_mp4, save_png, widen
-from rewild4d.visualize.turntable import find_stance, four_views, turn
+from rewild4d.visualize.turntable import find_framing, four_views, orbit_frames
 
 ROWS = 4
-"""Moments shown in the comparison picture."""
+"""Times shown in the comparison picture."""
 
 
 def save_pictures(
@@ -30,29 +30,28 @@ def save_pictures(
 ) -> list[str]:
     """Write all pictures of a run into ``folder`` and return their names.
 
-    comparison.png  rows are moments; input, render, held-out truth, held-out render
+    comparison.png  rows are times; input, render, held-out truth, held-out render
     canonical.png   canonical Gaussians coloured by skinning weight (methods that have them)
     input.mp4       input beside render, in the input view
-    orbit.mp4       one turn around the moving animal, upright
+    orbit.mp4       one orbit around the moving animal, upright
     orbit.png       the animal from four sides
     original.mp4    original frame beside the render over its background, held-out frames too (crops of a video)
-    original.png    the same at six moments
+    original.png    the same at six times
 
     Args:
         reconstruction: of the clip.
-        clip: what the method saw.
-        truth: what it did not see.
+        clip: input of the method.
+        truth: held out from it.
         folder: of the run.
-        originals: the whole frames that the images of both were cut from, uint8 [h, w, 3], in the order of time; None:
-            the renders in the original frame are laid on white.
+        originals: the whole frames that both were cut from, uint8 [h, w, 3], in the order of time, or None.
     """
     names = ["comparison.png", "input.mp4", "orbit.mp4", "orbit.png"]
     save_png(comparison(reconstruction, clip, truth), folder / names[0])
     fps = film_rate(clip.fps)
     save_mp4((beside(frame.over(1.0), _shot(reconstruction, frame)) for frame in clip.frames), folder / names[1], fps)
-    stance = find_stance(reconstruction, clip, truth.up)
-    save_mp4(turn(reconstruction, clip, stance), folder / names[2], fps)
-    save_png(four_views(reconstruction, clip, stance), folder / names[3])
+    framing = find_framing(reconstruction, clip, truth.up)
+    save_mp4(orbit_frames(reconstruction, clip, framing), folder / names[2], fps)
+    save_png(four_views(reconstruction, clip, framing), folder / names[3])
     names += save_original_view(reconstruction, all_moments(clip, truth), originals, folder)
     if hasattr(reconstruction, "canonical") and hasattr(reconstruction, "weights"):
         save_png(canonical(reconstruction.canonical(), reconstruction.weights), folder / "canonical.png")
@@ -61,7 +60,7 @@ def save_pictures(
 
 
 def comparison(reconstruction: Reconstruction, clip: Clip, truth: Truth) -> Tensor:
-    """The comparison picture, [3, H, W]."""
+    """Draw the comparison picture, [3, H, W]."""
     panels, times = [], [frame.time for frame in truth.held_out]
     for row in range(ROWS):
         frame = clip.frames[row * len(clip.frames) // ROWS]
@@ -76,7 +75,7 @@ def comparison(reconstruction: Reconstruction, clip: Clip, truth: Truth) -> Tens
 
 
 def canonical(splats: Splats, weights: Tensor) -> Tensor:
-    """Canonical Gaussians from the side, obliquely, the front and above, each part in its own colour, [3, H, W]."""
+    """Draw canonical Gaussians from the side, obliquely, the front and above, coloured by part, [3, H, W]."""
     hues = np.array([[((part * 97) % 180, 200, 235) for part in range(weights.shape[1])]], np.uint8)
     palette = torch.from_numpy(cv2.cvtColor(hues, cv2.COLOR_HSV2RGB)[0]).to(weights) / 255
     colored = Splats(splats.means, splats.quats, splats.scales, splats.opacities, (weights @ palette)[:, None])
@@ -93,6 +92,6 @@ def canonical(splats: Splats, weights: Tensor) -> Tensor:
 
 
 def _shot(reconstruction: Reconstruction, frame: Frame) -> Tensor:
-    """The reconstruction as the frame's camera sees it, on white."""
+    """Render from the frame's camera, on white."""
     camera = input_camera(reconstruction, frame)
     return torch.ones_like(frame.rgb) if camera is None else over(reconstruction.at(frame.time), camera)

@@ -1,8 +1,8 @@
-"""Once around the animal, upright and in the middle: a film in which time runs, and a still from four sides.
+"""Draw an orbit around the animal, upright and centred: a film over time, and a still from four sides.
 
-Axes are the animal's own, x left, y up, z ahead, where somebody knows them: the reconstruction, if it is a skinned
-shape, or the prior, which is the world of a video whose camera nobody knows. Else up is the data set's or the input
-cameras', and "ahead" is unknown: the still then shows quarter turns from the input camera.
+Axes are the animal's own, x left, y up, z ahead, where they are known: from the reconstruction, if it is a skinned
+shape, or from the prior, whose object frame is the world of a video without cameras. Else up is the data set's or the
+input cameras', and "ahead" is unknown: the still then shows quarter rotations from the input camera.
 """
 
 import math
@@ -21,31 +21,31 @@ from rewild4d.types import Camera, Clip, Splats
 from rewild4d.visualize.pictures import PANEL, header, over
 
 STEPS = 72
-"""Frames of one turn."""
+"""Frames of one orbit."""
 FIELD_OF_VIEW = math.radians(25)
 ELEVATIONS = (0.0, math.radians(30))
-"""The input cameras' elevation is kept between these: from below or straight above a person sees little."""
+"""Bounds of the camera's elevation: from below or straight above little is visible."""
 INSIDE = 0.998
-"""Share of the solid Gaussians that are inside the picture; the rest are stray."""
+"""Share of the visible Gaussians inside the picture; the rest are stray."""
 MARGIN = 1.03
-"""Of the picture around them."""
+"""Factor of the radius."""
 STEADY = 0.8
-"""Share of the moments from which on the camera has a side of its own; less, and it walked around the animal."""
+"""Share of the times on one side from which on the input camera has a side of its own; less, and it moved around."""
 WINDOW = 9
-"""Moments over which the middle is smoothed; odd."""
+"""Times over which the centre is smoothed; odd."""
 
 
 @dataclass(frozen=True)
-class Stance:
-    """Where the animal stands and how large it is.
+class Framing:
+    """Position and size of the animal, and direction of the input camera.
 
     Attributes:
-        middles: at each of the clip's moments, world, float64, [T, 3].
-        axes: left, up and ahead at each moment, unit rows, world, float64, [T, 3, 3].
+        middles: centre at each of the clip's times, world, float64, [T, 3].
+        axes: left, up and ahead at each time, unit rows, world, float64, [T, 3, 3].
         known: whether "ahead" is the animal's.
         radius: of a ball around it, world units.
         azimuth: of the input camera about up, from ahead towards left, radians.
-        steady: share of the moments at which the input camera stood on the side where it stood on the whole.
+        steady: share of the times at which the input camera was on its main side.
         elevation: of the input camera, within `ELEVATIONS`, radians.
     """
 
@@ -58,7 +58,7 @@ class Stance:
     elevation: float
 
     def camera(self, moment: int, azimuth: float) -> Camera:
-        """A camera on the circle, looking at the middle."""
+        """Return a camera on the circle, looking at the centre."""
         left, up, ahead = self.axes[moment]
         focal = PANEL / 2 / math.tan(FIELD_OF_VIEW / 2)
         intrinsics = torch.tensor(((focal, 0, PANEL / 2), (0, focal, PANEL / 2), (0, 0, 1))).double()
@@ -69,8 +69,8 @@ class Stance:
         return camera
 
 
-def find_stance(reconstruction: Reconstruction, clip: Clip, up: Tensor | None) -> Stance | None:
-    """Where the animal stands; None where there are no Gaussians or no camera.
+def find_framing(reconstruction: Reconstruction, clip: Clip, up: Tensor | None) -> Framing | None:
+    """Find position and size of the animal; None without Gaussians or without a camera.
 
     Args:
         reconstruction: of the clip.
@@ -84,62 +84,62 @@ def find_stance(reconstruction: Reconstruction, clip: Clip, up: Tensor | None) -
     # the median lies in the trunk; a picture is centred on the middle of the whole, legs and head included
     middles = _smooth(torch.stack([_box_middle(means) for means, _ in clouds]))
     axes, known = _axes(reconstruction, clip, cameras, middles, up)
-    reaches = [(means - middle).norm(dim=1) + reach for (means, reach), middle in zip(clouds, middles, strict=True)]
-    radius = max(float(torch.quantile(reach, INSIDE)) for reach in reaches)
-    offsets = torch.stack(
-        [axes[i] @ (camera.center - middles[i]) for i, camera in enumerate(_per_moment(cameras, clip))]
-    )
+    extents = [(means - middle).norm(dim=1) + size for (means, size), middle in zip(clouds, middles, strict=True)]
+    radius = max(float(torch.quantile(extent, INSIDE)) for extent in extents)
+    if len(cameras) < len(clip.times):  # some are unknown: the first represents them
+        cameras = cameras[:1]
+    offsets = torch.stack([axes[i] @ (camera.center - middles[i]) for i, camera in enumerate(cameras)])
     offset = normalize(offsets, dim=1).mean(0)
     elevation = math.atan2(float(offset[1]), float(offset[[0, 2]].norm()))
     azimuth = math.atan2(float(offset[0]), float(offset[2]))
     steady = float((offsets[:, 0] * offset[0] > 0).double().mean())
     elevation = min(max(elevation, ELEVATIONS[0]), ELEVATIONS[1])
-    return Stance(middles, axes, known, max(MARGIN * radius, 1e-6), azimuth, steady, elevation)
+    return Framing(middles, axes, known, max(MARGIN * radius, 1e-6), azimuth, steady, elevation)
 
 
-def turn(reconstruction: Reconstruction, clip: Clip, stance: Stance | None) -> Iterator[Tensor]:
-    """Images [3, PANEL, PANEL] of one turn from the input camera on while time runs; one white image without stance."""
-    for step in range(STEPS if stance else 1):
+def orbit_frames(reconstruction: Reconstruction, clip: Clip, framing: Framing | None) -> Iterator[Tensor]:
+    """Render images [3, PANEL, PANEL] of one orbit over time from the input camera on; without framing, a white one."""
+    for step in range(STEPS if framing else 1):
         moment = step % len(clip.times)
-        if stance is None:
+        if framing is None:
             yield torch.ones(3, PANEL, PANEL)
         else:
-            camera = stance.camera(moment, stance.azimuth + 2 * math.pi * step / STEPS)
+            camera = framing.camera(moment, framing.azimuth + 2 * math.pi * step / STEPS)
             yield over(reconstruction.at(clip.times[moment]), camera)
 
 
-def four_views(reconstruction: Reconstruction, clip: Clip, stance: Stance | None) -> Tensor:
-    """The side that the camera saw, the front, the other side and behind, at the clip's middle, [3, H, 4 PANEL]."""
-    if stance is None:
+def four_views(reconstruction: Reconstruction, clip: Clip, framing: Framing | None) -> Tensor:
+    """Draw the side that the camera saw, front, other side and behind, at the clip's middle time, [3, H, 4 PANEL]."""
+    if framing is None:
         titles, images = ["no Gaussians, or no camera"], [torch.ones(3, PANEL, PANEL)] * 4
     else:
         moment = len(clip.times) // 2
         splats = reconstruction.at(clip.times[moment])
-        sides = _sides(stance)
+        sides = _sides(framing)
         titles = list(sides)
-        images = [over(splats, stance.camera(moment, azimuth)) for azimuth in sides.values()]
+        images = [over(splats, framing.camera(moment, azimuth)) for azimuth in sides.values()]
     return torch.cat([header(titles, 4 * PANEL), torch.cat(images, dim=2)], dim=1)
 
 
-def _sides(stance: Stance) -> dict[str, float]:
-    """Title -> azimuth of each still view."""
+def _sides(framing: Framing) -> dict[str, float]:
+    """Return title -> azimuth of each still view."""
     quarter = math.pi / 2
-    if not stance.known:
+    if not framing.known:
         return {
-            "input camera": stance.azimuth, "a quarter turn on": stance.azimuth + quarter,
-            "half a turn": stance.azimuth + 2 * quarter, "three quarters": stance.azimuth + 3 * quarter,
+            "input camera": framing.azimuth, "a quarter turn on": framing.azimuth + quarter,
+            "half a turn": framing.azimuth + 2 * quarter, "three quarters": framing.azimuth + 3 * quarter,
         }  # fmt: skip
-    is_left = math.sin(stance.azimuth) > 0
+    is_left = math.sin(framing.azimuth) > 0
     seen, other = ("left", "right") if is_left else ("right", "left")
     side = quarter if is_left else -quarter
-    said = " (the camera's)" if stance.steady >= STEADY else ""
+    said = " (the camera's)" if framing.steady >= STEADY else ""
     return {f"{seen} side{said}": side, "front": 0.0, f"{other} side": -side, "behind": math.pi}
 
 
 def _axes(
     reconstruction: Reconstruction, clip: Clip, cameras: list[Camera], middles: Tensor, up: Tensor | None
 ) -> tuple[Tensor, bool]:
-    """Left, up and ahead at each moment, [T, 3, 3], and whether they are the animal's own."""
+    """Return left, up and ahead at each time, [T, 3, 3], and whether they are the animal's own."""
     if isinstance(reconstruction, Articulated):
         worlds = torch.stack([reconstruction.articulation(time)[1][:3, :3].double().cpu() for time in clip.times])
         return normalize(worlds, dim=1).transpose(1, 2), True
@@ -152,25 +152,20 @@ def _axes(
     return torch.stack((torch.linalg.cross(up, ahead), up, ahead)).expand(count, 3, 3), False
 
 
-def _per_moment(cameras: list[Camera], clip: Clip) -> list[Camera]:
-    """A camera for each moment; where some are unknown, the first one stands for them."""
-    return cameras if len(cameras) == len(clip.times) else [cameras[0]]
-
-
 def _solid(splats: Splats) -> tuple[Tensor, Tensor]:
-    """Centres and reach of the Gaussians that can be seen, float64, [n, 3] and [n]; of all where none can."""
+    """Return centres and radii of the visible Gaussians, float64, [n, 3] and [n]; of all where none is visible."""
     shown = splats.opacities.detach().cpu() > 0.1
-    means, reach = splats.means.detach().double().cpu(), 2 * splats.scales.detach().double().cpu().amax(-1)
-    return (means[shown], reach[shown]) if bool(shown.any()) else (means, reach)
+    means, radii = splats.means.detach().double().cpu(), 2 * splats.scales.detach().double().cpu().amax(-1)
+    return (means[shown], radii[shown]) if bool(shown.any()) else (means, radii)
 
 
 def _smooth(middles: Tensor) -> Tensor:
-    """A straight line through the neighbouring moments of each, so that a stride does not shake the picture, [T, 3]."""
+    """Fit a line through the neighbouring times of each centre, so that a stride does not shake the picture, [T, 3]."""
     window = min(WINDOW, len(middles) - 1 + len(middles) % 2)
     return middles if window < 3 else torch.from_numpy(savgol_filter(middles.numpy(), window, 1, axis=0))
 
 
 def _box_middle(cloud: Tensor) -> Tensor:
-    """The middle of the box that holds all but stray points, [3]."""
+    """Return the centre of the box that holds all but stray points, [3]."""
     ends = torch.tensor(((1 - INSIDE) / 2, (1 + INSIDE) / 2), dtype=torch.float64)
     return torch.quantile(cloud, ends, dim=0).mean(0)

@@ -12,7 +12,6 @@ from extractors import LinearNetwork, LinearVideoNetwork, SquaredError
 
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig
 from rewild4d.cameras.input_view import world_up
-from rewild4d.cameras.rendering import render
 from rewild4d.contracts import Reconstruction
 from rewild4d.errors import UserError
 from rewild4d.evaluation import measuring, novel_views
@@ -213,14 +212,14 @@ def test_the_orbit_of_a_still_camera_keeps_its_elevation(case: Case, degrees: in
 
 
 def test_a_ball_against_itself_is_at_distance_zero(case: Case) -> None:
-    still = novel_views._Orbit(Ball(), case.clip, 1.0, render, NovelViews(), None)
+    still = novel_views._Orbit(Ball(), case.clip, 1.0, NovelViews(), None)
     frames = []
     for i, frame in enumerate(case.clip.frames):
         image = still.image(i, i)
         frames.append(replace(frame, rgb=image, mask=torch.ones_like(image[:1])))
     clip: Clip = replace(case.clip, frames=tuple(frames))
     (found,), sets = novel_views.novel_view_distances(
-        Ball(), clip, NovelViews(frames=4), names=("kid_v",), background=1.0, render=render,
+        Ball(), clip, NovelViews(frames=4), names=("kid_v",), background=1.0,
         images=LinearNetwork(), videos=None, log=quiet,
     )  # fmt: skip
     assert found.value == pytest.approx(0, abs=1e-6) and found.n == 16 * min(4, len(frames))
@@ -239,7 +238,7 @@ def test_a_nan_at_a_moment_that_is_not_held_out_is_one_sentence(case: Case, name
 
     with pytest.raises(UserError, match=f"^the reconstruction's {name} at 0.0000 s hold a NaN or an infinite value.$"):
         novel_views.novel_view_distances(
-            Broken(), case.clip, NovelViews(frames=2), names=("kid_v",), background=1.0, render=render,
+            Broken(), case.clip, NovelViews(frames=2), names=("kid_v",), background=1.0,
             images=LinearNetwork(), videos=None, log=quiet,
         )  # fmt: skip
 

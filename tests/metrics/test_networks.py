@@ -16,7 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from rewild4d.metrics import features
-from rewild4d.metrics.features import Lpips, i3d, inception
+from rewild4d.metrics.features import I3dFeatures, InceptionFeatures, Lpips
 from rewild4d.metrics.networks import i3d as i3d_network
 from rewild4d.metrics.networks.inception import Inception
 from rewild4d.metrics.networks.layers import check_range, exact_float32, normalise
@@ -103,7 +103,7 @@ def assert_features(found: Tensor, mean: float, length: float, first: tuple[floa
 @pytest.mark.parametrize("how", ["clean", "tf1", "bilinear-antialias"])
 def test_inception_gives_the_recorded_features(how: str) -> None:
     need("inception-fid")
-    extractor = inception(how)
+    extractor = InceptionFeatures(how)
     for pixel, recorded in CONSTANT.items():
         size = 299 if how == "clean" else 40  # a constant stays constant under every resize
         assert_features(extractor(torch.full((1, 3, size, size), pixel / 255)), *recorded)
@@ -118,15 +118,15 @@ def test_inception_gives_the_recorded_features_of_a_ramp() -> None:
 
 def test_inception_reads_a_rendering_as_its_png() -> None:
     need("inception-fid")
-    extractor, image = inception(tap=64), torch.rand(2, 3, 50, 70, generator=torch.Generator().manual_seed(0))
+    extractor, image = InceptionFeatures(tap=64), torch.rand(2, 3, 50, 70, generator=torch.Generator().manual_seed(0))
     assert torch.equal(extractor(image), extractor((image * 255).round() / 255))
     assert (extractor.name, extractor.dimension, extractor.resize) == ("inception-fid-64", 64, "clean")
     assert extractor(image).shape == (2, 64)
     torch.testing.assert_close(extractor(image)[1:], extractor(image[1:]), rtol=1e-5, atol=1e-6)
     with pytest.raises(ValueError, match="expected a tap out of 64, 192, 768, 2048, got 1000"):
-        inception(tap=1000)
+        InceptionFeatures(tap=1000)
     with pytest.raises(ValueError, match="expected a resize out of clean, tf1, bilinear-antialias, got nearest"):
-        inception("nearest")
+        InceptionFeatures("nearest")
     with pytest.raises(ValueError, match=r"shape \[B, 3, H, W\], got \(2, 1, 50, 70\)"):
         extractor(image[:, :1])
 
@@ -151,7 +151,7 @@ def in_batches(extractor: Callable[[Tensor], Tensor], images: Tensor) -> Tensor:
 def test_fid_of_torchmetrics_doctest() -> None:
     """torchmetrics 1.9, FrechetInceptionDistance(feature=64), seed 42: tensor(12.6388)."""
     images = doctest_images(42)
-    extractor = inception("bilinear-antialias", tap=64)
+    extractor = InceptionFeatures("bilinear-antialias", tap=64)
     x, y = (in_batches(extractor, part).numpy() for part in images)
     s1, s2 = np.cov(x, rowvar=False), np.cov(y, rowvar=False)
     root = np.sqrt(np.linalg.eigvals(s1 @ s2).real.clip(0)).sum()
@@ -166,7 +166,7 @@ def test_kid_of_torchmetrics_doctest() -> None:
     """torchmetrics 1.9, KernelInceptionDistance(subset_size=50), seed 42: (tensor(0.0312), tensor(0.0025))."""
     images = doctest_images(42)
     state = torch.get_rng_state()
-    extractor = inception("bilinear-antialias")
+    extractor = InceptionFeatures("bilinear-antialias")
     x, y = (in_batches(extractor, part) for part in images)
     torch.set_rng_state(state)
     values = []
@@ -181,7 +181,7 @@ def test_kid_of_torchmetrics_doctest() -> None:
 def test_i3d_sets_black_and_white_apart_as_tensorflows() -> None:
     """Squared distance of the logits at T frames; at T = 30 TensorFlow's own network gives 151.39244."""
     need("i3d-k400")
-    extractor = i3d("square")
+    extractor = I3dFeatures("square")
     for frames, recorded in {
         10: 569.7713012695312,
         16: 152.90162658691406,
@@ -195,7 +195,7 @@ def test_i3d_sets_black_and_white_apart_as_tensorflows() -> None:
 
 def test_i3d_says_which_clips_it_cannot_read() -> None:
     need("i3d-k400")
-    extractor = i3d()
+    extractor = I3dFeatures()
     assert (extractor.name, extractor.dimension, extractor.minimum_frames) == ("i3d-k400", 400, 9)
     with pytest.raises(ValueError, match="at least 9 frames a clip for I3D, got 8"):
         extractor(torch.zeros(1, 8, 3, 16, 16))
@@ -204,7 +204,7 @@ def test_i3d_says_which_clips_it_cannot_read() -> None:
     with pytest.raises(ValueError, match=r"expected values in \[0, 1\], got 0 to 255"):
         extractor(torch.cat((torch.zeros(1, 9, 3, 16, 16), torch.full((1, 9, 3, 16, 16), 255.0))))
     with pytest.raises(ValueError, match="expected a resize out of short-side-crop, square, got clean"):
-        i3d("clean")
+        I3dFeatures("clean")
     assert extractor(torch.zeros(1, 9, 3, 20, 16)).shape == (1, 400)
 
 
@@ -320,6 +320,6 @@ def test_without_weights_every_network_says_how_to_get_them(monkeypatch: pytest.
         raise WeightsMissing
 
     monkeypatch.setattr(features, "load_weights", nowhere)
-    for build in (inception, i3d, lambda: Lpips("alex"), lambda: Lpips("vgg")):
+    for build in (InceptionFeatures, I3dFeatures, lambda: Lpips("alex"), lambda: Lpips("vgg")):
         with pytest.raises(WeightsMissing, match="weights missing, run: rewild4d-bench weights fetch"):
             build()

@@ -292,7 +292,7 @@ def test_nothing_is_scored_as_before_and_costs_one_call_a_set(case: Case) -> Non
     def score() -> list[Any]:
         return novel_views.novel_view_distances(
             EmptyReconstruction(), case.clip, settings, names=names.SETS, background=1.0,
-            render=render, images=images, videos=videos, log=lambda *_: None,
+            images=images, videos=videos, log=lambda *_: None,
         )[0]  # fmt: skip
 
     found = {one.name.split(" [")[0]: one for one in score()}
@@ -303,10 +303,10 @@ def test_nothing_is_scored_as_before_and_costs_one_call_a_set(case: Case) -> Non
     y = video_features([[[reference[i] for i in window] for window in windows]], LinearVideoNetwork())
     assert found["KVD-F"].value == found["KVD-Diag"].value == kid(x, y).value
     assert found["FVD-F"].value == frechet(x, y, name="", conditions=WHITE).value
-    still = image_features([[white] * (16 * len(novel_views._spread(len(reference), 3)))], LinearNetwork())
+    still = image_features([[white] * (16 * len(novel_views.evenly_spaced(len(reference), 3)))], LinearNetwork())
     assert found["KID-V"].value == kid(still, image_features([reference], LinearNetwork())).value
     calls = images.calls, videos.calls
     assert videos.calls == 2 + len(windows) and score() and videos.calls == calls[1] + 2
-    orbit = novel_views._Orbit(EmptyReconstruction(), case.clip, 1.0, render, NovelViews(), None)
+    orbit = novel_views._Orbit(EmptyReconstruction(), case.clip, 1.0, NovelViews(), None)
     color, alpha = render(EmptyReconstruction().at(0.0), orbit.cameras[3])
     assert torch.equal(orbit.image(3, 0), (color + (1 - alpha) * 1.0).clamp(0, 1))

@@ -191,8 +191,10 @@ def demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Spec:
     monkeypatch.setattr(run_table, "find_spec", lambda _: found)
     monkeypatch.setattr(table, "find_spec", lambda _: found)
     monkeypatch.setattr(run_table, "open_dataset", lambda *_: (tmp_path, OneCase(case)))
-    own = planning.protocol_of
-    monkeypatch.setattr(planning, "protocol_of", lambda *given: msgspec.structs.replace(own(*given), floors=("empty",)))
+    own = run_table.find_protocol
+    monkeypatch.setattr(
+        run_table, "find_protocol", lambda *given: msgspec.structs.replace(own(*given), floors=("empty",))
+    )
     return found
 
 

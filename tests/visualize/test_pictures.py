@@ -25,7 +25,7 @@ from rewild4d.visualize import original_view, turntable
 from rewild4d.visualize.original_view import original_frames, save_original_view
 from rewild4d.visualize.pictures import PANEL, over
 from rewild4d.visualize.run_pictures import save_pictures
-from rewild4d.visualize.turntable import Stance, find_stance, four_views, turn
+from rewild4d.visualize.turntable import Framing, find_framing, four_views, orbit_frames
 
 pytestmark = pytest.mark.usefixtures("cache")
 
@@ -68,16 +68,14 @@ def test_readers_give_the_whole_frames_of_all_moments(tmp_path: Path) -> None:
 def test_the_matte_lies_where_the_animal_was(tmp_path: Path) -> None:
     clip = footage(tmp_path)[1]
     for frame in clip.frames[::6]:
-        place = original_view._Place.of(frame)
-        matte = place.mask(frame)[0].numpy() > 0.5
+        assert frame.crop is not None
+        matte = original_view._original_matte(frame.mask, frame.crop)[0].numpy() > 0.5
         true = moving.mask(round(frame.time * 10), step=0.5) > 0
-        assert (place.width, place.height) == moving.SIZE
+        assert matte.shape == moving.SIZE[::-1]
         assert (matte & true).sum() / (matte | true).sum() > 0.93
-    large = replace(clip.frames[0], crop=Crop(-200.0, 0.0, 2000.0, 3840, 2161))
-    reduced = original_view._Place.of(large)
-    assert (reduced.width, reduced.height) == (960, 540)
-    matte = reduced.mask(replace(large, mask=torch.ones(1, 64, 64)))
-    assert int((matte[0, 270] > 0.5).sum()) == pytest.approx(1800 / 4, abs=2), "the crop reaches 200 pixels over"
+    large = original_view._original_matte(torch.ones(1, 64, 64), Crop(-200.0, 0.0, 2000.0, 3840, 2161))
+    assert large.shape == (1, 540, 960)
+    assert int((large[0, 270] > 0.5).sum()) == pytest.approx(1800 / 4, abs=2), "the crop reaches 200 pixels over"
 
 
 def test_the_render_takes_the_animals_place_and_nothing_else(tmp_path: Path) -> None:
@@ -195,14 +193,14 @@ def panels(image: torch.Tensor) -> list[torch.Tensor]:
 def test_four_sides_begin_with_the_one_the_camera_saw(toward: tuple[float, float, float]) -> None:
     cameras = seen_from(toward)
     clip = clip_of(cameras, CROP)
-    stance = find_stance(Signpost(cameras), clip, None)
-    assert stance is not None and stance.known
+    framing = find_framing(Signpost(cameras), clip, None)
+    assert framing is not None and framing.known
     seen = "left" if toward[0] > 0 else "right"
     other = "right" if seen == "left" else "left"
-    titles = list(turntable._sides(stance))
+    titles = list(turntable._sides(framing))
     assert titles == [f"{seen} side (the camera's)", "front", f"{other} side", "behind"]
-    assert next(iter(turntable._sides(replace(stance, steady=0.6)))) == f"{seen} side", "it walked around"
-    side, front, far, behind = panels(four_views(Signpost(cameras), clip, stance))
+    assert next(iter(turntable._sides(replace(framing, steady=0.6)))) == f"{seen} side", "it walked around"
+    side, front, far, behind = panels(four_views(Signpost(cameras), clip, framing))
     red = [middle_of(panel, 0) for panel in (side, far)]
     # From its right an animal looks to the right, from its left to the left.
     ahead = 1 if seen == "right" else -1
@@ -219,10 +217,10 @@ def test_four_sides_begin_with_the_one_the_camera_saw(toward: tuple[float, float
 def test_a_skinned_shape_brings_its_own_axes() -> None:
     cameras = seen_from((-1.0, 0.2, 0.0))
     posed = Posed(cameras, TURNED)
-    stance = find_stance(posed, clip_of(cameras, None), None)
-    assert stance is not None and stance.known
-    torch.testing.assert_close(stance.axes[0], TURNED.T)
-    (side, *_) = panels(four_views(posed, clip_of(cameras, None), stance))
+    framing = find_framing(posed, clip_of(cameras, None), None)
+    assert framing is not None and framing.known
+    torch.testing.assert_close(framing.axes[0], TURNED.T)
+    (side, *_) = panels(four_views(posed, clip_of(cameras, None), framing))
     green = middle_of(side, 1)
     assert green is not None and green[1] < PANEL / 2 - 15
 
@@ -230,19 +228,19 @@ def test_a_skinned_shape_brings_its_own_axes() -> None:
 def test_where_nobody_knows_what_is_ahead_it_says_quarters() -> None:
     cameras = seen_from((-1.0, 0.5, 0.4))
     clip = clip_of(cameras, None)
-    stance = find_stance(Signpost(cameras), clip, UP)
-    assert stance is not None and not stance.known and stance.azimuth == pytest.approx(0, abs=0.05)
-    torch.testing.assert_close(stance.axes[0, 1], UP)
-    torch.testing.assert_close(stance.axes[0] @ stance.axes[0].T, torch.eye(3).double())
-    assert float(torch.linalg.det(stance.axes[0])) == pytest.approx(1)
+    framing = find_framing(Signpost(cameras), clip, UP)
+    assert framing is not None and not framing.known and framing.azimuth == pytest.approx(0, abs=0.05)
+    torch.testing.assert_close(framing.axes[0, 1], UP)
+    torch.testing.assert_close(framing.axes[0] @ framing.axes[0].T, torch.eye(3).double())
+    assert float(torch.linalg.det(framing.axes[0])) == pytest.approx(1)
 
 
 def test_the_turn_starts_at_the_camera_follows_the_animal_and_closes() -> None:
     cameras = seen_from((-1.0, 0.3, 0.2), count=24)
     clip, post = clip_of(cameras, CROP), Signpost(cameras, step=0.1)
-    stance = find_stance(post, clip, None)
-    assert isinstance(stance, Stance)
-    images = list(turn(post, clip, stance))
+    framing = find_framing(post, clip, None)
+    assert isinstance(framing, Framing)
+    images = list(orbit_frames(post, clip, framing))
     assert len(images) == 72 and images[0].shape == (3, PANEL, PANEL)
     rows = []
     for image in images[::6]:
@@ -251,14 +249,14 @@ def test_the_turn_starts_at_the_camera_follows_the_animal_and_closes() -> None:
         assert dark[:, 1].min() > 2 and dark[:, 1].max() < PANEL - 3
         rows.append(float(dark[:, 0].mean()))
     assert max(rows) - min(rows) < PANEL / 8, "upright: it does not swing"
-    first = stance.camera(0, stance.azimuth).center - stance.middles[0]
-    given = cameras[0.0].center - stance.middles[0]
+    first = framing.camera(0, framing.azimuth).center - framing.middles[0]
+    given = cameras[0.0].center - framing.middles[0]
     assert float(first @ given / first.norm() / given.norm()) > 0.9
 
 
 def test_nothing_is_drawn_as_white(tmp_path: Path) -> None:
     case = tiny_case()
-    assert find_stance(EmptyReconstruction(), case.clip, None) is None
+    assert find_framing(EmptyReconstruction(), case.clip, None) is None
     names = save_pictures(EmptyReconstruction(), case.clip, case.truth, tmp_path)
     assert names == ["comparison.png", "input.mp4", "orbit.mp4", "orbit.png"]
     assert imageio.imread(tmp_path / "orbit.png").shape == (24 + PANEL, 4 * PANEL, 3)
