@@ -41,7 +41,7 @@ def available() -> bool:
         return True
     answer = cache_folder() / "kernels" / f"bfloat16-numba-{numba.__version__}-llvmlite-{llvmlite.__version__}"
     with contextlib.suppress(OSError):
-        return answer.read_text() == "yes"
+        return answer.read_text(encoding="utf-8") == "yes"
     child = [sys.executable, "-c", f"from {__name__} import probe; probe()"]
     works = subprocess.run(child, env=os.environ | {IN_PROBE: "1"}, capture_output=True).returncode == 0
     if not works:
