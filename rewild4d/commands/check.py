@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rewild4d.commands.options import DataFlags
 from rewild4d.commands.shared import open_dataset
 from rewild4d.config import parse_flags
-from rewild4d.contracts import Finding, Parts
+from rewild4d.contracts import Finding
 from rewild4d.errors import UserError
 
 DESCRIPTION = """Verify a data set's folder (every fault named, not only the first), or that a method keeps its
@@ -14,19 +15,12 @@ contract: same seed same result, save and load same pixels, resume, a clear erro
 SIGNS = {"ok": "ok     ", "warning": "warning", "error": "ERROR  "}
 
 
-@dataclass(frozen=True)
-class Options:
-    """Flags of `check`.
+@dataclass(frozen=True, kw_only=True)
+class CheckChoice:
+    """Flags that only `check` has.
 
     Attributes:
         dataset: whose layout to verify.
-        data: the folder; the built-in data where it is left out.
-        video: the same as --data, for a video file or a folder of frames (--dataset online).
-        masks: as for `run`.
-        parts: as for `run`.
-        start: as for `run`.
-        end: as for `run`.
-        fps: as for `run`.
         case: which videos to look at, names or patterns; the first few where it is left out.
         sheets: folder for contact sheets: pictures of the masks over their frames.
         method: verify this method instead.
@@ -34,17 +28,15 @@ class Options:
     """
 
     dataset: str | None = None
-    data: Path | None = None
-    video: Path | None = None
-    masks: Path | None = None
-    parts: Parts | None = None
-    start: float | None = None
-    end: float | None = None
-    fps: float | None = None
     case: tuple[str, ...] = ()
     sheets: Path = Path("check")
     method: str | None = None
     preset: str = "quick"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(DataFlags, CheckChoice):
+    """Flags of `check`."""
 
 
 def main(arguments: list[str]) -> int:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import tyro
 
+from rewild4d.commands.options import ComputeFlags
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError
 
@@ -12,26 +13,22 @@ DESCRIPTION = """Score saved reconstructions again, with the protocol that they 
 out what the method has seen), draw their pictures again and write their records anew."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """Flags of `evaluate`.
+@dataclass(frozen=True, kw_only=True)
+class EvaluateChoice:
+    """Flags that only `evaluate` has.
 
     Attributes:
         runs: folders of single runs, each with a record.json and a reconstruction.
         data: where the data is now, if it was moved since.
-        device: auto, cpu or cuda.
-        rasterizer: what renders: auto, numba (CPU), triton or gsplat (CUDA), or reference (small scenes only).
-        kernels: auto (fused CPU kernels where they fit) or torch (plain torch everywhere, to try edited code); auto, or
-            what $REWILD4D_KERNELS says, where it is left out.
-        json: print the records as a JSON array, and nothing else, to standard output.
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     data: Path | None = None
-    device: str = "auto"
-    rasterizer: str = "auto"
-    kernels: str | None = None
-    json: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(ComputeFlags, EvaluateChoice):
+    """Flags of `evaluate`."""
 
 
 def main(arguments: list[str]) -> int:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rewild4d.commands.options import RunFlags
 from rewild4d.commands.shared import (
     check_numbers,
     check_seeds,
@@ -17,7 +18,6 @@ from rewild4d.commands.shared import (
     require_writable,
 )
 from rewild4d.config import load_preset, parse_flags
-from rewild4d.contracts import Parts
 from rewild4d.errors import UserError
 from rewild4d.evaluation.protocol import find_protocol
 from rewild4d.priors.config import Use
@@ -34,21 +34,13 @@ Finished runs are skipped and a killed one resumes. Without --data the built-in 
 `run --table NAME` runs all that a table needs instead; its flags: `run --table NAME --help`."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """Flags of `run`.
+@dataclass(frozen=True, kw_only=True)
+class RunChoice:
+    """Flags that only `run` has.
 
     Attributes:
         method: which method (see `list`).
         dataset: which data set's layout (see `list`).
-        data: one animal's folder or a folder of animals; the built-in animals where it is left out.
-        video: the same as --data, for a video file or a folder of frames (--dataset online).
-        masks: of the animal: a folder or, for online, a video; in place of the data set's own where it has some.
-        parts: of masks in several parts: all, or main, the one that goes on from the frame before; where left out,
-            main if many masks took in a second animal that stands apart (auto).
-        start: seconds from where on frames of the video are used.
-        end: seconds up to which they are used.
-        fps: how many of them a second; of a folder of frames the rate at which it was taken.
         case: names or patterns of cases ("wolf/Run", "wolf/*"); all (of real videos: quadrupeds) where it is left out.
         protocol: what is held out and measured (see `list`); the data set's default where it is left out.
         preset: size of the effort: quick, standard or paper; of `ours` also beyond, standard with what is better than
@@ -61,26 +53,10 @@ class Options:
         mapping: which keypoint is which point of the template: aptv2, badja, superanimal-quadruped or a .toml file.
         use_keypoints: frames whose keypoints the prior's fit sees: all; half (the rest is scored); none (all are
             scored). Where it is left out: all of aptv2's and of a file's, none of BADJA's beside davis.
-        device: auto, cpu or cuda.
-        rasterizer: what renders: auto, numba (CPU), triton or gsplat (CUDA), or reference (small scenes only).
-        kernels: auto (fused CPU kernels where they fit) or torch (plain torch everywhere, to try edited code); auto, or
-            what $REWILD4D_KERNELS says, where it is left out.
-        jobs: runs at a time (a case, a method and a seed each); 0 is one for each processor core (one in all on a GPU).
-        threads: of torch in each run; other numbers than 1 may change the last digits. Our own kernels take idle cores
-            unasked, which changes nothing but the time.
-        out: folder for runs.
-        json: print the records as a JSON array, and nothing else, to standard output.
     """
 
     method: str = "ours"
     dataset: str = "artemis"
-    data: Path | None = None
-    video: Path | None = None
-    masks: Path | None = None
-    parts: Parts | None = None
-    start: float | None = None
-    end: float | None = None
-    fps: float | None = None
     case: tuple[str, ...] = ()
     protocol: str | None = None
     preset: str = "quick"
@@ -89,13 +65,11 @@ class Options:
     keypoints: Path | None = None
     mapping: str | None = None
     use_keypoints: Use | None = None
-    device: str = "auto"
-    rasterizer: str = "auto"
-    kernels: str | None = None
-    jobs: int = 0
-    threads: int = 1
-    out: Path = Path("runs")
-    json: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(RunFlags, RunChoice):
+    """Flags of `run`."""
 
 
 def main(arguments: list[str]) -> int:

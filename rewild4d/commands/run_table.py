@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
 
+from rewild4d.commands.options import RunFlags
 from rewild4d.commands.shared import (
     check_numbers,
     check_seeds,
@@ -20,7 +20,7 @@ from rewild4d.commands.shared import (
     require_writable,
 )
 from rewild4d.config import parse_flags
-from rewild4d.contracts import DatasetReader, Parts
+from rewild4d.contracts import DatasetReader
 from rewild4d.errors import UserError
 from rewild4d.evaluation.protocol import Protocol, find_protocol
 from rewild4d.leaderboard.specs import Spec, find_spec, load_specs
@@ -35,56 +35,30 @@ DESCRIPTION = """Fit what a table of leaderboard/tables (see `list`) needs and h
 print it. Finished runs are skipped and a killed one resumes."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """Flags of `run --table`.
+@dataclass(frozen=True, kw_only=True)
+class TableChoice:
+    """Flags that only `run --table` has.
 
     Attributes:
         table: which one.
-        data: one animal's folder or a folder of animals; the built-in animals where it is left out.
-        video: the same as --data, for a video file or a folder of frames (a protocol of online).
-        masks: of the animal: a folder or, for online, a video; in place of the data set's own where it has some.
-        parts: of masks in several parts: all, or main, the one that goes on from the frame before; where left out,
-            main if many masks took in a second animal that stands apart (auto).
-        start: seconds from where on frames of the video are used.
-        end: seconds up to which they are used.
-        fps: how many of them a second; of a folder of frames the rate at which it was taken.
         case: names or patterns of cases ("wolf/Run", "wolf/*"); all that the table wants where it is left out.
         protocol: instead of the table's, where it has one condition; one of another data set brings that data set.
         preset: size of the effort: quick, standard or paper; the table's where it is left out.
         seeds: one run for each; the table's where they are left out.
-        device: auto, cpu or cuda.
-        rasterizer: what renders: auto, numba (CPU), triton or gsplat (CUDA), or reference (small scenes only).
-        kernels: auto (fused CPU kernels where they fit) or torch (plain torch everywhere, to try edited code); auto, or
-            what $REWILD4D_KERNELS says, where it is left out.
-        jobs: runs at a time; 0 is one for each processor core (one in all on a GPU).
-        threads: of torch in each run; other numbers than 1 may change the last digits. Our own kernels take idle cores
-            unasked, which changes nothing but the time.
-        out: folder for runs.
         plan: print what would be run, and run nothing.
-        json: print the records as a JSON array, and nothing else, to standard output.
     """
 
     table: str
-    data: Path | None = None
-    video: Path | None = None
-    masks: Path | None = None
-    parts: Parts | None = None
-    start: float | None = None
-    end: float | None = None
-    fps: float | None = None
     case: tuple[str, ...] = ()
     protocol: str = ""
     preset: str = ""
     seeds: tuple[int, ...] = ()
-    device: str = "auto"
-    rasterizer: str = "auto"
-    kernels: str | None = None
-    jobs: int = 0
-    threads: int = 1
-    out: Path = Path("runs")
     plan: bool = False
-    json: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(RunFlags, TableChoice):
+    """Flags of `run --table`."""
 
 
 def main(arguments: list[str]) -> int:

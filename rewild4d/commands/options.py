@@ -1,0 +1,66 @@
+"""Share the flags that several commands have."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rewild4d.contracts import Parts
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataFlags:
+    """Flags that say which data is read.
+
+    Attributes:
+        data: one animal's folder or a folder of animals; the built-in animals where it is left out.
+        video: the same as --data, for a video file or a folder of frames (--dataset online).
+        masks: of the animal: a folder or, for online, a video; in place of the data set's own where it has some.
+        parts: of masks in several parts: all, or main, the one that goes on from the frame before; where left out,
+            main if many masks took in a second animal that stands apart (auto).
+        start: first second of the video that is used.
+        end: last second of the video that is used.
+        fps: frames per second that are used; of a folder of frames the rate at which it was taken.
+    """
+
+    data: Path | None = None
+    video: Path | None = None
+    masks: Path | None = None
+    parts: Parts | None = None
+    start: float | None = None
+    end: float | None = None
+    fps: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComputeFlags:
+    """Flags that say what computes.
+
+    Attributes:
+        device: auto, cpu or cuda.
+        rasterizer: what renders: auto, numba (CPU), triton or gsplat (CUDA), or reference (small scenes only).
+        kernels: auto (fused CPU kernels where they fit) or torch (plain torch everywhere, to try edited code); auto, or
+            what $REWILD4D_KERNELS says, where it is left out.
+        json: print the records as a JSON array, and nothing else, to standard output.
+    """
+
+    device: str = "auto"
+    rasterizer: str = "auto"
+    kernels: str | None = None
+    json: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFlags(ComputeFlags, DataFlags):
+    """Flags of commands that fit. Help lists the flags of later base classes first.
+
+    Attributes:
+        jobs: runs at a time (a case, a method and a seed each); 0 is one for each processor core (one in all on a GPU).
+        threads: of torch in each run; other numbers than 1 may change the last digits. Our own kernels take idle cores
+            unasked, which changes nothing but the time.
+        out: folder for runs.
+    """
+
+    jobs: int = 0
+    threads: int = 1
+    out: Path = Path("runs")
