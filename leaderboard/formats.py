@@ -7,9 +7,8 @@ pandas writes the CSV. Its Styler has no place for rules between kinds of rows, 
 import html as escaping
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from rewild4d.leaderboard.layout import Cell, Row, Table
 
@@ -98,24 +97,14 @@ def tidy_csv(table: Table) -> str:
 FORMATS: dict[str, Callable[[Table], str]] = {"md": markdown, "latex": latex, "html": html, "csv": tidy_csv}
 
 
-@dataclass(frozen=True)
-class _Style:
-    """How a format writes the parts of a table that hold text; patterns have one %s.
-
-    Attributes:
-        best, second: around a ranked figure.
-        spread: behind a figure.
-        number: of a note.
-        space: before that number.
-        summary: around the title of a row that sums up others.
-        text: escapes what has a meaning in the format.
-    """
+class _Style(NamedTuple):
+    """Patterns of a format, one %s each: around a figure, behind it, a note's number, around the title of a mean."""
 
     best: str
     second: str
     spread: str
     number: str
-    space: str
+    before_number: str
     summary: str
     text: Callable[[str], str]
 
@@ -137,7 +126,7 @@ class _Style:
         return figure + (self.spread % cell.spread if cell.spread else "") + self._numbers(table.number(cell.note))
 
     def _numbers(self, numbers: str) -> str:
-        return self.space + self.number % numbers if numbers else ""
+        return self.before_number + self.number % numbers if numbers else ""
 
 
 def _latex_groups(table: Table) -> list[str]:
