@@ -214,7 +214,7 @@ def _middle(clouds: Sequence[Points]) -> tuple[Points, float]:
 
 
 class _Search:
-    """Iterated closest points over the moments of a sequence."""
+    """Iterated closest points over the times of a sequence."""
 
     def __init__(self, pairs: list[tuple[Points, Points]], trim: float, clamp: tuple[float, float], seed: int) -> None:
         self._clouds = [(Cloud(x), Cloud(y)) for x, y in pairs]

@@ -195,7 +195,7 @@ def describe(
     conditions: Conditions,
     interval: tuple[float, float] | None = None,
 ) -> Distance:
-    """Build a distance with what its two sets know of themselves."""
+    """Build a distance with the metadata of its two sets."""
     return Distance(
         name=name if prediction.extractor in ORIGINAL else f"{name} [{prediction.extractor}]",
         value=value,

@@ -74,7 +74,7 @@ def pool(parts: Sequence[Compared]) -> Compared:
         parts: of one kind, from one network and resize rule, clips of one length, on one background and crop.
 
     Raises:
-        ValueError: parts that differ; the text says in what.
+        ValueError: parts that differ in any of these.
 
     Example:
         >>> one = Features(torch.zeros(2, 1), torch.zeros(2, dtype=torch.int64), "toy", "", "")
@@ -121,7 +121,7 @@ def write_features(sets: Sequence[Compared], path: Path) -> str:
 
 
 def read_features(path: Path, expected: str | None = None) -> dict[str, Compared]:
-    """Read what `write_features` wrote, by kind; every part is one sequence.
+    """Read the file of `write_features`, by kind; every part is one sequence.
 
     Args:
         path: of the file.

@@ -1,7 +1,7 @@
 """Compute distances between two sets of clips by the features of a video network: FVD, FVD-F, FVD-Diag, KVD, I3D-dist.
 
 An image matrix M[v][f] holds view v at frame f of one sequence. The names are SV4D's (Xie et al. 2025, sec. 4), who
-released no code for them; what the paper leaves open is fixed here:
+released no code for them; definitions that the paper leaves open are fixed here:
   FVD-F     one clip a view: M[v, :]
   FVD-Diag  one clip a start view: M[(v0 + i) mod V, i], the camera advancing one view a frame around a closed orbit
 All clips of all sequences are pooled into one distance, which publishes n, m and T. FVD (Unterthiner et al. 2018) is
@@ -96,7 +96,7 @@ def video_features(
         >>> found.values[:, 0].tolist(), found.frames
         ([0.0, 1.0], 5)
     """
-    if reason := unfit(sequences, sequences, extractor):
+    if reason := incomparable(sequences, sequences, extractor):
         raise ValueError(reason)
     rows, groups = [], []
     total = sum(map(len, sequences))
@@ -113,8 +113,10 @@ def video_features(
     return Features(values, ids, extractor.name, extractor.digest, extractor.resize, frames)
 
 
-def unfit(prediction: Sequence[Sequence[Images]], truth: Sequence[Sequence[Images]], extractor: VideoExtractor) -> str:
-    """Return why a network cannot compare two sets of clips, or "": only clips of equal length compare."""
+def incomparable(
+    prediction: Sequence[Sequence[Images]], truth: Sequence[Sequence[Images]], extractor: VideoExtractor
+) -> str:
+    """Return why a network cannot compare two sets of clips, or "": lengths have to be equal."""
     lengths = sorted({len(clip) for side in (prediction, truth) for clips in side for clip in clips})
     if len(lengths) > 1:
         found = ", ".join(map(str, lengths))
@@ -154,7 +156,7 @@ def clip_distances(
         [3.0, 7.0]
     """
     names = [f"FVD{suffix}", f"KVD{suffix}", *([f"KVD{suffix}-u", I3D_DIST] if paired else [])]
-    if reason := unfit(prediction, truth, extractor):
+    if reason := incomparable(prediction, truth, extractor):
         x, y = (_nothing(clips, extractor) for clips in (prediction, truth))
         return [describe(name, None, x, y, estimator="", notes=[reason], conditions=conditions) for name in names]
     counts = [sum(map(len, side)) for side in (prediction, truth)]
@@ -172,7 +174,7 @@ def feature_distances(
     conditions: Conditions = Conditions(),
     seed: int = 0,
 ) -> list[Distance]:
-    """Compute what `clip_distances` does from features.
+    """Compute the distances of `clip_distances` from features.
 
     Args:
         prediction: of the clips, [n, D].

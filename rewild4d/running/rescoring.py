@@ -81,7 +81,7 @@ def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: s
             raise UserError(f"{place}: the {name} of {record.case} is not the one that {folder} was fitted to.")
     reconstruction = load_method(record.method).load(saved, device)
     begin = time.perf_counter()
-    shown = provenance.shown_of(clip, record.prior)
+    shown = provenance.shown_clip(clip, record.prior)
     progress = Progress(f"{record.case}: refine on held-out frames")
     reconstruction, clip, truth = ready_to_score(reconstruction, clip, truth, shown, progress)
     progress.close()
