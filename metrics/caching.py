@@ -58,8 +58,8 @@ def cached_features(
 ) -> Features:
     """Compute features of a reference once on a machine, for every method and seed that is compared with it.
 
-    They are stored in the cache folder, under a digest of the pixels, the network and all that decides the last bits of its
-    arithmetic (torch, device, processor, threads), so a cached number equals a computed one.
+    They are stored in the cache folder, under a digest of the pixels, the network and all that decides the last bits of
+    its arithmetic (torch, device, processor, threads), so a cached number equals a computed one.
 
     Args:
         network: image or video extractor.
