@@ -18,7 +18,7 @@ from rewild4d.metrics.samples import Features
 class CachedNetwork:
     """Cache a network's outputs for its last inputs, so that equal inputs pass only once.
 
-    Example:
+    Examples:
         >>> class Sum:
         ...     name, digest, resize = "sum", "", "none"
         ...     def __call__(self, images):

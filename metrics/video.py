@@ -58,7 +58,7 @@ class MatrixClip:
 def frame_clips(matrix: ImageMatrix) -> list[MatrixClip]:
     """Return the clips of FVD-F: every view over all frames, M[v, :].
 
-    Example:
+    Examples:
         >>> [clip.views for clip in frame_clips(torch.zeros(2, 3, 3, 4, 4))]
         [(0, 0, 0), (1, 1, 1)]
     """
@@ -69,7 +69,7 @@ def frame_clips(matrix: ImageMatrix) -> list[MatrixClip]:
 def diagonal_clips(matrix: ImageMatrix) -> list[MatrixClip]:
     """Return the clips of FVD-Diag: one view further a frame, M[(v0 + i) mod V, i]; the orbit must close.
 
-    Example:
+    Examples:
         >>> [clip.views for clip in diagonal_clips(torch.zeros(2, 3, 3, 4, 4))]
         [(0, 1, 0), (1, 0, 1)]
     """
@@ -90,7 +90,7 @@ def video_features(
     Raises:
         ValueError: clips of differing or too small T, or an image that `require_image` refuses.
 
-    Example:
+    Examples:
         >>> from rewild4d.metrics.samples import MeanColor
         >>> found = video_features([[torch.zeros(5, 3, 4, 4)], [torch.ones(5, 3, 4, 4)]], MeanColor())
         >>> found.values[:, 0].tolist(), found.frames
@@ -149,7 +149,7 @@ def clip_distances(
         progress: called after every clip.
         seed: of the bootstrap over sequences.
 
-    Example:
+    Examples:
         >>> from rewild4d.metrics.samples import MeanColor
         >>> black, white = torch.zeros(9, 3, 4, 4), torch.ones(9, 3, 4, 4)
         >>> [one.value for one in clip_distances([[black, black]], [[white, white]], MeanColor(), paired=False)]
@@ -199,7 +199,7 @@ def fvd_f(
 
     Settings are the keywords of `clip_distances` except the suffix.
 
-    Example:
+    Examples:
         >>> from rewild4d.metrics.samples import MeanColor
         >>> found = fvd_f([torch.zeros(2, 9, 3, 4, 4)], [torch.ones(2, 9, 3, 4, 4)], MeanColor(), paired=False)
         >>> [(one.name, one.value) for one in found]
@@ -231,7 +231,7 @@ def i3d_dist(prediction: Features, truth: Features, *, conditions: Conditions = 
         truth: row i belongs to row i of the prediction, [n, D].
         conditions: background, crop and fps that both sets share.
 
-    Example:
+    Examples:
         >>> groups = torch.zeros(1, dtype=torch.int64)
         >>> x, y = (Features(torch.full((1, 2), a).double(), groups, "i3d-k400", "", "", 9) for a in (0.0, 1.0))
         >>> i3d_dist(x, y).value
