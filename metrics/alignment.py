@@ -63,7 +63,7 @@ def yaw_starts(up: Tensor, count: int = 4) -> dict[str, Tensor]:
     Returns:
         Name ("yaw 90") -> rotation, float64, [3, 3].
 
-    Example:
+    Examples:
         >>> list(yaw_starts(torch.tensor([0.0, 1.0, 0.0])))
         ['yaw 0', 'yaw 90', 'yaw 180', 'yaw 270']
     """
@@ -83,7 +83,7 @@ def yaw_starts(up: Tensor, count: int = 4) -> dict[str, Tensor]:
 def cube_starts() -> dict[str, Tensor]:
     """Return the 24 rotations of a cube, for frames that share no axis: name ("cube 0" is none) -> float64, [3, 3].
 
-    Example:
+    Examples:
         >>> len(cube_starts())
         24
     """
@@ -104,7 +104,7 @@ def align(source: Tensor, target: Tensor, **settings: Any) -> Alignment:
         target: finite, [m, 3].
         settings: keywords of `align_sequence`.
 
-    Example:
+    Examples:
         >>> points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 4]])
         >>> found = align(points, 2 * points + 1, trim=0.0)
         >>> round(found.scale, 3), round(found.chamfer, 3)
@@ -146,7 +146,7 @@ def align_sequence(
         Undetermined: no time has points of both, or those of a side lie on one line at every time.
         ValueError: unequal lengths, a NaN, no start or one that is no rotation, a setting out of its range.
 
-    Example:
+    Examples:
         >>> points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 4]])
         >>> found = align_sequence([points, points + 1], [2 * points, 2 * points + 2], trim=0.0)
         >>> round(found.scale, 3)
@@ -214,7 +214,7 @@ def _middle(clouds: Sequence[Points]) -> tuple[Points, float]:
 
 
 class _Search:
-    """Iterated closest points over the moments of a sequence."""
+    """Iterated closest points over the times of a sequence."""
 
     def __init__(self, pairs: list[tuple[Points, Points]], trim: float, clamp: tuple[float, float], seed: int) -> None:
         self._clouds = [(Cloud(x), Cloud(y)) for x, y in pairs]

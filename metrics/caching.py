@@ -18,7 +18,7 @@ from rewild4d.metrics.samples import Features
 class CachedNetwork:
     """Cache a network's outputs for its last inputs, so that equal inputs pass only once.
 
-    Example:
+    Examples:
         >>> class Sum:
         ...     name, digest, resize = "sum", "", "none"
         ...     def __call__(self, images):
@@ -58,14 +58,14 @@ def cached_features(
 ) -> Features:
     """Compute features of a reference once on a machine, for every method and seed that is compared with it.
 
-    They lie in the cache folder, under a digest of the pixels, the network and all that decides the last bits of its
-    arithmetic (torch, device, processor, threads), so a cached number equals a computed one.
+    They are stored in the cache folder, under a digest of the pixels, the network and all that decides the last bits of
+    its arithmetic (torch, device, processor, threads), so a cached number equals a computed one.
 
     Args:
         network: image or video extractor.
         images: the reference, [3, H, W] each.
         compute: network -> the features, all of one sequence.
-        choice: what else ``compute`` depends on (the windows of clips); its repr is hashed.
+        choice: further inputs of ``compute`` (the windows of clips); their repr is hashed.
     """
     device = torch.device(getattr(network, "device", "cpu"))
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else torch.backends.cpu.get_cpu_capability()

@@ -97,7 +97,7 @@ def from_flax_lpips(source: Tensors) -> Tensors:
 def from_torchvision(source: Tensors) -> Tensors:
     """Rename the convolutions of a torchvision AlexNet or VGG-16 in order, without the classifier.
 
-    Example:
+    Examples:
         >>> list(from_torchvision({"features.0.weight": torch.ones(1), "features.0.bias": torch.ones(1)}))
         ['trunk.0.weight', 'trunk.0.bias']
     """
@@ -112,7 +112,7 @@ def from_torchvision(source: Tensors) -> Tensors:
 def from_lpips_heads(source: Tensors) -> Tensors:
     """Rename the learned weights of the stages, [1, channels, 1, 1] each.
 
-    Example:
+    Examples:
         >>> from_lpips_heads({"lin0.model.1.weight": torch.ones(1, 2, 1, 1)})
         {'head.0': tensor([1., 1.])}
     """
@@ -214,7 +214,7 @@ BLOCKS = {
 def tower_names() -> dict[str, str]:
     """Map TensorFlow's names of the 2015 Inception's units to the usual PyTorch ones.
 
-    Example:
+    Examples:
         >>> tower_names()["mixed_1.tower.conv"]
         'Mixed_5c.branch5x5_1'
     """

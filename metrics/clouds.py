@@ -27,7 +27,7 @@ def as_points(cloud: Tensor, name: str, empty: bool = False) -> Points:
     Raises:
         ValueError: another shape, a NaN, an infinite or a huge value, no points.
 
-    Example:
+    Examples:
         >>> as_points(torch.tensor([[1.0, 2.0, float("nan")]]), "truth")
         Traceback (most recent call last):
         ValueError: expected finite points in the truth, got 1 of 1 with a NaN or an infinity
@@ -54,7 +54,7 @@ def check_paired(predictions: Sequence[Tensor], truths: Sequence[Tensor]) -> Non
 def subsample(cloud: Tensor, count: int, seed: int) -> Tensor:
     """Draw at most ``count`` points without replacement, in their own order, [n, 3] -> [min(n, count), 3].
 
-    Example:
+    Examples:
         >>> subsample(torch.arange(300.0).reshape(100, 3), count=5, seed=0).shape
         torch.Size([5, 3])
     """
@@ -67,7 +67,7 @@ def subsample(cloud: Tensor, count: int, seed: int) -> Tensor:
 def box_diagonal(points: Points) -> float:
     """Compute the diagonal of the axis-aligned bounding box, [n, 3] -> a length in the points' unit.
 
-    Example:
+    Examples:
         >>> box_diagonal(np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 2.0]]))
         3.0
     """
@@ -79,7 +79,7 @@ def is_straight(points: Points) -> bool:
 
     The second spread is then below 1e-5 of the first, the accuracy of single-precision coordinates.
 
-    Example:
+    Examples:
         >>> is_straight(np.array([[0.0, 0, 0], [1, 1, 1], [2, 2, 2]]))
         True
     """

@@ -58,7 +58,7 @@ def kid(
     Returns:
         The distance; its value is None with fewer than two images on a side.
 
-    Example:
+    Examples:
         >>> groups = torch.zeros(2, dtype=torch.int64)
         >>> x, y = (Features(torch.full((2, 1), value).double(), groups, "toy", "", "none") for value in (0.0, 1.0))
         >>> found = kid(x, y)
@@ -101,7 +101,7 @@ def kid_v(
         extractor: [B, 3, H, W] in [0, 1] -> [B, D].
         paired, conditions, seed: see `kid`.
 
-    Example:
+    Examples:
         >>> from rewild4d.metrics.samples import MeanColor
         >>> kid_v([torch.zeros(16, 3, 4, 4)], [torch.ones(10, 3, 4, 4)], MeanColor()).value
         7.0
@@ -113,7 +113,7 @@ def kid_v(
 def fid(prediction: Features, truth: Features, *, conditions: Conditions = Conditions()) -> Distance:
     """Compute the Fréchet distance of image features (Heusel et al. 2017). Biased: compare equal n and m only.
 
-    Example:
+    Examples:
         >>> groups = torch.zeros(2, dtype=torch.int64)
         >>> x, y = (Features(torch.tensor([[a], [a + 2.0]]).double(), groups, "toy", "", "none") for a in (0.0, 3.0))
         >>> round(fid(x, y).value, 6)
@@ -142,7 +142,7 @@ def mmd2_unbiased(x: Tensor, y: Tensor) -> float:
         x: features, at least two rows, [n, D].
         y: features, at least two rows, [m, D].
 
-    Example:
+    Examples:
         >>> mmd2_unbiased(torch.zeros(2, 1), torch.ones(3, 1))  # 1 + 8 - 2 * 1
         7.0
     """
@@ -158,7 +158,7 @@ def mmd2_u_statistic(x: Tensor, y: Tensor) -> float:
         x: features, at least two rows, [n, D].
         y: features, row i belongs to row i of x, [n, D].
 
-    Example:
+    Examples:
         >>> x = torch.tensor([[0.0], [1.0]])
         >>> mmd2_u_statistic(x, x), mmd2_unbiased(x, x)  # the second keeps k(x_i, x_i)
         (0.0, -3.5)
@@ -203,7 +203,7 @@ def mmd2_interval(
     Returns:
         Lower and upper end; None with fewer than `LEAST_SEQUENCES` on a side.
 
-    Example:
+    Examples:
         >>> mmd2_interval(torch.zeros(5, 1), torch.ones(5, 1), torch.arange(5), torch.arange(5))
         (7.0, 7.0)
     """
@@ -241,7 +241,7 @@ def kid_subsets(
         size: rows of a subset, drawn without replacement from each side, the truth's first.
         generator: of the draws; torch's own where None.
 
-    Example:
+    Examples:
         >>> kid_subsets(torch.zeros(4, 1), torch.ones(4, 1), subsets=3, size=2)
         (7.0, 0.0)
     """
@@ -265,7 +265,7 @@ def frechet_distance(x: Tensor, y: Tensor) -> float:
         x: features, at least two rows, [n, D].
         y: features, at least two rows, [m, D].
 
-    Example:
+    Examples:
         >>> round(frechet_distance(torch.tensor([[0.0], [2.0]]), torch.tensor([[3.0], [5.0]])), 6)
         9.0
     """

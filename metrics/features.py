@@ -45,7 +45,7 @@ class InceptionFeatures:
         ValueError: another resize or tap.
         WeightsMissing: the weights are not here.
 
-    Example:
+    Examples:
         >>> InceptionFeatures("nearest")
         Traceback (most recent call last):
         ValueError: expected a resize out of clean, tf1, bilinear-antialias, got nearest
@@ -86,7 +86,7 @@ class I3dFeatures:
         ValueError: another resize.
         WeightsMissing: the weights are not here.
 
-    Example:
+    Examples:
         >>> I3dFeatures("clean")
         Traceback (most recent call last):
         ValueError: expected a resize out of short-side-crop, square, got clean

@@ -75,7 +75,7 @@ def distances(prediction: Tensor, truth: Tensor) -> Distances:
     Raises:
         ValueError: another shape, a NaN or an infinite value, an empty truth.
 
-    Example:
+    Examples:
         >>> found = distances(torch.tensor([[0.0, 0, 0], [3, 0, 0]]), torch.tensor([[0.0, 0, 0], [1, 0, 0]]))
         >>> found.to_truth.tolist(), found.to_prediction.tolist()
         ([0.0, 2.0], [0.0, 1.0])
@@ -92,7 +92,7 @@ def chamfer(prediction: Tensor, truth: Tensor) -> Chamfer:
     Papers differ by the square and by a factor of two; `Chamfer.symmetric` is the mean of the two directions. Arguments
     and errors are those of `distances`, but the prediction may not be empty.
 
-    Example:
+    Examples:
         >>> found = chamfer(torch.tensor([[0.0, 0, 0], [3, 0, 0]]), torch.tensor([[0.0, 0, 0], [1, 0, 0]]))
         >>> found, found.symmetric
         (Chamfer(to_truth=1.0, to_prediction=0.5), 0.75)
@@ -108,7 +108,7 @@ def fscore(prediction: Tensor, truth: Tensor, threshold: float) -> float:
     truth's points nearer to the prediction. Zero where both are zero, and for an empty prediction. The threshold is in
     the clouds' unit; other arguments and errors are those of `distances`.
 
-    Example:
+    Examples:
         >>> fscore(torch.tensor([[0.0, 0, 0], [3, 0, 0]]), torch.tensor([[0.0, 0, 0], [1, 0, 0]]), threshold=0.5)
         0.5
     """
@@ -143,7 +143,7 @@ def compare(prediction: Tensor, truth: Tensor, *, second: Tensor | None = None, 
         second: another sampling of the truth, for the floor, [k, 3].
         settings: further keywords of `compare_sequence`.
 
-    Example:
+    Examples:
         >>> cube = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
         >>> shifted = cube + torch.tensor([0.25, 0.0, 0.0])
         >>> compare(shifted, cube, fit="none").scores["chamfer_unaligned"].value
@@ -190,7 +190,7 @@ def compare_sequence(
     Raises:
         ValueError: unequal lengths, another shape, a NaN or an infinite value, an empty truth.
 
-    Example:
+    Examples:
         >>> cube = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
         >>> found = compare_sequence([cube, cube + 0.25], [cube, cube], fit="none")
         >>> [round(value, 3) for value in found.scores["chamfer_unaligned"].per_item]

@@ -45,7 +45,7 @@ def mask_box(mask: Tensor, margin: float = BOX_MARGIN, least: int = LEAST_BOX) -
     Returns:
         The box, or None where the mask is empty.
 
-    Example:
+    Examples:
         >>> mask = torch.zeros(1, 64, 64, dtype=torch.bool)
         >>> mask[0, 20:30, 10:50] = True
         >>> mask_box(mask, least=1)
@@ -68,7 +68,7 @@ def mask_box(mask: Tensor, margin: float = BOX_MARGIN, least: int = LEAST_BOX) -
 def crop_to_box(images: Tensor, box: Box) -> Tensor:
     """Cut the same box out of images or masks, [..., H, W] -> [..., bottom - top, right - left].
 
-    Example:
+    Examples:
         >>> crop_to_box(torch.arange(9).reshape(3, 3), Box(top=0, bottom=2, left=1, right=3)).tolist()
         [[1, 2], [4, 5]]
     """
@@ -90,7 +90,7 @@ def fill_outside(images: Tensor, mask: Tensor, background: float) -> Tensor:
         mask: boolean, [B, 1, H, W].
         background: grey level in [0, 1].
 
-    Example:
+    Examples:
         >>> fill_outside(torch.zeros(1, 1, 1, 2), torch.tensor([[[[True, False]]]]), background=0.5).tolist()
         [[[[0.0, 0.5]]]]
     """
@@ -108,7 +108,7 @@ def psnr(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tens
     Returns:
         Decibels per image, float64, [B]; NaN for an image without a pixel in the mask.
 
-    Example:
+    Examples:
         >>> psnr(torch.full((1, 3, 4, 4), 0.6), torch.full((1, 3, 4, 4), 0.5)).round(decimals=4).tolist()
         [20.0]
     """
@@ -137,7 +137,7 @@ def ssim(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tens
     Returns:
         Mean over the windows and the channels per image, float64, [B]; NaN for an image without a window in the mask.
 
-    Example:
+    Examples:
         >>> black, white = torch.zeros(1, 1, 16, 16), torch.ones(1, 1, 16, 16)
         >>> ssim(white, white).tolist(), ssim(black, white).round(decimals=4).tolist()
         ([1.0], [0.0001])

@@ -40,7 +40,7 @@ ALL = (*IMAGES, *GEOMETRY, *SETS)
 def split_name(name: str) -> tuple[str, str]:
     """Split an image score's name into metric and region.
 
-    Example:
+    Examples:
         >>> split_name("lpips_alex_fg"), split_name("psnr")
         (('lpips_alex', 'fg'), ('psnr', 'full'))
     """
@@ -51,7 +51,7 @@ def split_name(name: str) -> tuple[str, str]:
 def geometry_unit(name: str) -> tuple[str, str]:
     """Return a geometry score's unit ("world" is the clouds' own), and which way is better.
 
-    Example:
+    Examples:
         >>> geometry_unit("chamfer_relative_framewise"), geometry_unit("fscore_1")
         (('1', 'lower'), ('1', 'higher'))
     """

@@ -33,7 +33,7 @@ class Images(Protocol):
 class LazyImages:
     """A number of images, each made by a function of its index when asked for.
 
-    Example:
+    Examples:
         >>> images = LazyImages(2, lambda i: torch.full((3, 4, 4), i / 2))
         >>> len(images), images[1].mean().item()
         (2, 0.5)
@@ -77,7 +77,7 @@ class VideoExtractor(Protocol):
 class MeanColor:
     """Toy extractor of images and clips for examples: the mean of each channel.
 
-    Example:
+    Examples:
         >>> MeanColor()(torch.ones(2, 3, 4, 4)).tolist()
         [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
     """
@@ -138,7 +138,7 @@ def image_features(
     Raises:
         ValueError: an image is not [3, H, W], not float, or leaves [0, 1].
 
-    Example:
+    Examples:
         >>> found = image_features([torch.zeros(2, 3, 4, 4), torch.ones(1, 3, 8, 8)], MeanColor())
         >>> found.values[:, 0].tolist(), found.groups.tolist()
         ([0.0, 0.0, 1.0], [0, 0, 1])
@@ -158,7 +158,7 @@ def image_features(
 def batches(items: Iterable[T], size: int, key: Callable[[T], Any]) -> Iterator[list[T]]:
     """Group neighbours with one key into lists of at most a size, in order.
 
-    Example:
+    Examples:
         >>> list(batches("aaabba", 2, str))
         [['a', 'a'], ['a'], ['b', 'b'], ['a']]
     """
@@ -173,7 +173,7 @@ def require_image(image: Tensor) -> Tensor:
     Raises:
         ValueError: another shape, type or range.
 
-    Example:
+    Examples:
         >>> require_image(torch.full((3, 2, 2), 255.0))
         Traceback (most recent call last):
         ValueError: expected values in [0, 1], got 255 to 255
@@ -195,7 +195,7 @@ def describe(
     conditions: Conditions,
     interval: tuple[float, float] | None = None,
 ) -> Distance:
-    """Build a distance with what its two sets know of themselves."""
+    """Build a distance with the metadata of its two sets."""
     return Distance(
         name=name if prediction.extractor in ORIGINAL else f"{name} [{prediction.extractor}]",
         value=value,

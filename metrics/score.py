@@ -1,4 +1,4 @@
-"""What a measurement returns: a score or a distance between two sets, each with all that decides its value."""
+"""Results of a measurement: a score, or a distance between two sets."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ class Score(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         note: why there is no value, or what the mean leaves out.
         floor: value of a perfect result where that is not the best possible value; None where unknown.
 
-    Example:
+    Examples:
         >>> Score(value=30.0, unit="dB", better="higher", count=2, per_item=[29.0, 31.0]).note
         ''
     """
@@ -37,16 +37,15 @@ class Distance:
 
     Attributes:
         name: of the metric; lower is better.
-        value: None where it could not be computed; ``note`` then says why.
+        value: None where it could not be computed.
         n: predicted images or clips.
         m: true ones.
-        sequences: how many sequences they come from (of the side with fewer).
+        sequences: that they come from (of the side with fewer).
         estimator: in words.
         interval: 2.5 and 97.5 % of a bootstrap over sequences, or None (too few sequences, or no such estimate).
-        note: why there is no value, or what to beware of.
-        extractor, digest, resize: the network, the SHA-256 of its weights, how images reach its input size.
+        note: why there is no value, or a warning.
+        extractor, digest, resize, frames: see `metrics.samples.Features`.
         background, crop, fps: see `metrics.samples.Conditions`.
-        frames: T of the clips; None for still images.
     """
 
     name: str

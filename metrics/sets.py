@@ -45,7 +45,7 @@ class Compared:
 def distances(compared: Compared) -> list[Distance]:
     """Compute the distances of `KINDS` between two sets.
 
-    Example:
+    Examples:
         >>> groups = torch.zeros(2, dtype=torch.int64)
         >>> x, y = (Features(torch.full((2, 1), a).double(), groups, "i3d-k400", "", "", frames=9) for a in (0.0, 1.0))
         >>> [(one.name, one.value) for one in distances(Compared("fvd_f", x, y, Conditions()))]
@@ -60,7 +60,7 @@ def distances(compared: Compared) -> list[Distance]:
 def suffix_of(kind: str) -> str:
     """Return the end of FVD's and KVD's name for a kind of clips.
 
-    Example:
+    Examples:
         >>> suffix_of("fvd_diag")
         '-Diag'
     """
@@ -74,9 +74,9 @@ def pool(parts: Sequence[Compared]) -> Compared:
         parts: of one kind, from one network and resize rule, clips of one length, on one background and crop.
 
     Raises:
-        ValueError: parts that differ; the text says in what.
+        ValueError: parts that differ in any of these.
 
-    Example:
+    Examples:
         >>> one = Features(torch.zeros(2, 1), torch.zeros(2, dtype=torch.int64), "toy", "", "")
         >>> part = Compared("kid_v", one, one, Conditions())
         >>> pool([part, part]).truth.groups.tolist()
@@ -121,7 +121,7 @@ def write_features(sets: Sequence[Compared], path: Path) -> str:
 
 
 def read_features(path: Path, expected: str | None = None) -> dict[str, Compared]:
-    """Read what `write_features` wrote, by kind; every part is one sequence.
+    """Read the file of `write_features`, by kind; every part is one sequence.
 
     Args:
         path: of the file.

@@ -25,7 +25,7 @@ def mask_iou(prediction: Tensor, target: Tensor, threshold: float = 0.5) -> Tens
     Returns:
         Per image in [0, 1], float64, [B]; NaN where both are empty.
 
-    Example:
+    Examples:
         >>> mask_iou(torch.tensor([[[[1.0, 1.0, 0.0]]]]), torch.tensor([[[[1.0, 0.0, 0.0]]]])).tolist()
         [0.5]
     """
@@ -36,7 +36,7 @@ def mask_iou(prediction: Tensor, target: Tensor, threshold: float = 0.5) -> Tens
 def mask_dice(prediction: Tensor, target: Tensor, threshold: float = 0.5) -> Tensor:
     """Compute the Dice coefficient 2 |A & B| / (|A| + |B|) (Dice 1945); arguments, range and NaN as `mask_iou`, [B].
 
-    Example:
+    Examples:
         >>> mask_dice(torch.tensor([[[[1.0, 1.0, 1.0]]]]), torch.tensor([[[[1.0, 0.0, 0.0]]]])).tolist()
         [0.5]
     """
@@ -63,7 +63,7 @@ def boundary_f(
         Per image in [0, 1], float64, [B]; 0 where one contour is empty, NaN where neither image has one (both masks
         empty, or both full: the image's border is no contour).
 
-    Example:
+    Examples:
         >>> truth, prediction = torch.zeros(1, 1, 16, 16), torch.zeros(1, 1, 16, 16)
         >>> truth[..., 4:12, 4:12] = 1
         >>> prediction[..., 4:12, 5:13] = 1

@@ -54,7 +54,7 @@ def umeyama(source: Tensor, target: Tensor, weights: Tensor | None = None) -> Si
         Undetermined: fewer than three points, or all at one position or on one line. Points in one plane are enough.
         ValueError: shapes that do not fit, or a NaN.
 
-    Example:
+    Examples:
         >>> source = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
         >>> found = umeyama(source, 2 * source + torch.tensor([0.0, 0, 3]))
         >>> round(found.scale, 4), [round(x, 4) + 0.0 for x in found.translation.tolist()]

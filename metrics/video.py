@@ -1,7 +1,7 @@
 """Compute distances between two sets of clips by the features of a video network: FVD, FVD-F, FVD-Diag, KVD, I3D-dist.
 
 An image matrix M[v][f] holds view v at frame f of one sequence. The names are SV4D's (Xie et al. 2025, sec. 4), who
-released no code for them; what the paper leaves open is fixed here:
+released no code for them; definitions that the paper leaves open are fixed here:
   FVD-F     one clip a view: M[v, :]
   FVD-Diag  one clip a start view: M[(v0 + i) mod V, i], the camera advancing one view a frame around a closed orbit
 All clips of all sequences are pooled into one distance, which publishes n, m and T. FVD (Unterthiner et al. 2018) is
@@ -58,7 +58,7 @@ class MatrixClip:
 def frame_clips(matrix: ImageMatrix) -> list[MatrixClip]:
     """Return the clips of FVD-F: every view over all frames, M[v, :].
 
-    Example:
+    Examples:
         >>> [clip.views for clip in frame_clips(torch.zeros(2, 3, 3, 4, 4))]
         [(0, 0, 0), (1, 1, 1)]
     """
@@ -69,7 +69,7 @@ def frame_clips(matrix: ImageMatrix) -> list[MatrixClip]:
 def diagonal_clips(matrix: ImageMatrix) -> list[MatrixClip]:
     """Return the clips of FVD-Diag: one view further a frame, M[(v0 + i) mod V, i]; the orbit must close.
 
-    Example:
+    Examples:
         >>> [clip.views for clip in diagonal_clips(torch.zeros(2, 3, 3, 4, 4))]
         [(0, 1, 0), (1, 0, 1)]
     """
@@ -90,13 +90,13 @@ def video_features(
     Raises:
         ValueError: clips of differing or too small T, or an image that `require_image` refuses.
 
-    Example:
+    Examples:
         >>> from rewild4d.metrics.samples import MeanColor
         >>> found = video_features([[torch.zeros(5, 3, 4, 4)], [torch.ones(5, 3, 4, 4)]], MeanColor())
         >>> found.values[:, 0].tolist(), found.frames
         ([0.0, 1.0], 5)
     """
-    if reason := unfit(sequences, sequences, extractor):
+    if reason := incomparable(sequences, sequences, extractor):
         raise ValueError(reason)
     rows, groups = [], []
     total = sum(map(len, sequences))
@@ -113,8 +113,10 @@ def video_features(
     return Features(values, ids, extractor.name, extractor.digest, extractor.resize, frames)
 
 
-def unfit(prediction: Sequence[Sequence[Images]], truth: Sequence[Sequence[Images]], extractor: VideoExtractor) -> str:
-    """Return why a network cannot compare two sets of clips, or "": only clips of equal length compare."""
+def incomparable(
+    prediction: Sequence[Sequence[Images]], truth: Sequence[Sequence[Images]], extractor: VideoExtractor
+) -> str:
+    """Return why a network cannot compare two sets of clips, or "": lengths have to be equal."""
     lengths = sorted({len(clip) for side in (prediction, truth) for clips in side for clip in clips})
     if len(lengths) > 1:
         found = ", ".join(map(str, lengths))
@@ -147,14 +149,14 @@ def clip_distances(
         progress: called after every clip.
         seed: of the bootstrap over sequences.
 
-    Example:
+    Examples:
         >>> from rewild4d.metrics.samples import MeanColor
         >>> black, white = torch.zeros(9, 3, 4, 4), torch.ones(9, 3, 4, 4)
         >>> [one.value for one in clip_distances([[black, black]], [[white, white]], MeanColor(), paired=False)]
         [3.0, 7.0]
     """
     names = [f"FVD{suffix}", f"KVD{suffix}", *([f"KVD{suffix}-u", I3D_DIST] if paired else [])]
-    if reason := unfit(prediction, truth, extractor):
+    if reason := incomparable(prediction, truth, extractor):
         x, y = (_nothing(clips, extractor) for clips in (prediction, truth))
         return [describe(name, None, x, y, estimator="", notes=[reason], conditions=conditions) for name in names]
     counts = [sum(map(len, side)) for side in (prediction, truth)]
@@ -172,7 +174,7 @@ def feature_distances(
     conditions: Conditions = Conditions(),
     seed: int = 0,
 ) -> list[Distance]:
-    """Compute what `clip_distances` does from features.
+    """Compute the distances of `clip_distances` from features.
 
     Args:
         prediction: of the clips, [n, D].
@@ -197,7 +199,7 @@ def fvd_f(
 
     Settings are the keywords of `clip_distances` except the suffix.
 
-    Example:
+    Examples:
         >>> from rewild4d.metrics.samples import MeanColor
         >>> found = fvd_f([torch.zeros(2, 9, 3, 4, 4)], [torch.ones(2, 9, 3, 4, 4)], MeanColor(), paired=False)
         >>> [(one.name, one.value) for one in found]
@@ -229,7 +231,7 @@ def i3d_dist(prediction: Features, truth: Features, *, conditions: Conditions = 
         truth: row i belongs to row i of the prediction, [n, D].
         conditions: background, crop and fps that both sets share.
 
-    Example:
+    Examples:
         >>> groups = torch.zeros(1, dtype=torch.int64)
         >>> x, y = (Features(torch.full((1, 2), a).double(), groups, "i3d-k400", "", "", 9) for a in (0.0, 1.0))
         >>> i3d_dist(x, y).value

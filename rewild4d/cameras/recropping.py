@@ -60,7 +60,7 @@ def all_moments(clip: Clip, truth: Truth) -> Clip:
     return replace(clip, frames=tuple(frames), travel=None)
 
 
-def seen_by(reconstruction: Reconstruction, clip: Clip, truth: Truth, shown: Clip) -> tuple[Clip, Truth]:
+def add_cameras(reconstruction: Reconstruction, clip: Clip, truth: Truth, shown: Clip) -> tuple[Clip, Truth]:
     """Add the reconstruction's cameras to a clip and its truth wherever the data set has none and the method knows one.
 
     Args:
@@ -69,12 +69,14 @@ def seen_by(reconstruction: Reconstruction, clip: Clip, truth: Truth, shown: Cli
         truth: its held-out frames are decoded when they are read.
         shown: the frames of the clip that the method saw.
     """
-    placed = Placed(reconstruction, shown, clip.frames)
-    return replace(clip, frames=tuple(placed)), replace(truth, held_out=Placed(reconstruction, shown, truth.held_out))
+    placed = WithCameras(reconstruction, shown, clip.frames)
+    return replace(clip, frames=tuple(placed)), replace(
+        truth, held_out=WithCameras(reconstruction, shown, truth.held_out)
+    )
 
 
 @dataclass(frozen=True)
-class Placed(Sequence[Frame]):
+class WithCameras(Sequence[Frame]):
     """Frames, with a camera of the reconstruction for each that has none of its own."""
 
     reconstruction: Reconstruction
@@ -87,8 +89,8 @@ class Placed(Sequence[Frame]):
     @overload
     def __getitem__(self, index: int) -> Frame: ...
     @overload
-    def __getitem__(self, index: slice) -> "Placed": ...
-    def __getitem__(self, index: int | slice) -> "Frame | Placed":
+    def __getitem__(self, index: slice) -> "WithCameras": ...
+    def __getitem__(self, index: int | slice) -> "Frame | WithCameras":
         if isinstance(index, slice):
             return replace(self, frames=self.frames[index])
         frame = self.frames[index]

@@ -41,7 +41,7 @@ class Options:
 
 def main(arguments: list[str]) -> int:
     options = parse_flags(Options, arguments, prog="rewild4d-bench export", description=DESCRIPTION)
-    from rewild4d.cameras.recropping import all_moments, seen_by
+    from rewild4d.cameras.recropping import add_cameras, all_moments
     from rewild4d.io.export import export, parse_kinds, why_not
     from rewild4d.leaderboard.records import FILE, read_record
     from rewild4d.machine import pick_device
@@ -59,7 +59,7 @@ def main(arguments: list[str]) -> int:
     protocol = find_protocol(record.dataset, record.protocol["name"])
     clip, truth = reader_of(options.run, record, options.data).load(record.case, protocol.selection)
     reconstruction = load_method(record.method).load(saved, device)
-    clip = all_moments(*seen_by(reconstruction, clip, truth, provenance.shown_of(clip, record.prior)))
+    clip = all_moments(*add_cameras(reconstruction, clip, truth, provenance.shown_clip(clip, record.prior)))
     reasons = {kind: why_not(reconstruction, kind, clip) for kind in kinds}
     if all(reasons.values()):
         raise UserError(f"{options.run}: nothing can be written: {'; '.join(f'{k}: {r}' for k, r in reasons.items())}.")

@@ -116,7 +116,7 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
     require_writable(options.out)
     root, reader = open_dataset(spec.dataset, options.data, options)
     plans = []
-    for (name, prior), patterns in planning.grounds(spec).items():
+    for (name, prior), patterns in planning.cases_of_conditions(spec).items():
         protocol = protocols[name]
         cases = _cases(options, reader, protocol, patterns)
         own = {entry.method for entry in entries}
@@ -157,9 +157,9 @@ def _table(options: Options, spec: Spec, records: list[RunRecord]) -> Table:
 
 def _print_plan(plan: Plan, labels: dict[str, str]) -> None:
     """One line a run: whether it has a good record, its row, its folder."""
-    from rewild4d.running.runner import pieces
+    from rewild4d.running.runner import list_jobs
 
-    for job in pieces(plan):
+    for job in list_jobs(plan):
         label = labels.get(_key(job.entry), job.entry.method)
         print("done   " if job.finished() else "missing", f"{label:<20} {job.folder}")
 

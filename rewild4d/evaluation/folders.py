@@ -8,19 +8,18 @@ import torch
 
 from rewild4d.datasets.video.footage import open_footage
 from rewild4d.evaluation.image_scores import (
-    SILHOUETTES,
     measure,
     needs,
     summarize,
     without_value,
 )
-from rewild4d.evaluation.networks import FAMILIES, Networks
-from rewild4d.evaluation.pairing import Inputs, Match, images_beside, match_inputs, on_background
+from rewild4d.evaluation.networks import FAMILIES, Networks, family_of
+from rewild4d.evaluation.pairing import Inputs, Match, iterate_pairs, match_inputs, on_background
 from rewild4d.evaluation.reports import SCHEMA, Report
 from rewild4d.machine import code_version, machine
 from rewild4d.metrics.caching import CachedNetwork
 from rewild4d.metrics.distribution import kid
-from rewild4d.metrics.names import IMAGES, split_name
+from rewild4d.metrics.names import IMAGES
 from rewild4d.metrics.samples import Conditions, Distance, Images, Progress, image_features
 from rewild4d.metrics.score import Score
 from rewild4d.metrics.video import clip_distances
@@ -103,14 +102,14 @@ def image_scores(
     matches: Sequence[Match], families: Sequence[str], networks: Networks, background: float, progress: Progress
 ) -> tuple[dict[str, Score], list[str], list[str]]:
     """Compute scores by name, the label of each image, and warnings."""
-    names = [name for name in IMAGES if _family(name) in families]
-    reasons = {name: networks.missing.get(_family(name), "") for name in names}
+    names = [name for name in IMAGES if family_of(name) in families]
+    reasons = {name: networks.missing.get(family_of(name), "") for name in names}
     values: dict[str, list[float | None]] = {name: [] for name in names if not reasons[name]}
     # Two pairs: the union of two images with alpha is the full frame.
     lpips = {name: CachedNetwork(network, 2) for name, network in networks.lpips.items()}
     total, labels = sum(len(match.truth) for match in matches), list[str]()
     alphas, mattes = set[tuple[bool, bool]](), set[int]()
-    for label, shown, alpha in images_beside(matches, background):
+    for label, shown, alpha in iterate_pairs(matches, background):
         alphas.add(alpha)
         mattes |= {side for side, matte in enumerate((shown.truth_matte, shown.prediction_matte)) if matte is not None}
         for name in values:
@@ -166,11 +165,6 @@ def video_distances(
     return clip_distances(
         prediction, truth, networks.videos, paired=paired, conditions=conditions, progress=stage("FVD")
     )
-
-
-def _family(name: str) -> str:
-    metric, _ = split_name(name)
-    return "silhouette" if metric in SILHOUETTES else metric.replace("_", "-")
 
 
 def _absent(name: str, counts: Sequence[int], reason: str, conditions: Conditions) -> Distance:

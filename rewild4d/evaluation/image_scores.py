@@ -28,7 +28,7 @@ _LEAST = {"ssim": WINDOW, "lpips_alex": 31, "lpips_vgg": 16}
 
 
 @dataclass(frozen=True)
-class Beside:
+class ImagePairs:
     """Predictions and truths of one size on one background.
 
     Attributes:
@@ -52,7 +52,7 @@ def needs(name: str) -> tuple[bool, bool]:
     return metric in SILHOUETTES or region != "full", metric in SILHOUETTES or region == "union"
 
 
-def measure(name: str, shown: Beside, networks: Mapping[str, LpipsNetwork]) -> list[float | None]:
+def measure(name: str, shown: ImagePairs, networks: Mapping[str, LpipsNetwork]) -> list[float | None]:
     """Compute one score of every image.
 
     Args:
@@ -98,7 +98,7 @@ def without_value(name: str, reason: str) -> Score:
 
 
 def _compare(
-    metric: str, shown: Beside, mask: Tensor | None, networks: Mapping[str, LpipsNetwork]
+    metric: str, shown: ImagePairs, mask: Tensor | None, networks: Mapping[str, LpipsNetwork]
 ) -> list[float | None]:
     if min(shown.truth.shape[2:]) < _LEAST.get(metric, 1):
         return [None] * len(shown.truth)
@@ -111,7 +111,7 @@ def _compare(
     return [value if inside else None for value, inside in zip(values, mask.flatten(1).any(1), strict=True)]
 
 
-def _region_mask(shown: Beside, region: str) -> Tensor | None:
+def _region_mask(shown: ImagePairs, region: str) -> Tensor | None:
     if region == "full":
         return None
     assert shown.truth_matte is not None
@@ -122,7 +122,7 @@ def _region_mask(shown: Beside, region: str) -> Tensor | None:
     return mask
 
 
-def _truth_crop(shown: Beside, index: int) -> Beside | None:
+def _truth_crop(shown: ImagePairs, index: int) -> ImagePairs | None:
     """Cut one image to its truth's box; None where the truth is empty."""
     assert shown.truth_matte is not None
     box = mask_box(shown.truth_matte[index] >= FOREGROUND)

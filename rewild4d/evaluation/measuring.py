@@ -12,7 +12,7 @@ from rewild4d.cameras.rendering import render
 from rewild4d.contracts import Log, Reconstruction
 from rewild4d.errors import UserError
 from rewild4d.evaluation import geometry_scores, image_scores, novel_views
-from rewild4d.evaluation.networks import Networks, families_of, load_networks
+from rewild4d.evaluation.networks import Networks, families_of, family_of, load_networks
 from rewild4d.evaluation.protocol import Protocol
 from rewild4d.metrics import names
 from rewild4d.metrics.samples import batches
@@ -100,7 +100,7 @@ def _score_images(
 ) -> tuple[dict[str, Score], list[str]]:
     """Compute the scores of held-out images, and the label of each image."""
     asked = [name for name in protocol.scores if name in names.IMAGES]
-    absent = {name: networks.missing.get(names.split_name(name)[0].replace("_", "-")) for name in asked}
+    absent = {name: networks.missing.get(family_of(name)) for name in asked}
     values: dict[str, list[float | None]] = {name: [] for name in asked if not absent[name]}
     labels = []
     total = len(truth.held_out) if asked else 0
@@ -134,12 +134,12 @@ def _render_frames(reconstruction: Reconstruction, frames: Iterable[Frame]) -> I
             )
 
 
-def _beside(frames: list[Frame], rendered: list[tuple[Tensor, Tensor]], background: float) -> image_scores.Beside:
+def _beside(frames: list[Frame], rendered: list[tuple[Tensor, Tensor]], background: float) -> image_scores.ImagePairs:
     target = torch.stack([frame.over(background) for frame in frames])
     mask = torch.stack([frame.mask for frame in frames])
     alpha = torch.stack([alpha for _, alpha in rendered])
     image = (torch.stack([color for color, _ in rendered]) + (1 - alpha) * background).clamp(0, 1)
-    return image_scores.Beside(image, target.clamp(0, 1), alpha, mask, background)
+    return image_scores.ImagePairs(image, target.clamp(0, 1), alpha, mask, background)
 
 
 def _size(frame: Frame) -> torch.Size:

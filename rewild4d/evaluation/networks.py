@@ -70,16 +70,17 @@ def load_networks(families: Sequence[str], device: torch.device) -> Networks:
     return Networks(lpips, made.get("kid"), made.get("fvd"), missing)
 
 
+def family_of(score: str) -> str:
+    """Return the family of an image score or of a score of sets, such as "lpips-alex" or "kid"."""
+    if score in names.SETS:
+        return "kid" if score == "kid_v" else "fvd"
+    metric, _ = names.split_name(score)
+    return "silhouette" if metric in names.SILHOUETTES else metric.replace("_", "-")
+
+
 def families_of(scores: Iterable[str]) -> list[str]:
     """List the families of networks that scores need."""
-    found = set()
-    for name in scores:
-        metric = names.split_name(name)[0]
-        if metric.startswith("lpips"):
-            found.add(metric.replace("_", "-"))
-        elif name in names.SETS:
-            found.add("kid" if name == "kid_v" else "fvd")
-    return sorted(found)
+    return sorted(NETWORKS.keys() & map(family_of, scores))
 
 
 def may_be_scored_now(scores: Mapping[str, Score]) -> bool:

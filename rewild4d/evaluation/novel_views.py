@@ -18,6 +18,7 @@ from rewild4d.cameras.rendering import render
 from rewild4d.contracts import Log, Reconstruction
 from rewild4d.errors import UserError
 from rewild4d.evaluation.coverage import evenly_spaced
+from rewild4d.evaluation.networks import family_of
 from rewild4d.evaluation.protocol import NovelViews
 from rewild4d.metrics.caching import CachedNetwork, cached_features
 from rewild4d.metrics.distribution import VIEWS
@@ -33,7 +34,7 @@ from rewild4d.metrics.samples import (
 )
 from rewild4d.metrics.score import Score
 from rewild4d.metrics.sets import Compared, distances, suffix_of
-from rewild4d.metrics.video import clip_distances, diagonal_clips, frame_clips, unfit, video_features
+from rewild4d.metrics.video import clip_distances, diagonal_clips, frame_clips, incomparable, video_features
 from rewild4d.types import Camera, Clip, Frame
 
 TITLES = {title: name for scores in KINDS.values() for name, title in scores.items()}
@@ -94,7 +95,7 @@ def novel_view_distances(
         if videos is None or not any(name.endswith(kind.removeprefix("fvd")) for name in names):
             continue
         clips = [part for window in windows for part in cut(orbit.matrix(window))]
-        if unfit([clips], [truths], videos):
+        if incomparable([clips], [truths], videos):
             suffix = suffix_of(kind)
             found += clip_distances([clips], [truths], videos, paired=False, suffix=suffix, conditions=conditions)
             continue
@@ -112,8 +113,8 @@ def as_scores(found: Sequence[Distance], names: Sequence[str], missing: dict[str
     for name in names:
         distance = by_name.get(name)
         if distance is None:
-            family = "kid" if name == "kid_v" else "fvd"
-            scores[name] = Score(None, "1", "lower", 0, [], f"not computed: {missing.get(family, 'no network')}")
+            reason = missing.get(family_of(name), "no network")
+            scores[name] = Score(None, "1", "lower", 0, [], f"not computed: {reason}")
             continue
         frames = f", T = {distance.frames}" if distance.frames else ""
         note = f"n = {distance.n}, m = {distance.m}{frames}" + (f"; {distance.note}" if distance.note else "")

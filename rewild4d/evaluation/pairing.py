@@ -8,7 +8,7 @@ from torch import Tensor
 
 from rewild4d.datasets.video.footage import Footage, Picture, Reel, match_images, match_reels, open_footage
 from rewild4d.errors import UserError
-from rewild4d.evaluation.image_scores import Beside
+from rewild4d.evaluation.image_scores import ImagePairs
 from rewild4d.metrics.samples import LazyImages
 
 
@@ -65,7 +65,7 @@ def match_inputs(inputs: Inputs, prediction: Footage, truth: Footage) -> tuple[l
     return [Match(*row) for row in zip(*columns, strict=True)], notes
 
 
-def images_beside(matches: Sequence[Match], background: float) -> Iterator[tuple[str, Beside, tuple[bool, bool]]]:
+def iterate_pairs(matches: Sequence[Match], background: float) -> Iterator[tuple[str, ImagePairs, tuple[bool, bool]]]:
     """Iterate over images: label, pair, and whether prediction and truth have alpha of their own.
 
     Raises:
@@ -75,7 +75,7 @@ def images_beside(matches: Sequence[Match], background: float) -> Iterator[tuple
         for index in range(len(match.truth)):
             prediction, truth = (reel.picture(index) for reel in (match.prediction, match.truth))
             require_size(prediction.label, prediction.rgb, truth)
-            shown = Beside(
+            shown = ImagePairs(
                 prediction=prediction.over(background)[None],
                 truth=truth.over(background)[None],
                 prediction_matte=_matte(match.prediction_masks, index, prediction, truth),

@@ -1,4 +1,4 @@
-"""Evaluation protocols: a TOML file states what is held out and what is measured."""
+"""Evaluation protocols: a TOML file states held-out frames and scores."""
 
 from collections.abc import Mapping
 from importlib import metadata, resources
@@ -41,7 +41,7 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         background: grey level in [0, 1] behind prediction and truth alike.
         scores: out of `metrics.names.ALL`: on held-out images, on the shape, on novel views as a set.
         floors: methods that are always printed as lower-bound rows.
-        selection: input of a method, and what is held out.
+        selection: input of a method, and held-out frames.
         default: whether it is the data set's default; of several, the highest version.
         points: drawn from each cloud for scores of the shape.
         novel: settings of novel views for scores of sets.

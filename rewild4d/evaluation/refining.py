@@ -1,6 +1,6 @@
 """Prepare a reconstruction for scoring: as fitted, or refined on the scored frames."""
 
-from rewild4d.cameras.recropping import seen_by
+from rewild4d.cameras.recropping import add_cameras
 from rewild4d.contracts import Log, Reconstruction
 from rewild4d.types import Clip, Truth
 
@@ -23,7 +23,7 @@ def ready_to_score(
     Raises:
         ValueError: a refined reconstruction without marks.
     """
-    clip, placed = seen_by(reconstruction, clip, truth, shown)
+    clip, placed = add_cameras(reconstruction, clip, truth, shown)
     refine = getattr(reconstruction, "refined", None)
     if refine is None or not len(truth.held_out) or truth.held_out[0].camera is not None:
         return reconstruction, clip, placed

@@ -1,4 +1,4 @@
-"""Ctrl-C: a KeyboardInterrupt where it unwinds cleanly, an end at once where libraries would swallow or print it."""
+"""Handle Ctrl-C: raise KeyboardInterrupt where it unwinds cleanly, else end the process at once."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ if TYPE_CHECKING:
     from types import CodeType, FrameType
 
 STATUS = 130
-"""Exit status after Ctrl-C, as shells have it: 128 and the number of the signal."""
+"""Exit status after Ctrl-C, as in shells: 128 and the number of the signal."""
 COMPILERS = ("numba", "llvmlite")
-"""Packages that turn a KeyboardInterrupt into other errors, or print it and go on."""
+"""Packages that convert a KeyboardInterrupt to other errors, or print it and continue."""
 
 
 def answer_interrupts(owner: CodeType, line: str = "") -> bool:
-    """Answer Ctrl-C in this process from now on, where Python itself would.
+    """Install the handler of Ctrl-C in this process, where Python's own is in use.
 
     Args:
         owner: code of the function that catches the KeyboardInterrupt. While it does not run, modules are imported or
             numba compiles, the process ends at once instead.
-        line: said on standard error at such an end.
+        line: printed on standard error before such an end.
 
     Returns:
-        Whether Ctrl-C is answered: not under nohup, which ignores it, and not in another thread than the main one.
+        Whether the handler is installed: not under nohup, which ignores Ctrl-C, and not outside the main thread.
     """
 
     def answer(number: int, frame: FrameType | None) -> None:
@@ -50,6 +50,6 @@ def _swallows(frame: FrameType) -> bool:
 
 
 def block_interrupts(blocked: bool) -> None:
-    """Keep Ctrl-C from this thread, and from the processes that it starts, until they let it through."""
+    """Block Ctrl-C for this thread and the processes that it starts, or unblock it."""
     if hasattr(signal, "pthread_sigmask"):  # Windows has none
         signal.pthread_sigmask(signal.SIG_BLOCK if blocked else signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -95,7 +95,7 @@ def entries(name: str, spec: Spec, seeds: tuple[int, ...]) -> tuple[Entry, ...]:
     return tuple(found)
 
 
-def grounds(spec: Spec) -> dict[tuple[str, str], tuple[str, ...]]:
+def cases_of_conditions(spec: Spec) -> dict[tuple[str, str], tuple[str, ...]]:
     """Return (protocol, prior) of the conditions, each once, with the patterns of their cases, () for all."""
     found: dict[tuple[str, str], tuple[str, ...]] = {}
     for one in spec.conditions:
@@ -118,7 +118,7 @@ def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[
     """Return the rows of a table with their records, then its lower-bound rows, and notes on records left out."""
     points = getattr(load_dataset(spec.dataset), "keypoint_use", "none")
     records = [record for record in records if record.prior.get("keypoints", "none") == points]
-    kept, remarks = latest([r for r in records if any(_is_under(r, condition, spec) for condition in spec.conditions)])
+    kept, left_out = latest([r for r in records if any(_is_under(r, condition, spec) for condition in spec.conditions)])
     kept = [_beside_equals(record) for record in kept]
     under = [tuple(r for r in kept if _is_under(r, condition, spec)) for condition in spec.conditions]
     rows = []
@@ -143,7 +143,7 @@ def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[
         )
         if any(own):
             rows.append(Entrant(floor, own))
-    return rows, [*remarks, *_missing(spec, cases)]
+    return rows, [*left_out, *_missing(spec, cases)]
 
 
 def reported(spec: Spec) -> Any:

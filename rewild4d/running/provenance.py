@@ -41,7 +41,7 @@ def left_out(clip: Clip, shown: Clip | None) -> dict[str, list[int]]:
     return {"left_out": rows} if rows else {}
 
 
-def shown_of(clip: Clip, prior: dict[str, Any]) -> Clip:
+def shown_clip(clip: Clip, prior: dict[str, Any]) -> Clip:
     """Return the part of its clip that a record's method was shown; ``prior`` as in the record."""
     missing = set(prior.get("left_out", ()))
     return clip.only([row for row in range(len(clip.frames)) if row not in missing]) if missing else clip

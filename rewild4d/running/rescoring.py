@@ -1,6 +1,7 @@
-"""Saved runs read back: their data, and their scores anew by the protocol they were fitted for."""
+"""Read saved runs: their data, and new scores by the protocol that they were fitted for."""
 
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +27,15 @@ from rewild4d.visualize.run_pictures import save_pictures
 
 
 def reader_of(run: Path, record: RunRecord, data: Path | None) -> DatasetReader:
-    """The reader of the data that a run was fitted to.
+    """Return the reader of the data that a run was fitted to.
 
     Args:
         run: folder of the run.
         record: of the run.
-        data: where the data is now; None: where the record says.
+        data: present folder of the data; None: the record's.
 
     Raises:
-        UserError: the record does not say where or how it was read, or the data is not there any more.
+        UserError: the record lacks folder or settings of its data, or the folder is gone.
     """
     reader, root = load_dataset(record.dataset), data or record.data.get("root")
     if not root:
@@ -53,7 +54,7 @@ def score_again(folder: Path, data: Path | None = None, device: str = "auto", ra
 
     Args:
         folder: of the run, with a record.json and a reconstruction.
-        data: where the run's data is now; None: where the record says.
+        data: present folder of the run's data; None: the record's.
         device: auto, cpu or cuda.
         rasterizer: one of `rewild4d.rasterizer.BACKENDS`.
 
@@ -77,17 +78,15 @@ def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: s
     clip, truth = reader.load(record.case, protocol.selection)
     for name, now in (("clip", clip.digest), ("truth", truth.digest)):
         if now != record.data.get(name):
-            place = data or record.data["root"]
-            raise UserError(f"{place}: the {name} of {record.case} is not the one that {folder} was fitted to.")
+            root = data or record.data["root"]
+            raise UserError(f"{root}: the {name} of {record.case} is not the one that {folder} was fitted to.")
     reconstruction = load_method(record.method).load(saved, device)
     begin = time.perf_counter()
-    shown = provenance.shown_of(clip, record.prior)
-    progress = Progress(f"{record.case}: refine on held-out frames")
-    reconstruction, clip, truth = ready_to_score(reconstruction, clip, truth, shown, progress)
-    progress.close()
-    progress = Progress(f"{record.case}: evaluate")
-    found = evaluate(reconstruction, clip, truth, protocol, progress, device)
-    progress.close()
+    shown = provenance.shown_clip(clip, record.prior)
+    with closing(Progress(f"{record.case}: refine on held-out frames")) as log:
+        reconstruction, clip, truth = ready_to_score(reconstruction, clip, truth, shown, log)
+    with closing(Progress(f"{record.case}: evaluate")) as log:
+        found = evaluate(reconstruction, clip, truth, protocol, log, device)
     seconds = time.perf_counter() - begin
     whole = original_frames(reader, clip, protocol.selection)
     pictures = save_pictures(reconstruction, clip, truth, folder, whole)
@@ -102,6 +101,6 @@ def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: s
 
 
 def _timing(record: RunRecord, spent: float, seconds: float) -> Timing:
-    """When it was fitted, how long that took, which a failed record does not say, and how long scoring took now."""
+    """Combine the start and duration of the fit, which a failed record lacks, with the duration of this scoring."""
     memory = max(record.timing.peak_memory_mib, round(peak_memory_mib(), 1))
     return Timing(record.timing.started, round(spent, 2), round(seconds, 2), memory)

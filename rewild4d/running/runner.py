@@ -139,7 +139,7 @@ def _readable(plan: Plan) -> Plan:
     return replace(plan, cases=tuple(name for name in plan.cases if name not in faults))
 
 
-def pieces(plan: Plan) -> list["Job"]:
+def list_jobs(plan: Plan) -> list["Job"]:
     """List all jobs of the plan that can be read, in its order, finished or not; nothing is run."""
     plan = _readable(replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device)))
     return [job for name in plan.cases for job in _jobs(plan, name, *plan.reader.load(name, plan.protocol.selection))]

@@ -1,7 +1,7 @@
 """Draw a reconstruction in the original frames that its clip was cut from, beside these.
 
-The animal itself is removed from the frame before the render is laid on it, so that what the reconstruction lacks is
-white, and not the filmed animal.
+The animal itself is removed from the frame before the render is laid on it, so that missing parts of the
+reconstruction are white, and not the filmed animal.
 """
 
 from collections.abc import Iterable, Iterator

@@ -53,15 +53,11 @@ def over(splats: Splats, camera: Camera, background: float | Tensor = 1.0) -> Te
     return (color + (1 - alpha) * background).clamp(0, 1)
 
 
-def widen(image: Tensor) -> Tensor:
-    """Enlarge by a whole factor to at least `PANEL` pixels."""
-    factor = max(1, math.ceil(PANEL / image.shape[2]))
-    return image.repeat_interleave(factor, 1).repeat_interleave(factor, 2)
-
-
 def beside(*images: Tensor) -> Tensor:
-    """Lay images of one height side by side, each at least `PANEL` wide."""
-    return torch.cat([widen(image) for image in images], dim=2)
+    """Lay images of one height side by side, each enlarged by a whole factor to at least `PANEL` pixels."""
+    factors = [max(1, math.ceil(PANEL / image.shape[2])) for image in images]
+    wide = [image.repeat_interleave(n, 1).repeat_interleave(n, 2) for image, n in zip(images, factors, strict=True)]
+    return torch.cat(wide, dim=2)
 
 
 def header(titles: Sequence[str], width: int) -> Tensor:

@@ -14,7 +14,7 @@ from rewild4d.contracts import Reconstruction
 from rewild4d.transforms import look_at
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Splats, Truth
 from rewild4d.visualize.original_view import save_original_view
-from rewild4d.visualize.pictures import PANEL, beside, film_rate, header, over, save_mp4, save_png, widen
+from rewild4d.visualize.pictures import PANEL, beside, film_rate, header, over, save_mp4, save_png
 from rewild4d.visualize.turntable import find_framing, four_views, orbit_frames
 
 ROWS = 4
@@ -69,7 +69,7 @@ def comparison(reconstruction: Reconstruction, clip: Clip, truth: Truth) -> Tens
         if held:
             other = truth.held_out[held[(len(held) // 3 + row * len(held) // (2 * ROWS)) % len(held)]]
             images += [other.over(1.0), _shot(reconstruction, other)]
-        panels.append(torch.cat([widen(image) for image in images], dim=2))
+        panels.append(beside(*images))
     titles = ["input", "render", "held-out truth", "held-out render"]
     return torch.cat([header(titles[: len(images)], panels[0].shape[2]), *panels], dim=1)
 

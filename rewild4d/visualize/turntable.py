@@ -81,7 +81,7 @@ def find_framing(reconstruction: Reconstruction, clip: Clip, up: Tensor | None) 
     clouds = [_solid(reconstruction.at(time)) for time in clip.times]
     if not cameras or not all(len(means) for means, _ in clouds):
         return None
-    # the median lies in the trunk; a picture is centred on the middle of the whole, legs and head included
+    # The box's centre, not the median, which is in the trunk: legs and head are in the picture too.
     middles = _smooth(torch.stack([_box_middle(means) for means, _ in clouds]))
     axes, known = _axes(reconstruction, clip, cameras, middles, up)
     extents = [(means - middle).norm(dim=1) + size for (means, size), middle in zip(clouds, middles, strict=True)]

@@ -84,9 +84,9 @@ def test_a_record_carries_the_mark_and_the_table_does_not_rank_it(case: Case, tm
     assert table.notes == tuple(rotated.marks)
     # Another file in the folder is another run; the same ones are the same run.
     first = plan.entries[0]
-    assert runner.pieces(replace(plan, entries=(first,)))[0].run_id == as_is.run_id
+    assert runner.list_jobs(replace(plan, entries=(first,)))[0].run_id == as_is.run_id
     (tmp_path / "theirs" / "frame_0000.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    assert runner.pieces(replace(plan, entries=(first,)))[0].run_id != as_is.run_id
+    assert runner.list_jobs(replace(plan, entries=(first,)))[0].run_id != as_is.run_id
 
 
 def test_a_program_is_scored_on_footage_whose_cameras_nobody_knows(tmp_path: Path) -> None:

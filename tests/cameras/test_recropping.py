@@ -7,7 +7,7 @@ import pytest
 import torch
 from prior_files import a_prior
 
-from rewild4d.cameras.recropping import crop_between, recropped, seen_by
+from rewild4d.cameras.recropping import add_cameras, crop_between, recropped
 from rewild4d.ours.motion import camera_between, frame_position
 from rewild4d.priors.motion import world_camera
 from rewild4d.priors.placing import in_crops, known_frames, with_cameras
@@ -100,10 +100,10 @@ def test_cameras_of_all_frames_agree_where_the_priors_filter_left_one_out() -> N
         assert error(frame, frame.camera) < 0.02
     dropped = clip.frames[LEFT_OUT]
     assert error(dropped, world_camera(prior, dropped.time)) > 0.1
-    placed, truth = seen_by(Known(shown), clip, Truth((dropped, clip.frames[7]), None, ""), shown)
+    placed, truth = add_cameras(Known(shown), clip, Truth((dropped, clip.frames[7]), None, ""), shown)
     assert all(error(frame, frame.camera) < 0.02 for frame in (*placed.frames, *truth.held_out))
     assert [len(part) for part in (truth.held_out, truth.held_out[:1])] == [2, 1]
-    nobody = seen_by(Known(clip), clip, Truth((dropped,), None, ""), shown)
+    nobody = add_cameras(Known(clip), clip, Truth((dropped,), None, ""), shown)
     assert nobody[0].frames == clip.frames and nobody[1].held_out[0] is dropped
 
 
@@ -111,9 +111,9 @@ def test_a_record_knows_what_its_method_was_not_shown() -> None:
     clip = film()
     shown = without(clip, LEFT_OUT)
     said = provenance.left_out(clip, shown)
-    assert said == {"left_out": [LEFT_OUT]} and provenance.shown_of(clip, said).times == shown.times
+    assert said == {"left_out": [LEFT_OUT]} and provenance.shown_clip(clip, said).times == shown.times
     assert provenance.left_out(clip, clip) == provenance.left_out(clip, None) == {}
-    assert provenance.shown_of(clip, {}) is clip
+    assert provenance.shown_clip(clip, {}) is clip
     assert math.isclose(clip.only([0, 9]).times[1], 9 / 24)
 
 

@@ -12,7 +12,7 @@ from films import PROTOCOL, panned, plan
 from rewild4d.baselines.gart_config import GartConfig, GartStarConfig
 from rewild4d.baselines.gart_reconstruction import SEEN, GartStarReconstruction
 from rewild4d.baselines.gart_skeleton import prior_poses
-from rewild4d.cameras.recropping import seen_by
+from rewild4d.cameras.recropping import add_cameras
 from rewild4d.cameras.rendering import render
 from rewild4d.datasets.video.online import Online
 from rewild4d.evaluation.refining import ready_to_score
@@ -142,7 +142,9 @@ def test_a_run_says_that_the_row_has_seen_the_test_image(tmp_path: Path, monkeyp
     monkeypatch.setattr("rewild4d.running.rescoring.find_protocol", lambda *_: PROTOCOL)
     again = score_again(folder, tmp_path / "clip")
     assert again.scores == star.scores and again.marks == star.marks
-    monkeypatch.setattr("rewild4d.running.rescoring.ready_to_score", lambda *given: (given[0], *seen_by(*given[:4])))
+    monkeypatch.setattr(
+        "rewild4d.running.rescoring.ready_to_score", lambda *given: (given[0], *add_cameras(*given[:4]))
+    )
     unrefined = score_again(folder, tmp_path / "clip")
     assert SEEN not in unrefined.marks
     seen, unseen = again.scores["psnr"].value, unrefined.scores["psnr"].value

@@ -104,7 +104,7 @@ def test_conditions_of_one_protocol_are_one_plan() -> None:
         Condition(protocol="p", cases=("*@side",)), Condition(protocol="p", cases=("*@frontal",)),
         Condition(protocol="q"), Condition(protocol="q", cases=("x",)), Condition(protocol="p", prior="coarse:1"),
     ))  # fmt: skip
-    assert planning.grounds(found) == {
+    assert planning.cases_of_conditions(found) == {
         ("p", "template"): ("*@side", "*@frontal"), ("q", "template"): (), ("p", "coarse:1"): (),
     }  # fmt: skip
 

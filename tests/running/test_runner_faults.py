@@ -53,7 +53,7 @@ def plan(case: Case, tmp_path: Path) -> runner.Plan:
 
 
 def only_job(plan: runner.Plan) -> runner.Job:
-    (job,) = runner.pieces(plan)
+    (job,) = runner.list_jobs(plan)
     return job
 
 
