@@ -17,14 +17,13 @@ COLLECTED = ROOT / "build" / "docs" / "rewild4d"
 CELL = re.compile(r"^# %%(.*)$", re.MULTILINE)
 
 
-def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Copy the package and the folders that install below it, so that mkdocstrings finds `rewild4d.metrics`."""
+def on_startup(command: str, dirty: bool) -> None:
+    """Copy the package and the folders that install below it, before mkdocstrings looks for `rewild4d.metrics`."""
     shutil.rmtree(COLLECTED, ignore_errors=True)
     sources = shutil.ignore_patterns("__pycache__")
     shutil.copytree(ROOT / "rewild4d", COLLECTED, ignore=sources)
     for name in ("baselines", "datasets", "leaderboard", "metrics"):
         shutil.copytree(ROOT / name, COLLECTED / name, ignore=sources)
-    return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

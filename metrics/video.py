@@ -1,6 +1,6 @@
 """Compute distances between two sets of clips by the features of a video network: FVD, FVD-F, FVD-Diag, KVD, I3D-dist.
 
-An image matrix M[v][f] holds view v at frame f of one sequence. The names are SV4D's (Xie et al. 2025, sec. 4), who
+An image matrix `M[v][f]` holds view v at frame f of one sequence. The names are SV4D's (Xie et al. 2025, sec. 4), who
 released no code for them; definitions that the paper leaves open are fixed here:
   FVD-F     one clip a view: M[v, :]
   FVD-Diag  one clip a start view: M[(v0 + i) mod V, i], the camera advancing one view a frame around a closed orbit
@@ -34,7 +34,7 @@ FEW_CLIPS = 64
 
 
 class ImageMatrix(Protocol):
-    """M[v][f], an image [3, H, W] in [0, 1]: a tensor [V, F, 3, H, W], a list of clips, or a lazy reader of either."""
+    """`M[v][f]`, an image [3, H, W] in [0, 1]: a tensor [V, F, 3, H, W], a list of clips, or a lazy reader."""
 
     def __len__(self) -> int: ...
 
@@ -43,7 +43,7 @@ class ImageMatrix(Protocol):
 
 @dataclass(frozen=True)
 class MatrixClip:
-    """A clip through an image matrix, read image by image: frame i is matrix[views[i]][i]."""
+    """A clip through an image matrix, read image by image: frame i is `matrix[views[i]][i]`."""
 
     matrix: ImageMatrix
     views: tuple[int, ...]
