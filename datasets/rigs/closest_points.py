@@ -20,7 +20,7 @@ class Closest(NamedTuple):
     """Closest points of a mesh.
 
     Attributes:
-        faces: index of the triangle, -1 where none is within the limit, int64, [n].
+        faces: index of the triangle, the lowest of those equally close, -1 where none is within the limit, int64, [n].
         uv: barycentric coordinates that belong to its second and third corner, float32, [n, 2].
         distances: Euclidean, the limit where no triangle is within it, float32, [n].
     """
@@ -44,19 +44,19 @@ def closest_points(triangles: NDArray[np.float64], points: NDArray[np.float64], 
     blocks = corners.reshape(-1, BLOCK * 3, 3)
     low, high = blocks.min(1), blocks.max(1)
     radii = np.linalg.norm(high - low, axis=1) * np.float32(0.5 + 1e-5)
-    rows, uv, distances = _search(corners, (low + high) / 2, radii, points.astype(np.float32), np.float32(limit))
-    return Closest(np.where(rows < 0, -1, order[rows]), uv, distances)
+    return Closest(*_search(corners, order, (low + high) / 2, radii, points.astype(np.float32), np.float32(limit)))
 
 
 @kernel
-def _search(corners: np.ndarray, centres: np.ndarray, radii: np.ndarray, points: np.ndarray, limit: float) -> tuple:
-    """Return the row of the closest triangle, [n], barycentric coordinates, [n, 2], and distance, [n]."""
-    rows, distances = np.full(len(points), -1, np.int64), np.full(len(points), limit, np.float32)
+def _search(
+    corners: np.ndarray, face_of: np.ndarray, centres: np.ndarray, radii: np.ndarray, points: np.ndarray, limit: float
+) -> tuple:
+    """Find `Closest` of each point; ``face_of`` holds the number of the triangle in each row of the corners."""
+    faces, distances = np.full(len(points), -1, np.int64), np.full(len(points), limit, np.float32)
     uv = np.zeros((len(points), 2), np.float32)
+    first = 0  # the block of the point before: it is near, so that most others are skipped
     for i in range(len(points)):
         point, nearest = (points[i, 0], points[i, 1], points[i, 2]), limit
-        # The block of the point before comes first: it is near, so that most others are skipped.
-        first = max(rows[i - 1], 0) // BLOCK if i else 0
         for turn in range(-1, len(centres)):
             block = first if turn < 0 else turn
             gap = _minus(point, (centres[block, 0], centres[block, 1], centres[block, 2]))
@@ -65,10 +65,11 @@ def _search(corners: np.ndarray, centres: np.ndarray, radii: np.ndarray, points:
                 continue
             for row in range(block * BLOCK, (block + 1) * BLOCK):
                 u, v, distance = _closest(corners, row, point)
-                if distance < nearest:
-                    rows[i], uv[i, 0], uv[i, 1], nearest = row, u, v, distance
+                if distance < nearest or (distance == nearest and face_of[row] < faces[i]):
+                    faces[i], uv[i, 0], uv[i, 1], nearest = face_of[row], u, v, distance
+                    first = block
         distances[i] = nearest
-    return rows, uv, distances
+    return faces, uv, distances
 
 
 @inlined

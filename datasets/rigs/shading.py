@@ -7,6 +7,7 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from rewild4d.datasets.rigs.animal import Surface
 from rewild4d.datasets.rigs.voxels import barycentric
@@ -137,13 +138,9 @@ def _albedo(surface: Surface, corners: NDArray[np.int64], share: NDArray[np.floa
 def sample_texture(texture: NDArray[np.uint8], uv: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the bilinear lookup in a repeated texture; (0, 0) is its upper left corner, [n, 2] -> [n, 3] in [0, 1]."""
     height, width = texture.shape[:2]
-    x, y = uv[:, 0] * width - 0.5, uv[:, 1] * height - 0.5
-    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    fx, fy = (x - left)[:, None], (y - top)[:, None]
-    rows, columns = (top % height, (top + 1) % height), (left % width, (left + 1) % width)
-    upper = (1 - fx) * texture[rows[0], columns[0]] + fx * texture[rows[0], columns[1]]
-    lower = (1 - fx) * texture[rows[1], columns[0]] + fx * texture[rows[1], columns[1]]
-    return ((1 - fy) * upper + fy * lower) / 255.0
+    place = uv[:, ::-1].T * ((height,), (width,)) - 0.5
+    channels = [map_coordinates(texture[..., k], place, np.float64, order=1, mode="grid-wrap") for k in range(3)]
+    return np.stack(channels, axis=1) / 255.0
 
 
 def _straight(premultiplied: NDArray[np.float32], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:
