@@ -15,7 +15,7 @@ from rewild4d.errors import UserError
 from rewild4d.evaluation import novel_views
 from rewild4d.evaluation.measuring import evaluate
 from rewild4d.evaluation.protocol import NovelViews, find_protocol
-from rewild4d.types import Camera, Clip, Splats, Truth
+from rewild4d.types import Clip, Truth
 from rewild4d.visualize.run_pictures import save_pictures
 
 pytestmark = pytest.mark.usefixtures("cache")
@@ -51,20 +51,16 @@ def test_without_any_camera_it_says_so(case: tuple[Clip, Truth]) -> None:
         evaluate(Plate(clip, knows=False), clip, truth, PROTOCOL, lambda *_: None, CPU)
 
 
-def nothing(splats: Splats, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    return torch.zeros(3, 1, 1), torch.zeros(1, 1, 1)
-
-
 def test_the_orbit_starts_at_the_reconstructions_camera(case: tuple[Clip, Truth]) -> None:
     clip = case[0]
-    orbit = novel_views._Orbit(Plate(clip), clip, 1.0, nothing, NovelViews(upright=True), None)
+    orbit = novel_views._Orbit(Plate(clip), clip, 1.0, NovelViews(upright=True), None)
     assert (orbit.cameras[0].width, orbit.cameras[0].height) == (64, 64)
     middle = orbit._middle()
     distances = torch.stack([(camera.center - middle).norm() for camera in orbit.cameras])
     assert torch.allclose(distances, middle.norm().expand(16))
     heights = torch.stack([camera.center[1] - middle[1] for camera in orbit.cameras])
     assert torch.allclose(heights, heights[:1])  # footage's y points up: a level circle
-    blank = novel_views._Orbit(EmptyReconstruction(), clip, 1.0, nothing, NovelViews(upright=True), None)
+    blank = novel_views._Orbit(EmptyReconstruction(), clip, 1.0, NovelViews(upright=True), None)
     assert len(blank.cameras) == 16
 
 
