@@ -177,7 +177,7 @@ def test_points_without_noise_end_at_the_truth_as_trimesh_does() -> None:
     found = align(source, target, up=UP)
     torch.testing.assert_close(found.matrix, truth.matrix, atol=1e-6, rtol=0)
     assert found.converged and not found.clamped and found.chamfer < 1e-6
-    matrix = found.transform.matrix.numpy()
+    matrix = found.matrix.numpy()
     oracle, _, _ = trimesh.registration.icp(source.numpy(), target.numpy(), initial=matrix, reflection=False)
     np.testing.assert_allclose(matrix, oracle, atol=1e-6)
 

@@ -171,7 +171,7 @@ def test_scores_that_lacked_a_network_are_made_once_it_is_there(
 ) -> None:
     """Scoring alone is repeated: the saved reconstruction is read back."""
     plan = replace(plan, protocol=msgspec.structs.replace(plan.protocol, scores=("psnr", "lpips_alex")))
-    monkeypatch.setattr(weights, "places", lambda: [tmp_path / "nets"])
+    monkeypatch.setattr(weights, "search_folders", lambda: [tmp_path / "nets"])
     (without,) = runner.execute(plan)
     note = without.scores["lpips_alex"].note
     assert note == "not computed: weights missing, run: rewild4d-bench weights fetch"
