@@ -18,21 +18,19 @@ class NetworkShape(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     depth: Count = 8
     """Layers before the heads."""
     width: Count = 256
-    """Of each: 10,000 Gaussians cost about 32 GFLOP a step at 256, 8 at 128, so short presets are narrower."""
+    """Hidden width of each layer."""
     skip: Whole = 4
     """The input joins once more after this layer (counted from 0)."""
     place_octaves: Whole = 10
-    """Of the position code."""
+    """Octaves of the position code."""
     time_octaves: Whole = 6
-    """Of the time code."""
+    """Octaves of the time code."""
     time_width: Count = 256
     """Hidden width of the time's own network."""
     time_features: Count = 30
-    """What it makes of the time."""
+    """Features of the time."""
     half: bool = True
-    """On a CPU that multiplies bfloat16 pairs the layers work in bfloat16, as the deformation of `ours` does: forward
-    and backward about 20 ms for 50 (timed by hand; 6,000 Gaussians, width 128, one thread); the built-in tiger held
-    out, standard, mean of three seeds that differ by .8: 20.3 dB for 20.0 (single precision, on another machine)."""
+    """Multiply in bfloat16 on a CPU that has it (docs/experiments/bfloat16.md)."""
 
 
 class Motion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -107,9 +105,6 @@ class D3dgsStarConfig(D3dgsConfig, frozen=True, forbid_unknown_fields=True, kw_o
     """`d3dgs-star`; the defaults are `d3dgs`'s with the silhouette loss of `ours` and its start."""
 
     mirrored: Share = 0.5
-    """Share of the steps that see a mirror image, at negative times (the paper's is open; `ours`: half). An eighth, as
-    presets of `ours` have it, gains nothing sure: tiger, held out, mean of three seeds 19.8 for 19.3 (quick), 20.5 for
-    20.3 (standard, seeds differ by .8); giraffe 25.9 (standard, one seed) for 26.2
-    (three, network in single precision)."""
+    """Share of the steps that see a mirror image, at negative times; the paper leaves it open."""
     canonical: StarCanonical = StarCanonical()
     loss: StarLoss = StarLoss()
