@@ -76,8 +76,7 @@ class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     octave_frames: Whole = 24
     """Frames that `frequencies` octaves suffice for; each doubling of the clip adds an octave; 0 adds none."""
     encoding: Literal["group", "view"] = "group"
-    """Sign that multiplies time in the code: the group's m, or the image's v ("w/o Symm. Enc."); unused where `tied`.
-    """
+    """Sign that multiplies time in the code: the group's m, or the image's v ("w/o Symm. Enc."); unused if `tied`."""
     explicit_group: bool = False
     """Append the group sign m to the code."""
     width: Count = 128
@@ -117,8 +116,7 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     max_log_scale: Positive = 1.0
     """Bound on the change of log scale (tanh)."""
     half: bool = True
-    """Round the factors of the network's products to bfloat16 where a CPU multiplies such pairs; sums stay in float32.
-    """
+    """Round the factors of the network's products to bfloat16 where a CPU multiplies such pairs; sums in float32."""
     sampled: Whole = 2000
     """Gaussians sampled for the gradients of the network's parameters (ours/fused/sampled_rows.py); 0 uses all."""
     ramp_start: Weight = 0.05
@@ -236,8 +234,7 @@ class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     rigid_neighbours: Count = 5
     """Neighbours that a Gaussian is compared with."""
     steady: Weight = 0.1
-    """Deformed branch: weight of the squared change of log scale, against growing scales that the deformation shrinks.
-    """
+    """Deformed branch: weight of the squared change of log scale, against scales that grow and are shrunk again."""
 
 
 class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -37,8 +37,7 @@ DEFORMATION = Kernel(
 )
 
 CHUNK = 11 * BLOCK
-"""Gaussians of a unit of work; parameter gradients are summed by unit, so they do not depend on the number of threads.
-"""
+"""Gaussians of a unit of work; gradients are summed by unit, so they do not depend on the number of threads."""
 
 
 @kernel
