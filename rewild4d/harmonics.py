@@ -10,7 +10,6 @@ from torch.nn.functional import normalize
 
 from rewild4d.kernels.harmonics import C0 as C0
 from rewild4d.kernels.harmonics import C1, C2, C3, HARMONICS, shade, turn
-from rewild4d.products import products
 from rewild4d.types import Splats
 
 
@@ -146,3 +145,19 @@ def seen_colors(splats: Splats, eye: Tensor) -> Tensor:
     directions = normalize(splats.means - eye, dim=-1)
     values = basis(directions, round(count**0.5) - 1)
     return (torch.einsum("nk,nkc->nc", values, splats.colors) + 0.5).clamp_min(0)
+
+
+def products(a: Tensor, b: Tensor) -> Tensor:
+    """Return all a_i b_j, i the slower index, [..., n] and [..., m] -> [..., n m].
+
+    The components are spread by matrices of zeros and ones: the gradient of a broadcast product would be a sum along
+    short axes, which takes a CPU twice as long.
+    """
+    left, right = _spread(a.shape[-1], b.shape[-1], a.device, a.dtype)
+    return (a @ left) * (b @ right)
+
+
+@cache
+def _spread(n: int, m: int, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    left, right = torch.eye(n).repeat_interleave(m, dim=1), torch.eye(m).repeat(1, n)
+    return left.to(device, dtype), right.to(device, dtype)

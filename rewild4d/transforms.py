@@ -11,8 +11,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from rewild4d.harmonics import rotated
-from rewild4d.products import products
+from rewild4d.harmonics import products, rotated
 from rewild4d.types import Camera, Splats
 
 
