@@ -27,9 +27,8 @@ def test_what_flags_need_imports_nothing_heavy() -> None:
               "metrics.score", "priors.config", "ours.config"]  # fmt: skip
     settings = sorted({module.removeprefix("rewild4d.") for module, _, _ in registry.SETTINGS.values()})
     modules = ["rewild4d", *(f"rewild4d.{name}" for name in ("cli", *ground, *settings, *commands))]
-    done = python(
-        f"import importlib, sys\nfor name in sys.argv[1:]:\n    importlib.import_module(name); {TELL}", *modules
-    )
+    each = f"import importlib, sys\nfor name in sys.argv[1:]:\n    importlib.import_module(name); {TELL}"
+    done = python(each, *modules)
     assert dict(zip(modules, done.stderr.splitlines(), strict=False)) == dict.fromkeys(modules, "heavy:")
 
 
@@ -117,7 +116,8 @@ def interrupted(folder: Path, body: str) -> subprocess.CompletedProcess[str]:
     (folder / "library.py").write_text(INTERRUPT)
     (folder / "imported.py").write_text("import os, library\nlibrary.swallow(os.kill, os.getpid())\n")
     (folder / "command.py").write_text(f"import os\nimport library\n\ndef main(arguments):\n{body}\n    return 0\n")
-    stand_in = f"import sys; sys.path.insert(0, {str(folder)!r}); import command"
+    unignored = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"  # a test in the background
+    stand_in = f"{unignored}; import sys; sys.path.insert(0, {str(folder)!r}); import command"
     code = f"{stand_in}; sys.modules['rewild4d.commands.overview'] = command; from rewild4d.cli import main; main()"
     return subprocess.run([sys.executable, "-c", code, "list"], capture_output=True, text=True, start_new_session=True)
 
