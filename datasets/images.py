@@ -1,15 +1,15 @@
-"""From image files to small premultiplied RGBA on disk: decode, cut a window, average down, keep.
+"""Decode image files to small premultiplied RGBA on disk: cut a window, average it down, keep it.
 
 A framing is one window of the source image per view; the window may reach over the border, where it is transparent.
 So "full", "letterbox" and "crop" share one path, and `Window.camera` moves the camera with the pixels.
 """
 
 import math
-import struct
-import zlib
+import re
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
 import cv2
@@ -29,10 +29,9 @@ CROP_MARGIN = 0.075
 _THREADS = 2
 _CACHE_VERSION = "2"
 ORIENTATION = 0x0112
-"""EXIF tag of how a picture is turned."""
+"""EXIF tag of an image's rotation."""
 _FLIPS = {2: (1, -1), 3: (-1, -1), 4: (-1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}
 """Steps along rows and columns of an upright picture, by EXIF orientation."""
-_PNG = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ def read_rgb(path: Path, upright: bool = False) -> np.ndarray:
 
     Args:
         path: PNG or JPEG.
-        upright: turn the image as its EXIF tag says; not where a camera was calibrated on the stored pixels.
+        upright: rotate the image as its EXIF tag says; not where a camera was calibrated on the stored pixels.
 
     Raises:
         UserError: the file cannot be read, or is cut off or damaged.
@@ -86,7 +85,7 @@ def read_rgb(path: Path, upright: bool = False) -> np.ndarray:
 
 
 def read_alpha(path: Path) -> np.ndarray:
-    """Matte of any PNG mode, uint8 [h, w]: the alpha channel where it is not opaque all over, else the luminance.
+    """Return a matte of any PNG mode, uint8 [h, w]: alpha where it is not opaque all over, else the luminance.
 
     Raises:
         UserError: the file cannot be read, or is cut off or damaged.
@@ -102,9 +101,7 @@ def read_alpha(path: Path) -> np.ndarray:
 
 
 def read_picture(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Colour and, where the file has one, straight alpha: PNG or JPEG, grey, palette or colour, 8 or 16 bits a channel.
-
-    The picture is turned as its EXIF tag says.
+    """Read colour and, where there is one, straight alpha of a PNG or JPEG of any mode, turned as its EXIF tag says.
 
     Returns:
         Colour in [0, 1], float32 [h, w, 3], and alpha in [0, 1], float32 [h, w], or None.
@@ -130,9 +127,9 @@ def read_pair(pair: ImagePair, source: tuple[int, int] | None = None) -> tuple[n
         UserError: as `read_rgb`, or a size that differs.
     """
     rgb = read_rgb(pair.rgb)
-    _expect_size(pair.rgb, rgb, source, "the other images")
+    expect_size(pair.rgb, rgb, source, "the other images")
     alpha = read_alpha(pair.alpha)
-    _expect_size(pair.alpha, alpha, (rgb.shape[1], rgb.shape[0]), pair.rgb.name)
+    expect_size(pair.alpha, alpha, (rgb.shape[1], rgb.shape[0]), pair.rgb.name)
     return rgb, alpha
 
 
@@ -144,7 +141,7 @@ def target_size(source: tuple[int, int], selection: Selection) -> tuple[int, int
     return max(1, round(source[0] * scale)), max(1, round(source[1] * scale))
 
 
-def place(rgb: np.ndarray, alpha: np.ndarray, window: Window, size: tuple[int, int]) -> np.ndarray:
+def cut_window(rgb: np.ndarray, alpha: np.ndarray, window: Window, size: tuple[int, int]) -> np.ndarray:
     """Cut a window out of an image and average it down to ``size``, colour weighted by the matte, uint8 [h, w, 4]."""
     height, width = alpha.shape
     left, top = max(window.left, 0), max(window.top, 0)
@@ -195,7 +192,7 @@ def _fill_cache(
     jobs = [(pair, window) for frame in pairs for pair, window in zip(frame, framed, strict=True)]
 
     def work(job: tuple[ImagePair, Window]) -> np.ndarray:
-        return place(*read_pair(job[0], source), job[1], size)
+        return cut_window(*read_pair(job[0], source), job[1], size)
 
     header = {"descr": "|u1", "fortran_order": False, "shape": (len(pairs), len(framed), size[1], size[0], 4)}
     # Written last: its presence says that the cache is complete.
@@ -218,12 +215,11 @@ def _windows(
     progress = tqdm(views, desc=f"framing {title}", disable=None, leave=False)
     with ThreadPoolExecutor(_THREADS) as pool:
         boxes = [_box(pool.map(lambda pair: read_alpha(pair.alpha), view)) for view in progress]
-    return [_padded(box) if box else _square(whole, max(source)) for box in boxes]
-
-
-def _padded(box: Window) -> Window:
-    side = max(box.width, box.height)
-    return _square(box, side + 2 * math.ceil(CROP_MARGIN * side))
+    sides = [max(box.width, box.height) if box else 0 for box in boxes]
+    return [
+        _square(box, side + 2 * math.ceil(CROP_MARGIN * side)) if box else _square(whole, max(source))
+        for box, side in zip(boxes, sides, strict=True)
+    ]
 
 
 def _square(box: Window, side: int) -> Window:
@@ -253,7 +249,8 @@ def _key(pairs: Sequence[Sequence[ImagePair]], selection: Selection) -> str:
     return digest(*parts)[:32]
 
 
-def _expect_size(path: Path, image: np.ndarray, size: tuple[int, int] | None, other: str) -> None:
+def expect_size(path: Path, image: np.ndarray, size: tuple[int, int] | None, other: str) -> None:
+    """Raise a `UserError` where an image [h, w, ...] differs from the width and height of ``other``; None: any."""
     if size and (image.shape[1], image.shape[0]) != size:
         raise UserError(
             f"{path}: expected {size[0]}x{size[1]} pixels like {other}, got {image.shape[1]}x{image.shape[0]}."
@@ -265,8 +262,8 @@ def _decode(path: Path, mode: int, upright: bool = False) -> np.ndarray:
         data = path.read_bytes()
     except OSError as error:
         raise UserError(f"{path}: expected an image that can be read, but: {error.strerror}.") from error
-    fault = _png_fault(data) if data.startswith(_PNG) else _jpeg_fault(data)
-    # Cameras know nothing of EXIF, so an orientation tag must not turn the image.
+    fault = _fault(data)
+    # Cameras know nothing of EXIF, so an orientation tag must not rotate the image.
     mode = mode if upright else mode | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = None if fault else cv2.imdecode(np.frombuffer(data, dtype=np.uint8), mode)
@@ -278,46 +275,33 @@ def _decode(path: Path, mode: int, upright: bool = False) -> np.ndarray:
 
 
 def _upright(path: Path, image: np.ndarray) -> np.ndarray:
-    """What OpenCV leaves undone when it reads a file unchanged: its EXIF turn, and one grey that means transparent."""
+    """Apply what OpenCV ignores in an unchanged file: its EXIF rotation, and one grey that means transparent."""
     with Image.open(path) as stored:
-        turn = stored.getexif().get(ORIENTATION, 1)
+        orientation = stored.getexif().get(ORIENTATION, 1)
         if image.ndim == 2 and stored.mode == "L" and isinstance(stored.info.get("transparency"), int):
             alpha = np.where(image == stored.info["transparency"], 0, 255).astype(np.uint8)
             image = np.dstack((image, image, image, alpha))
-    turned = image.swapaxes(0, 1) if turn >= 5 else image
+    image = image.swapaxes(0, 1) if orientation >= 5 else image
     # 1 to 8: as it is, mirrored, upside down, flipped; and the same after rows and columns were exchanged.
-    rows, columns = _FLIPS.get(turn, (1, 1))
-    return turned[::rows, ::columns]
+    rows, columns = _FLIPS.get(orientation, (1, 1))
+    return image[::rows, ::columns]
 
 
-def _png_fault(data: bytes) -> str:
-    """Return what is wrong with a PNG file, or "": OpenCV returns half an image where a file is cut off."""
-    position = len(_PNG)
-    while position + 12 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, position)
-        end = position + 12 + length
-        if end > len(data):
-            break
-        if zlib.crc32(memoryview(data)[position + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
-            return f"a PNG with a damaged {kind.decode('latin-1')} chunk"
-        if kind == b"IEND":
-            return ""
-        position = end
-    return f"a PNG that is cut off after {len(data)} bytes"
-
-
-def _jpeg_fault(data: bytes) -> str:
-    if not data.startswith(b"\xff\xd8"):
+def _fault(data: bytes) -> str:
+    """Return what is wrong with an image file, or "": OpenCV returns half an image where a file is cut off."""
+    kind = "PNG" if data.startswith(b"\x89PNG") else "JPEG" if data.startswith(b"\xff\xd8") else ""
+    if not kind:
         return "a file that is neither PNG nor JPEG" if data else "an empty file"
-    return "" if b"\xff\xd9" in data[_jpeg_scan(data) :] else f"a JPEG that is cut off after {len(data)} bytes"
-
-
-def _jpeg_scan(data: bytes) -> int:
-    """Where the pixels of a JPEG begin: a thumbnail before them has an end of its own, and a trailer may follow."""
-    position = 2
-    while position + 4 <= len(data) and data[position : position + 2] != b"\xff\xda":
-        if data[position + 1] == 0xFF:  # a marker may stand behind any number of these
-            position += 1
-            continue
-        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
-    return position
+    try:
+        with Image.open(BytesIO(data), formats=[kind]) as image:
+            image.verify() if kind == "PNG" else image.load()
+    except Image.DecompressionBombError:  # OpenCV has a limit of its own
+        return ""
+    except (OSError, SyntaxError, ValueError) as error:
+        damaged = re.search(r"checksum in b'(\w+)'", str(error))
+        return (
+            f"a PNG with a damaged {damaged[1]} chunk"
+            if damaged
+            else f"a {kind} that is cut off after {len(data)} bytes"
+        )
+    return ""

@@ -1,30 +1,20 @@
-"""Verifies an Artemis / DFA animal's folder without stopping at the first fault, with the reader's own validators."""
+"""Verify an Artemis / DFA animal's folder without stopping at the first fault, with the reader's own validators."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, ParamSpec, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from rewild4d.contracts import Finding
-from rewild4d.datasets.artemis.files import (
-    NO_LICENCE,
-    list_frames,
-    list_images,
-    list_motions,
-    motion_folders,
-    read_cameras,
-    read_intrinsics,
-    read_licence,
-)
+from rewild4d.datasets.artemis import files
 from rewild4d.datasets.artemis.recipe import FILE as RECIPE
 from rewild4d.datasets.artemis.recipe import read_recipe
 from rewild4d.datasets.artemis.views import SOLID, Look, covered, look, strayed, strayed_sentence
-from rewild4d.datasets.artemis.volume import SURFACE_POINTS, Surface, read_pose, read_skeleton, read_surface
+from rewild4d.datasets.artemis.volume import SURFACE_POINTS, Voxels, read_pose, read_skeleton, read_surface
 from rewild4d.datasets.images import ImagePair, read_alpha, read_pair, read_rgb
 from rewild4d.datasets.masking.masks import FRAMED
 from rewild4d.errors import UserError
@@ -37,8 +27,9 @@ COVERED = 0.75
 LOOKED_AT = 12
 """Views whose mattes are held against the voxels."""
 
-_Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
+_Study = tuple[Look | None, float]
+"""What a pair of images holds: the matte's look, and the darkest value of the animal's mean colour."""
 
 
 def check_animal(animal: Path) -> list[Finding]:
@@ -54,18 +45,18 @@ class _Check:
     def __init__(self, animal: Path) -> None:
         self.animal = animal
         self.findings: list[Finding] = []
-        self.surface: Surface | None = None
+        self.surface: Voxels | None = None
 
     def run(self) -> list[Finding]:
         animal = self.animal
-        cameras = self._attempt(read_cameras, animal / "CamPose.inf")
+        cameras = self._attempt(files.read_cameras, animal / "CamPose.inf")
         views = len(cameras) if cameras is not None else 0
-        intrinsics = self._attempt(read_intrinsics, animal / "Intrinsic.inf", views) if views else None
-        self._attempt(list_motions, animal)
+        intrinsics = self._attempt(files.read_intrinsics, animal / "Intrinsic.inf", views) if views else None
+        self._attempt(files.list_motions, animal)
         bones = self._skeleton()
-        motions = motion_folders(animal)
+        motions = files.motion_folders(animal)
         for motion in motions:
-            frames = self._attempt(list_frames, motion) or []
+            frames = self._attempt(files.list_frames, motion) or []
             for number in range(len(frames) if bones else 0):
                 self._attempt(read_pose, animal, motion.name, number, bones)
             if cameras is not None:
@@ -93,7 +84,7 @@ class _Check:
     ) -> None:
         """Decode every view of every frame, and hold what the first one shows against cameras and voxels."""
         views = len(camera_to_world)
-        listed = [self._attempt(list_images, frame, views) for frame in frames]
+        listed = [self._attempt(files.list_images, frame, views) for frame in frames]
         pairs = [pair for found in listed for pair in found or []]
         first = self._attempt(read_rgb, pairs[0].rgb) if pairs else None
         source = (first.shape[1], first.shape[0]) if first is not None else None
@@ -106,12 +97,12 @@ class _Check:
                 cameras = [
                     Camera(*pair, *source) for pair in zip(world_to_camera, torch.from_numpy(intrinsics), strict=True)
                 ]
-                looks = [study.look if study else None for study in studies[:views]]
+                looks = [study[0] if study else None for study in studies[:views]]
                 self._geometry(motion, cameras, pairs[:views], looks)
         if any(pair.rgb.suffix.lower() != ".png" for pair in pairs):
             self._add("warning", self.animal / "img" / motion, "images are JPEG: expect compression at the silhouette")
 
-    def _studies(self, motion: str, pairs: list[ImagePair], source: tuple[int, int] | None) -> list["_Study | None"]:
+    def _studies(self, motion: str, pairs: list[ImagePair], source: tuple[int, int] | None) -> list[_Study | None]:
         """Return what each pair of images holds, None where it cannot be read."""
         title = f"checking {self.animal.name}/{motion}"
         with ThreadPoolExecutor(2) as pool:
@@ -120,18 +111,15 @@ class _Check:
         for pair, study in zip(pairs, found, strict=True):
             if isinstance(study, UserError):
                 self._fault(study)
-            elif study.look is None:
+            elif study[0] is None:
                 self._add("warning", pair.alpha, "the matte is empty: this image cannot be an input")
         return [None if isinstance(study, UserError) else study for study in found]
 
-    def _mattes(self, motion: str, pairs: list[ImagePair], studies: list["_Study | None"]) -> bool:
+    def _mattes(self, motion: str, pairs: list[ImagePair], studies: list[_Study | None]) -> bool:
         """Add what the mattes of a motion have in common; whether they show an animal at all."""
         place = self.animal / "img" / motion
-        shown = [
-            (pair, study.look, study.darkest)
-            for pair, study in zip(pairs, studies, strict=True)
-            if study and study.look
-        ]
+        studied = zip(pairs, studies, strict=True)
+        shown = [(pair, study[0], study[1]) for pair, study in studied if study and study[0]]
         highest = max((found.highest for _, found, _ in shown), default=0)
         if highest < SOLID:
             said = f": they end at {highest}; are they 0 and 1 in place of 0 and 255?" if highest else ""
@@ -174,31 +162,23 @@ class _Check:
         if off.any():
             view = int(np.flatnonzero(off)[0])
             cx, cy = intrinsics[view, :2, 2]
-            self._add(
-                "warning",
-                self.animal / "Intrinsic.inf",
-                f"the principal point of view {view} is ({cx:.0f}, {cy:.0f}), far from the middle of its "
-                f"{source[0]}x{source[1]} image: were the images resized?",
-            )
+            told = f"the principal point of view {view} is ({cx:.0f}, {cy:.0f}), far from the middle of its "
+            told += f"{source[0]}x{source[1]} image: were the images resized?"
+            self._add("warning", self.animal / "Intrinsic.inf", told)
 
     def _notes(self) -> None:
         if not (self.animal / "sequences").is_file():
             self._add("warning", self.animal / "sequences", "no list of motions: the folders under img/ are taken")
-        if read_licence(self.animal) == NO_LICENCE:
-            self._add("warning", self.animal, NO_LICENCE)
+        if files.read_licence(self.animal) == files.NO_LICENCE:
+            self._add("warning", self.animal, files.NO_LICENCE)
         recipe = self.animal / RECIPE
         if recipe.is_file() and not read_recipe(self.animal):
             self._add("warning", recipe, "the files are no longer those that were rendered: the data counts as new")
 
-    def _attempt(
-        self,
-        action: Callable[_Arguments, _Result],
-        *args: _Arguments.args,
-        **kwargs: _Arguments.kwargs,
-    ) -> _Result | None:
+    def _attempt(self, action: Callable[..., _Result], *args: Any) -> _Result | None:
         """Return what an action returns, or None and a finding where it fails."""
         try:
-            return action(*args, **kwargs)
+            return action(*args)
         except UserError as error:
             self._fault(error)
             return None
@@ -213,14 +193,6 @@ class _Check:
         self.findings.append(Finding(level, str(path), message.rstrip(".")))
 
 
-@dataclass(frozen=True)
-class _Study:
-    """What a pair of images holds: the matte's look, and the darkest value of the animal's mean colour."""
-
-    look: Look | None
-    darkest: float
-
-
 def _study(pair: ImagePair, source: tuple[int, int] | None) -> _Study | UserError:
     """Return what a pair of images holds, or what is wrong with it."""
     try:
@@ -230,4 +202,4 @@ def _study(pair: ImagePair, source: tuple[int, int] | None) -> _Study | UserErro
     found = look(alpha)
     solid = alpha >= SOLID
     darkest = float(rgb[solid].mean(axis=0).min()) if found and solid.any() else 0.0
-    return _Study(found, darkest)
+    return found, darkest

@@ -107,7 +107,7 @@ def write_intrinsics(path: Path, intrinsics: np.ndarray) -> None:
 
 
 def read_parents(folder: Path) -> np.ndarray:
-    """Parent of each bone, the root's as it stands (readers ignore it), int64, [J]; both spellings of the name.
+    """Return the parent of each bone, the root's as it stands (readers ignore it), int64, [J], from either file name.
 
     Raises:
         UserError: no such file, or not a vector of integers.
@@ -128,10 +128,7 @@ def read_parents(folder: Path) -> np.ndarray:
 
 
 def _expect_tree(path: Path, parents: np.ndarray) -> None:
-    """Fail on a parent that does not exist, or on bones that are their own ancestors; row 0 is a root whatever it says.
-
-    Further roots have -1 or their own number.
-    """
+    """Fail on a missing parent or on a cycle; row 0 is a root whatever it says, others have -1 or their own number."""
     for bone in range(1, len(parents)):
         if not -1 <= parents[bone] < len(parents):
             raise UserError(
@@ -245,7 +242,7 @@ def list_images(frame: Path, views: int) -> list[ImagePair]:
 
 
 def frames_per_second(motion: str) -> float:
-    """Return artemis motions play at 30 frames a second, or as a name such as "s1_24fps" says."""
+    """Return the frame rate that a name such as "s1_24fps" says, else 30."""
     match = re.search(r"_(\d+(?:\.\d+)?)fps$", motion, re.IGNORECASE)
     return float(match[1]) if match and float(match[1]) > 0 else 30.0
 

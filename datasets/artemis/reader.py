@@ -1,4 +1,4 @@
-"""Reads Artemis / DFA folders into clips and truths (the format: `artemis_files`, `artemis_volume`).
+"""Read Artemis / DFA folders into clips and truths (the format: `files`, `volume`).
 
 Choices that the format leaves open: RGB files hold straight colour, so premultiplying by the matte is ours; a motion
 plays at 30 frames a second unless its name says otherwise; no world axis is assumed to point up.
@@ -9,28 +9,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import overload
+from typing import Any
 
 import numpy as np
 import torch
 
 from rewild4d.contracts import Finding, Selection
+from rewild4d.datasets.artemis import files
 from rewild4d.datasets.artemis.check import check_animal
-from rewild4d.datasets.artemis.files import (
-    frames_per_second,
-    list_frames,
-    list_images,
-    list_motions,
-    motion_folders,
-    read_cameras,
-    read_intrinsics,
-    read_licence,
-)
 from rewild4d.datasets.artemis.recipe import read_recipe
 from rewild4d.datasets.artemis.rig import read_rig
-from rewild4d.datasets.artemis.selection import held_out, kept_frames, placed_view, selected_views, up_direction
+from rewild4d.datasets.artemis.selection import held_out, placed_view, selected_views, up_direction
 from rewild4d.datasets.artemis.views import SOLID, look, strayed, strayed_sentence
-from rewild4d.datasets.artemis.volume import SURFACE_POINTS, MovingSurface, Surface, read_pose, read_surface
+from rewild4d.datasets.artemis.volume import SURFACE_POINTS, MovingSurface, Voxels, read_pose, read_surface
 from rewild4d.datasets.artemis.writer import ArtemisWriter
 from rewild4d.datasets.images import Decoded, ImagePair, decode
 from rewild4d.datasets.masking.masks import FRAMED
@@ -65,11 +56,11 @@ class Artemis:
 
     @property
     def licence(self) -> str:
-        """Licences of all animals, each once."""
-        return "; ".join(sorted({read_licence(folder) for folder in self._animals.values()}))
+        """Return the licences of all animals, each once."""
+        return "; ".join(sorted({files.read_licence(folder) for folder in self._animals.values()}))
 
     def cases(self, selection: Selection) -> list[str]:
-        """Names of all cases; reads no image. Of an animal whose motions cannot be told there is one, "(unreadable)".
+        """Return names of all cases without reading images; one is "(unreadable)" of an animal with unknown motions.
 
         Animals are not verified here, so that a faulty one does not stop the others: `load` does that.
         """
@@ -82,8 +73,8 @@ class Artemis:
             UserError: no such case, or files of it that cannot be used.
         """
         if folder := self._animals.get(case.partition("/")[0]):
-            list_motions(folder)
-            read_intrinsics(folder / "Intrinsic.inf", len(read_cameras(folder / "CamPose.inf")))
+            files.list_motions(folder)
+            files.read_intrinsics(folder / "Intrinsic.inf", len(files.read_cameras(folder / "CamPose.inf")))
         known = self._table(selection)
         if case not in known:
             raise unknown_name("case", case, known)
@@ -95,7 +86,7 @@ class Artemis:
         return [finding for folder in self._animals.values() for finding in check_animal(folder)]
 
     def recipe(self, case: str) -> str:
-        """By which a rendered case is known on every processor; "" for one that was filmed, or edited since."""
+        """Return the digest of a rendered case's recipe; "" for one that was filmed, or edited since."""
         return read_recipe(self._animals[case.partition("/")[0]])
 
     def _table(self, selection: Selection) -> dict[str, tuple[str, str, str]]:
@@ -120,24 +111,26 @@ class _Motion:
 
     @cached_property
     def frames(self) -> list[int]:
-        return kept_frames(list_motions(self.folder)[self.motion], self.selection)
+        return list(range(0, files.list_motions(self.folder)[self.motion], self.selection.stride))
 
     @cached_property
     def camera_to_world(self) -> np.ndarray:
-        return read_cameras(self.folder / "CamPose.inf")
+        return files.read_cameras(self.folder / "CamPose.inf")
 
     @cached_property
     def fps(self) -> float:
-        return frames_per_second(self.motion) / self.selection.stride
+        return files.frames_per_second(self.motion) / self.selection.stride
 
     def split(self, case: str, species: str, placement: str) -> tuple[Clip, Truth]:
         """Return the clip and the truth of a case."""
         views = len(self.camera_to_world)
-        surface, poses = self._geometry()
+        surface = read_surface(self.folder)
+        bones = len(surface.bones_rest) if surface else 0
+        poses = [read_pose(self.folder, self.motion, frame, bones) for frame in self.frames if surface]
         fixed_view = self._fixed_view(placement, surface, poses)
         selected = selected_views(len(self.frames), views, self.selection, fixed_view)
-        folders = list_frames(self.folder / "img" / self.motion)
-        pairs = [list_images(folders[number], views) for number in self.frames]
+        folders = files.list_frames(self.folder / "img" / self.motion)
+        pairs = [files.list_images(folders[number], views) for number in self.frames]
         decoded = decode(pairs, self.selection, case)
         _expect_animal(decoded, pairs, selected)
         cameras = self._cameras(decoded)
@@ -145,7 +138,7 @@ class _Motion:
         shown = _Frames(decoded, cameras, list(enumerate(selected)), self.fps)
         hidden = _Frames(decoded, shown.cameras, held_out(selected, views), self.fps)
         notes = tuple(self._notes(decoded, selected))
-        clip = Clip(case, species, tuple(shown), self.fps, read_licence(self.folder), shown.digest(), notes)
+        clip = Clip(case, species, tuple(shown), self.fps, files.read_licence(self.folder), shown.digest(), notes)
         up = torch.from_numpy(up_direction(self.camera_to_world))
         if surface is None:
             return clip, Truth(hidden, None, hidden.digest(), up=up)
@@ -154,16 +147,8 @@ class _Motion:
         rig = partial(read_rig, self.folder, poses)
         return clip, Truth(hidden, moving.at, key, moving.sample, surface.diagonal, up, rig)
 
-    def _geometry(self) -> tuple[Surface | None, list[np.ndarray]]:
-        """Return the surface points at rest and the bones of each kept frame."""
-        surface = read_surface(self.folder)
-        if surface is None:
-            return None, []
-        bones = len(surface.bones_rest)
-        return surface, [read_pose(self.folder, self.motion, frame, bones) for frame in self.frames]
-
-    def _fixed_view(self, placement: str, surface: Surface | None, poses: list[np.ndarray]) -> int:
-        """The camera at a placement relative to the animal as it stands at the first frame; view 0 without one."""
+    def _fixed_view(self, placement: str, surface: Voxels | None, poses: list[np.ndarray]) -> int:
+        """Return the camera at a placement relative to the animal at the first frame; view 0 without one."""
         if not placement:
             return 0
         if surface is None:
@@ -193,7 +178,7 @@ class _Motion:
 
     def _cameras(self, decoded: Decoded) -> list[Camera]:
         """Return the world camera of each view for the decoded images."""
-        intrinsics = read_intrinsics(self.folder / "Intrinsic.inf", len(self.camera_to_world))
+        intrinsics = files.read_intrinsics(self.folder / "Intrinsic.inf", len(self.camera_to_world))
         height, width = decoded.rgba.shape[2:4]
         cameras = []
         for pose, matrix, window in zip(self.camera_to_world, intrinsics, decoded.windows, strict=True):
@@ -206,19 +191,12 @@ class _Frames(Sequence[Frame]):
     """Frames read from the memory map on access."""
 
     def __init__(self, decoded: Decoded, cameras: list[Camera], pairs: list[tuple[int, int]], fps: float) -> None:
-        self.cameras = cameras
-        self._rgba = decoded.rgba
-        self._pairs = pairs
-        self._fps = fps
+        self.cameras, self._rgba, self._pairs, self._fps = cameras, decoded.rgba, pairs, fps
 
     def __len__(self) -> int:
         return len(self._pairs)
 
-    @overload
-    def __getitem__(self, index: int) -> Frame: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Frame]: ...
-    def __getitem__(self, index: int | slice) -> Frame | Sequence[Frame]:
+    def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
             return [self[item] for item in range(*index.indices(len(self)))]
         frame, view = self._pairs[index]
@@ -251,9 +229,9 @@ def _expect_animal(decoded: Decoded, pairs: list[list[ImagePair]], selected: lis
 def _motion_names(folder: Path) -> list[str]:
     """Return motions of an animal; of a faulty one the folders that it has, or a word in their place."""
     try:
-        return list(list_motions(folder))
+        return list(files.list_motions(folder))
     except UserError:
-        return [path.name for path in motion_folders(folder)] or ["(unreadable)"]
+        return [path.name for path in files.motion_folders(folder)] or ["(unreadable)"]
 
 
 def _is_animal(folder: Path) -> bool:

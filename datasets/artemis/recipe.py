@@ -24,7 +24,7 @@ def write_recipe(folder: Path, ingredients: dict[str, Any]) -> None:
 
 
 def read_recipe(folder: Path) -> str:
-    """Digest of the recipe; "" where the folder has none, or where its files are no longer those that were rendered."""
+    """Return the digest of the recipe; "" where there is none, or where the files are no longer those rendered."""
     try:
         recipe = json.loads((folder / FILE).read_text(encoding="utf-8"))
         ingredients, files = recipe["ingredients"], recipe["files"]

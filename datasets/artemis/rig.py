@@ -42,14 +42,9 @@ def read_rig(animal: Path, poses: Sequence[np.ndarray]) -> Rig:
     np.add.at(weights, (rows, voxels.indices[nearest]), voxels.weights[nearest])
     weights /= np.maximum(weights.sum(1, keepdims=True), 1e-12)
     kept = np.flatnonzero(weights.any(axis=0))
-    return Rig(
-        torch.from_numpy(vertices),
-        torch.from_numpy(faces),
-        torch.from_numpy(weights[:, kept]),
-        torch.from_numpy(voxels.bones_rest[kept]),
-        torch.from_numpy(np.stack(poses)[:, kept]),
-        torch.from_numpy(_parents_among(kept, read_parents(animal / "bones"))),
-    )
+    bones_rest, bones = voxels.bones_rest[kept], np.stack(poses)[:, kept]
+    parents = _parents_among(kept, read_parents(animal / "bones"))
+    return Rig(*map(torch.from_numpy, (vertices, faces, weights[:, kept], bones_rest, bones, parents)))
 
 
 def skin(voxels: Voxels) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,4 @@
-"""Which camera is seen at which frame, where a camera stands relative to the animal: pure functions.
-
-Everything that is not selected for the method is held out.
-"""
+"""Select the camera of each frame; everything that is not selected for the method is held out."""
 
 import numpy as np
 
@@ -9,11 +6,6 @@ from rewild4d.contracts import Selection
 
 PLACEMENT_AZIMUTHS = {"side": 90.0, "oblique": 45.0, "frontal": 0.0}
 """Degrees between the viewing direction and the long axis of the animal, both in the horizontal plane."""
-
-
-def kept_frames(count: int, selection: Selection) -> list[int]:
-    """Return numbers of the frames of a motion that a selection keeps."""
-    return list(range(0, count, selection.stride))
 
 
 def selected_views(frames: int, views: int, selection: Selection, fixed_view: int = 0) -> list[int]:

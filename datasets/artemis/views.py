@@ -1,4 +1,4 @@
-"""Whether the cameras, mattes and voxels of an Artemis animal tell of one world.
+"""Check that the cameras, mattes and voxels of an Artemis animal are of one world.
 
 A file of the right form may still hold world-to-camera matrices, OpenGL axes or the intrinsics of a larger image. Then
 the lines of sight to the animal do not meet before the cameras.
@@ -91,13 +91,13 @@ def _direction(camera: Camera, pixel: np.ndarray) -> np.ndarray:
 def _is_near(point: torch.Tensor, camera: Camera, box: tuple[int, int, int, int]) -> bool:
     pixel, depth = camera.project(point)
     corners = np.reshape(box, (2, 2))
-    reach = max(4.0, 0.5 * float(np.ptp(corners, axis=0).max()))
-    inside = (pixel.numpy() >= corners[0] - reach) & (pixel.numpy() <= corners[1] + reach)
+    most = max(4.0, 0.5 * float(np.ptp(corners, axis=0).max()))
+    inside = (pixel.numpy() >= corners[0] - most) & (pixel.numpy() <= corners[1] + most)
     return bool(depth > 0 and inside.all())
 
 
 def covered(points: np.ndarray, camera: Camera, alpha: np.ndarray) -> float:
-    """Share of the world points [n, 3] within a view's image that fall on its matte; 0 where none is within."""
+    """Return the share of the world points [n, 3] within a view's image that fall on its matte; 0 without any."""
     pixels, depth = camera.project(torch.from_numpy(points))
     column, row = np.floor(pixels.numpy()).T
     inside = (depth.numpy() > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)

@@ -21,15 +21,16 @@ OFF, RARE = 0.05, 0.01
 
 @dataclass(frozen=True)
 class Voxels:
-    """The rest-pose volume.
+    """Voxels of the rest pose with skinning weights: all of them, or those of the surface.
 
     Attributes:
         points: centres, world units, float64, [V, 3].
-        cells: their places on the lattice, from zero, int64, [V, 3].
+        cells: their indices on the lattice, from zero, int64, [V, 3].
         indices: bones that move each voxel, 0 where the weight is, int64, [V, K].
         weights: as the files have them, nothing below zero, float64, [V, K].
         bones_rest: global bone-to-world matrices at rest, float64, [J, 4, 4].
         pitch: size of a voxel along each axis, world units, zero along an axis with one layer, [3].
+        diagonal: of the rest pose's bounding box, world units.
     """
 
     points: np.ndarray
@@ -38,41 +39,21 @@ class Voxels:
     weights: np.ndarray
     bones_rest: np.ndarray
     pitch: np.ndarray
-
-
-@dataclass(frozen=True)
-class Surface:
-    """Rest-pose surface points with skinning weights.
-
-    Attributes:
-        points: world units, float64, [n, 3].
-        indices: bones that move each point, int64, [n, K].
-        weights: as the files have them, nothing below zero, float64, [n, K].
-        bones_rest: global bone-to-world matrices at rest, float64, [J, 4, 4].
-        pitch: size of a voxel along each axis, world units, zero along an axis with one layer, [3].
-        diagonal: of the rest pose's bounding box, world units.
-    """
-
-    points: np.ndarray
-    indices: np.ndarray
-    weights: np.ndarray
-    bones_rest: np.ndarray
-    pitch: np.ndarray
     diagonal: float
 
     def posed(self, bones: np.ndarray) -> np.ndarray:
-        """Plain linear blend skinning with T_b = bones[b] @ inv(rest[b]), weights not renormalised, [n, 3]."""
+        """Return plain linear blend skinning with T_b = bones[b] @ inv(rest[b]), weights not renormalised, [n, 3]."""
         transforms = (bones @ np.linalg.inv(self.bones_rest))[:, :3]
         blended = np.einsum("nk,nkab->nab", self.weights, transforms[self.indices])
         return np.einsum("nab,nb->na", blended[..., :3], self.points) + blended[..., 3]
 
-    def thinned(self, count: int) -> "Surface":
-        """At most ``count`` of the points, always the same ones."""
+    def thinned(self, count: int) -> "Voxels":
+        """Return at most ``count`` of the points, always the same ones."""
         if len(self.points) <= count:
             return self
-        return self._rows(np.sort(np.random.default_rng(0).choice(len(self.points), count, replace=False)))
+        return self.rows(np.sort(np.random.default_rng(0).choice(len(self.points), count, replace=False)))
 
-    def sampled(self, count: int, seed: int) -> "Surface":
+    def sampled(self, count: int, seed: int) -> "Voxels":
         """Return points in the cells of the surface voxels: each voxel gets as many as any other or one more.
 
         A point lies anywhere in its voxel's cell, as the true surface does, so two seeds give independent samplings of
@@ -81,11 +62,13 @@ class Surface:
         rng = np.random.default_rng((seed, count))
         whole, rest = divmod(count, len(self.points))
         drawn = rng.choice(len(self.points), rest, replace=False)
-        picked = self._rows(np.sort(np.concatenate((np.tile(np.arange(len(self.points)), whole), drawn))))
+        picked = self.rows(np.sort(np.concatenate((np.tile(np.arange(len(self.points)), whole), drawn))))
         return replace(picked, points=picked.points + (rng.random((count, 3)) - 0.5) * self.pitch)
 
-    def _rows(self, rows: np.ndarray) -> "Surface":
-        return replace(self, points=self.points[rows], indices=self.indices[rows], weights=self.weights[rows])
+    def rows(self, rows: np.ndarray) -> "Voxels":
+        """Return some of the voxels."""
+        names = ("points", "cells", "indices", "weights")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
 
 def read_skeleton(animal: Path) -> np.ndarray:
@@ -118,19 +101,14 @@ def read_pose(animal: Path, motion: str, frame: int, bones: int) -> np.ndarray:
     return pose
 
 
-def read_surface(animal: Path) -> Surface | None:
+def read_surface(animal: Path) -> Voxels | None:
     """Return the voxels of an animal that miss one of their six neighbours, or None where it has no folder of volumes.
 
     Raises:
         UserError: as `read_voxels`.
     """
     voxels = read_voxels(animal)
-    if voxels is None:
-        return None
-    rows = np.flatnonzero(is_surface(voxels.cells))
-    diagonal = float(np.linalg.norm(np.ptp(voxels.points, axis=0)))
-    points, indices, weights = voxels.points[rows], voxels.indices[rows], voxels.weights[rows]
-    return Surface(points, indices, weights, voxels.bones_rest, voxels.pitch, diagonal)
+    return voxels and voxels.rows(np.flatnonzero(is_surface(voxels.cells)))
 
 
 def read_voxels(animal: Path) -> Voxels | None:
@@ -169,14 +147,10 @@ def read_voxels(animal: Path) -> Voxels | None:
     cells, error = lattice(points)
     if error > 0.1:
         raise UserError(f"{folder / FILES[0]}: expected voxel centres on a lattice, got one {error:.2g} cells off.")
-    return Voxels(
-        points,
-        cells,
-        np.where(used, indices, 0).astype(np.int64),
-        np.where(used, weights, 0).astype(np.float64),
-        bones_rest,
-        np.ptp(points, axis=0) / np.maximum(cells.max(axis=0), 1),
-    )
+    indices, weights = np.where(used, indices, 0).astype(np.int64), np.where(used, weights, 0).astype(np.float64)
+    extent = np.ptp(points, axis=0)
+    pitch = extent / np.maximum(cells.max(axis=0), 1)
+    return Voxels(points, cells, indices, weights, bones_rest, pitch, float(np.linalg.norm(extent)))
 
 
 def _unsound(rows: np.ndarray) -> str:
@@ -184,13 +158,9 @@ def _unsound(rows: np.ndarray) -> str:
 
 
 def lattice(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the integer cells of points on an axis-aligned lattice whose pitch may differ per axis.
+    """Return the cells (from zero, int64) of points on a lattice, [n, 3], and the worst distance from a cell's centre.
 
-    Args:
-        points: float64, [n, 3].
-
-    Returns:
-        Cells from zero, int64, [n, 3], and how far the worst point is from its cell's centre, in cells.
+    The lattice is axis-aligned, its pitch may differ per axis; the distance is in cells.
     """
     low = points.min(axis=0)
     extent = points.max(axis=0) - low
@@ -231,20 +201,20 @@ class MovingSurface:
         fps: kept frames per second.
     """
 
-    surface: Surface
+    surface: Voxels
     poses: list[np.ndarray]
     fps: float
 
     @cached_property
-    def _thinned(self) -> Surface:
+    def _thinned(self) -> Voxels:
         return self.surface.thinned(SURFACE_POINTS)
 
     def at(self, time: float) -> torch.Tensor:
-        """Return the see `types.Truth.surface`: at most `SURFACE_POINTS` voxel centres."""
+        """Return at most `SURFACE_POINTS` voxel centres (see `types.Truth.surface`)."""
         return torch.from_numpy(self._thinned.posed(self._pose(time)))
 
     def sample(self, time: float, count: int, seed: int) -> torch.Tensor:
-        """Return the see `types.Truth.sample`."""
+        """Return points anywhere in the surface voxels (see `types.Truth.sample`)."""
         return torch.from_numpy(self.surface.sampled(count, seed).posed(self._pose(time)))
 
     def _pose(self, time: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Entries of annotation files (COCO-like, BADJA) one by one: what cannot be used is left out, counted and told."""
+"""Read entries of annotation files (COCO-like, BADJA); count and report those that cannot be used."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -44,7 +44,7 @@ class LeftOut:
             yield result
 
     def told(self, group: str | None = None) -> list[str]:
-        """A sentence for every reason, which names the first such entry: of all entries, or of those of one group."""
+        """Return a sentence for every reason, with the first such entry: of all entries, or of one group."""
         chosen = [(label, fault) for label, fault in self._found if group in (None, fault.group)]
         share = f"annotations of {group}" if group else f"of {self.total} annotations"
         sentences = []
@@ -77,11 +77,7 @@ def _label(entry: Any, number: int) -> str:
 
 
 def listed(table: Any, key: str) -> list[Any]:
-    """Return a list of a table.
-
-    Raises:
-        ValueError: there is none.
-    """
+    """Return a list of a table, or raise `ValueError` where there is none."""
     if not isinstance(table, Mapping) or not isinstance(table.get(key), list):
         raise ValueError(f"no list called {key}")
     return table[key]
@@ -100,11 +96,7 @@ def look_up(table: Mapping[Any, Entry], entry: Entry, key: str) -> Entry | None:
 
 
 def image_of(images: Mapping[Any, Entry], entry: Entry) -> Entry:
-    """Return the image of an annotation.
-
-    Raises:
-        Unusable: it is not listed.
-    """
+    """Return the image of an annotation, or raise `Unusable` where it is not listed."""
     image = look_up(images, entry, "image_id")
     if image is None:
         raise Unusable("name an image that is not listed", shown(entry, "image_id"))
@@ -120,11 +112,7 @@ def numbers(values: Any) -> list[float]:
 
 
 def box_of(entry: Entry) -> tuple[float, float, float, float]:
-    """Return the left, top, width and height.
-
-    Raises:
-        Unusable: there is no such box.
-    """
+    """Return the left, top, width and height, or raise `Unusable`."""
     box = numbers(entry.get("bbox"))
     if len(box) != 4:
         raise Unusable("have no bbox of four numbers", shown(entry, "bbox"))
@@ -132,11 +120,7 @@ def box_of(entry: Entry) -> tuple[float, float, float, float]:
 
 
 def triples_of(entry: Entry, count: int) -> list[float]:
-    """x, y and v of every keypoint, [3 count].
-
-    Raises:
-        Unusable: another count of numbers, or no numbers.
-    """
+    """Return x, y and v of every keypoint, [3 count], or raise `Unusable`."""
     values = numbers(entry.get("keypoints"))
     if len(values) != 3 * count:
         raise Unusable(f"have other keypoints than {3 * count} numbers", shown(entry, "keypoints"))

@@ -15,18 +15,8 @@ from typing import Any
 
 import torch
 
-from rewild4d.datasets.keypoints.entries import (
-    Entry,
-    LeftOut,
-    Unusable,
-    box_of,
-    by_id,
-    image_of,
-    listed,
-    look_up,
-    shown,
-    triples_of,
-)
+from rewild4d.datasets.keypoints import entries
+from rewild4d.datasets.keypoints.entries import Entry, LeftOut, Unusable, shown
 from rewild4d.datasets.keypoints.keypoints import BADJA_SIZE, OfFrames, badja_joints, bounded, not_used
 from rewild4d.errors import UserError
 from rewild4d.types import Keypoints
@@ -55,9 +45,12 @@ def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int]) -> O
     left = LeftOut()
     try:
         if path.suffix.lower() == ".csv":
-            found = _csv(path.read_text(encoding="utf-8-sig"), stems)
+            rows = [row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines()) if row]
+            found = _sleap(rows, stems) if "frame_idx" in rows[0] else _deeplabcut(rows, stems)
         else:
-            found = _json(json.loads(path.read_text(encoding="utf-8")), size, left)
+            content = json.loads(path.read_text(encoding="utf-8"))
+            is_badja = isinstance(content, list)
+            found = dict(left.usable(content, partial(_badja, size=size))) if is_badja else _coco(content, left)
     except OSError as error:
         raise UserError(f"{path}: expected a keypoint file, but: {error.strerror}.") from error
     except (
@@ -83,13 +76,6 @@ def _checked(points: Points, size: tuple[int, int]) -> Keypoints:
     return bounded([name for name, *_ in points], places, torch.tensor([seen for *_, seen in points]), size)
 
 
-def _json(content: Any, size: tuple[int, int], left: LeftOut) -> dict[str, Points]:
-    """Return points by the stem of their frame; ``left`` gets the entries that cannot be used."""
-    if isinstance(content, list):
-        return dict(left.usable(content, partial(_badja, size=size)))
-    return _coco(content, left)
-
-
 def _badja(entry: Entry, size: tuple[int, int]) -> tuple[str, Points]:
     across, down = size[0] / BADJA_SIZE[0], size[1] / BADJA_SIZE[1]
     stem, places, visible = badja_joints(entry)
@@ -101,64 +87,50 @@ def _badja(entry: Entry, size: tuple[int, int]) -> tuple[str, Points]:
 
 def _coco(content: Any, left: LeftOut) -> dict[str, Points]:
     """Return the annotation with the largest box of each image."""
-    images = by_id(listed(content, "images"), "file_name", str)
-    kinds = by_id(listed(content, "categories"), "keypoints", list)
+    images = entries.by_id(entries.listed(content, "images"), "file_name", str)
+    kinds = entries.by_id(entries.listed(content, "categories"), "keypoints", list)
     largest: dict[str, float] = {}
     found: dict[str, Points] = {}
-    for stem, area, points in left.usable(listed(content, "annotations"), partial(_annotated, images, kinds)):
+    annotations = entries.listed(content, "annotations")
+    for stem, area, points in left.usable(annotations, partial(_annotated, images, kinds)):
         if area > largest.get(stem, 0.0):
             largest[stem], found[stem] = area, points
     return found
 
 
 def _annotated(images: Mapping[Any, Entry], kinds: Mapping[Any, Entry], entry: Entry) -> tuple[str, float, Points]:
-    """Return the stem of an annotation's image, the area of its box, and its points.
-
-    Raises:
-        Unusable: one of them is not there.
-    """
-    image, kind = image_of(images, entry), look_up(kinds, entry, "category_id")
+    """Return the stem of an annotation's image, the area of its box, and its points, or raise `Unusable`."""
+    image, kind = entries.image_of(images, entry), entries.look_up(kinds, entry, "category_id")
     if kind is None or not kind["keypoints"]:
         raise Unusable("name a category without names of keypoints", shown(entry, "category_id"))
-    _, _, width, height = box_of(entry)
+    _, _, width, height = entries.box_of(entry)
     if not (width > 0 and height > 0):
         raise Unusable("have an empty bbox", shown(entry, "bbox"))
     names = [str(name) for name in kind["keypoints"]]
-    values = triples_of(entry, len(names))
+    values = entries.triples_of(entry, len(names))
     triples = zip(names, values[0::3], values[1::3], values[2::3], strict=True)
     return _stem(image["file_name"]), width * height, [(name, x + 0.5, y + 0.5, v > 0) for name, x, y, v in triples]
 
 
-def _csv(text: str, stems: Sequence[str]) -> dict[str, Points]:
-    rows = [row for row in csv.reader(text.splitlines()) if row]
-    return _sleap(rows, stems) if "frame_idx" in rows[0] else _deeplabcut(rows, stems)
-
-
 def _sleap(rows: list[list[str]], stems: Sequence[str]) -> dict[str, Points]:
-    """Columns frame_idx, instance.score and <node>.x, .y, .score; the instance with the highest score of each frame."""
-    at = {name: column for column, name in enumerate(rows[0])}
-    nodes = [name[:-2] for name in at if name.endswith(".x")]
+    """Read columns frame_idx, instance.score, <node>.x, .y and .score; of each frame the instance of highest score."""
+    nodes = [name[:-2] for name in rows[0] if name.endswith(".x")]
     best: dict[str, float] = {}
     found: dict[str, Points] = {}
-    for row in rows[1:]:
-        stem, total = _counted(row[at["frame_idx"]], stems), _number(row[at["instance.score"]])
-        total = -math.inf if math.isnan(total) else total
+    for cells in rows[1:]:
+        row = dict(zip(rows[0], cells, strict=False))
+        stem, total = _counted(row["frame_idx"], stems), _number(row["instance.score"], -math.inf)
         if stem not in found or total > best[stem]:
             best[stem] = total
-            found[stem] = [
-                _detected(name, row[at[f"{name}.x"]], row[at[f"{name}.y"]], _score(row, at, name)) for name in nodes
+            found[stem] = [  # a node without a score, as in labels by hand, is certain
+                _detected(name, row[f"{name}.x"], row[f"{name}.y"], _number(row.get(f"{name}.score", ""), 1.0))
+                for name in nodes
             ]
     return found
 
 
-def _score(row: list[str], at: Mapping[str, int], name: str) -> float:
-    """Read scores; a node without one, as in labels by hand, is certain."""
-    score = _number(row[at[f"{name}.score"]]) if f"{name}.score" in at else math.nan
-    return 1.0 if math.isnan(score) else score
-
-
 def _deeplabcut(rows: list[list[str]], stems: Sequence[str]) -> dict[str, Points]:
-    """Return the header rows scorer, (individuals,) bodyparts, coords; of several individuals the first."""
+    """Read rows below the headers scorer, (individuals,) bodyparts and coords; of several individuals the first."""
     heads = {row[0].strip(): row for row in rows[:4]}
     parts, coords = heads["bodyparts"], heads["coords"]
     people = heads.get("individuals", [""] * len(parts))
@@ -185,8 +157,9 @@ def _detected(name: str, x: str, y: str, score: float) -> tuple[str, float, floa
     return name, across + 0.5, down + 0.5, math.isfinite(across) and math.isfinite(down) and score >= LIKELY
 
 
-def _number(text: str) -> float:
-    return float(text) if text.strip() else math.nan
+def _number(text: str, missing: float = math.nan) -> float:
+    number = float(text) if text.strip() else math.nan
+    return missing if math.isnan(number) else number
 
 
 def _counted(label: str, stems: Sequence[str]) -> str:

@@ -50,12 +50,9 @@ OfFrames = tuple[list[Keypoints | None], str]
 
 
 def badja_joints(entry: Entry) -> tuple[str, list[tuple[float, float]], list[bool]]:
-    """Return an entry of BADJA's: the stem of its frame, and (column, row) and visibility of every joint.
+    """Return the stem of the frame of BADJA's entry, and (column, row) and visibility of every joint.
 
-    Places are in a frame of `BADJA_SIZE`, pixel centres at +0.5.
-
-    Raises:
-        Unusable: one of them is not there, or they do not fit each other.
+    Positions are in a frame of `BADJA_SIZE`, pixel centres at +0.5. An entry that lacks one of them is `Unusable`.
     """
     path, joints, visible = entry.get("image_path"), entry.get("joints"), entry.get("visibility")
     if not isinstance(path, str):
@@ -72,14 +69,7 @@ def badja_joints(entry: Entry) -> tuple[str, list[tuple[float, float]], list[boo
 
 
 def bounded(names: Sequence[str], points: Tensor, seen: Tensor, size: tuple[int, int]) -> Keypoints:
-    """Return keypoints of which those outside their frame are not visible.
-
-    Args:
-        names: [n].
-        points: (column, row) in pixels, [n, 2].
-        seen: which of them the file says are visible, bool, [n].
-        size: width and height of the frame.
-    """
+    """Return keypoints [n, 2] (column, row), of which those outside their frame (width, height) are not visible."""
     return Keypoints(tuple(names), points, seen & inside(points, size))
 
 
@@ -89,15 +79,7 @@ def inside(points: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def not_used(path: Path, found: Sequence[Keypoints | None], size: tuple[int, int], left: LeftOut) -> str:
-    """A sentence on the points that a file marks as seen but that lie outside their frame, and on the entries that were
-    left out; "" where there are none.
-
-    Args:
-        path: of the file.
-        found: of each frame.
-        size: width and height of the frames in pixels.
-        left: entries of the file.
-    """
+    """Describe a file's points outside their frames (of ``size``, width and height) and the entries left out, or ""."""
     count = sum(int((~inside(keypoints.points, size)).sum()) for keypoints in found if keypoints is not None)
     outside = [f"{count} keypoints outside their frame taken as not visible"] if count else []
     return "; ".join([*outside, *(f"{path.name}: {sentence}" for sentence in left.told())])

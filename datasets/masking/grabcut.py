@@ -59,13 +59,7 @@ def rough_masks(source: Unmasked) -> Iterator[np.ndarray]:
 
 
 def from_box(image: np.ndarray, box: Box, scale: float) -> np.ndarray:
-    """Return the mask inside a box, 0 or 1.
-
-    Args:
-        image: [h, w, 3].
-        box: in pixels of the original frame.
-        scale: of ``image`` over the original frame.
-    """
+    """Return the mask inside a box (pixels of the original frame, ``scale`` of which ``image`` has), 0 or 1."""
     height, width = image.shape[:2]
     left, top = (round(max(0.0, value * scale)) for value in box[:2])
     right, bottom = (round((box[i] + box[i + 2]) * scale) for i in (0, 1))
@@ -93,8 +87,8 @@ def from_mask(image: np.ndarray, carried: np.ndarray) -> np.ndarray | None:
     area = int(carried.sum())
     if not area:
         return None
-    reach = max(3, round(GROWN * area**0.5))
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    radius = max(3, round(GROWN * area**0.5))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     near, sure = cv2.dilate(carried, kernel), cv2.erode(carried, kernel)
     labels = np.where(near > 0, np.where(carried > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD).astype(np.uint8)
     labels[sure > 0] = cv2.GC_FGD
@@ -111,10 +105,8 @@ def _cut(image: np.ndarray, labels: np.ndarray, rounds: int) -> np.ndarray:
     part = slice(max(0, y - pad), min(height, y + h + pad)), slice(max(0, x - pad), min(width, x + w + pad))
     window = np.ascontiguousarray(labels[part])
     cv2.setRNGSeed(0)  # its colour models start at random
-    cv2.grabCut(
-        np.ascontiguousarray(image[part]), window, (0, 0, 0, 0), np.zeros((1, 65)), np.zeros((1, 65)), rounds,
-        cv2.GC_INIT_WITH_MASK,
-    )  # fmt: skip
+    models, pixels = np.zeros((2, 1, 65)), np.ascontiguousarray(image[part])
+    cv2.grabCut(pixels, window, (0, 0, 0, 0), models[0], models[1], rounds, cv2.GC_INIT_WITH_MASK)
     mask = np.zeros_like(labels)
     mask[part] = np.isin(window, (cv2.GC_FGD, cv2.GC_PR_FGD))
     return mask

@@ -70,11 +70,7 @@ def grounded_masks(
 
 
 def load_networks(detector: str, segmenter: str, device: torch.device) -> Networks:
-    """Load both networks.
-
-    Raises:
-        UserError: `transformers` is missing or too old, or a model cannot be loaded.
-    """
+    """Load both networks; its errors are those of `grounded_masks`."""
     try:
         from transformers import AutoModelForZeroShotObjectDetection, AutoTokenizer, Sam2Model
     except (ImportError, RuntimeError) as error:  # a torchvision that does not fit torch is a RuntimeError
@@ -82,12 +78,9 @@ def load_networks(detector: str, segmenter: str, device: torch.device) -> Networ
             "--tool grounded-sam2: expected the package transformers (4.56 or newer), run: pip install -e "
             f"'.[masks]' ({_first_line(error)})."
         ) from error
+    wanted = (AutoModelForZeroShotObjectDetection, detector), (AutoTokenizer, detector), (Sam2Model, segmenter)
     loaded = []
-    for kind, name in (
-        (AutoModelForZeroShotObjectDetection, detector),
-        (AutoTokenizer, detector),
-        (Sam2Model, segmenter),
-    ):
+    for kind, name in wanted:
         try:
             loaded.append(kind.from_pretrained(name))
         except (OSError, ValueError, RuntimeError, KeyError) as error:
@@ -99,10 +92,10 @@ def load_networks(detector: str, segmenter: str, device: torch.device) -> Networ
 
 @torch.no_grad()
 def find_box(networks: Networks, image: np.ndarray, prompt: str, before: Tensor | None) -> Tensor | None:
-    """The box of what the prompt names, left, top, right, bottom in pixels, [4]; None where nothing is sure enough.
+    """Return left, top, right, bottom of what the prompt names, pixels, [4]; None where nothing is sure enough.
 
     Args:
-        networks: loaded.
+        networks: both of them.
         image: uint8 [h, w, 3].
         prompt: lower case, with a full stop.
         before: the box in the frame before, [4].
@@ -126,7 +119,8 @@ def find_box(networks: Networks, image: np.ndarray, prompt: str, before: Tensor 
 def fill_box(networks: Networks, image: np.ndarray, box: Tensor) -> np.ndarray:
     """Return the mask of what a box holds, uint8 [h, w]; SAM 2 sees the frame stretched to a square."""
     height, width = image.shape[:2]
-    side = _side(networks.segmenter.config)
+    side = networks.segmenter.config.prompt_encoder_config.image_size
+    side = int(side if isinstance(side, int) else side[0])
     pixels = prepared(image, (side, side), networks.device)
     scaled = box * torch.tensor((side / width, side / height, side / width, side / height))
     out = networks.segmenter(
@@ -150,11 +144,6 @@ def overlap(boxes: Tensor, box: Tensor) -> Tensor:
     shared = (upper - lower).clamp_min(0).prod(dim=1)
     areas = [(each[..., 2:] - each[..., :2]).clamp_min(0).prod(dim=-1) for each in (boxes, box)]
     return shared / (areas[0] + areas[1] - shared).clamp_min(1e-9)
-
-
-def _side(config: Any) -> int:
-    size = config.prompt_encoder_config.image_size
-    return int(size if isinstance(size, int) else size[0])
 
 
 def _first_line(error: Exception) -> str:

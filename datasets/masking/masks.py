@@ -1,4 +1,4 @@
-"""Masks from files of any kind: which values mean the animal, and which mask belongs to which frame.
+"""Read masks from files of any kind: which values mean the animal, and which frame a mask belongs to.
 
 The same value means different things: 255 is the foreground of DAVIS 2016 (grey images of 0 and 255) and "void" in
 DAVIS 2017 (indexed images whose values are object ids). So a folder is read as a whole before its values are told.
@@ -31,8 +31,6 @@ FILM_TINT = 40
 """Largest difference of two channels where a film of masks is grey: compression tints it."""
 CUT_SHARE = 0.1
 """The animal is cut where it touches the image's border along more than this share of its shorter side."""
-
-
 FRAMED = 0.9
 """Of an image's border that is animal: more, and the mask is inverted or covers everything."""
 
@@ -293,8 +291,8 @@ def match_masks(masks: Sequence[Path], stems: Sequence[str], folder: Path) -> tu
     if not masks:
         raise UserError(f"{folder}: expected masks ({', '.join(SUFFIXES)}), got none.")
     by_name = {mask.stem: mask for mask in masks}
-    by_number = {number: mask for mask in masks if (number := _number(mask.stem)) is not None}
-    numbers = [number for stem in stems if (number := _number(stem)) is not None]
+    by_number = {number: mask for mask in masks if (number := last_number(mask.stem)) is not None}
+    numbers = [number for stem in stems if (number := last_number(stem)) is not None]
     counted = len(by_number) == len(masks) and len({*numbers}) == len(stems)
     shift = min(by_number) - min(numbers) if counted else 0
     # Numbers that fit no frame as they are, and all fit one by one: counted from 1 beside frames from 0, or vice versa.
@@ -323,6 +321,7 @@ def _left_over(masks: Sequence[Path], found: Sequence[Path | None]) -> str:
     return f"{len(rest)} of {len(masks)} masks fit no frame: {', '.join(rest[:3])}{', ...' if len(rest) > 3 else ''}"
 
 
-def _number(stem: str) -> int | None:
+def last_number(stem: str) -> int | None:
+    """Return the last number in a file's name, or None."""
     found = re.findall(r"[0-9]+", stem)
     return int(found[-1]) if found else None

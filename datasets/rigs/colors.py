@@ -32,8 +32,8 @@ def base_texture(
     if accessor is None:
         raise document.error(f"expected TEXCOORD_{channel} in a textured mesh, but a primitive lacks it")
     angle = extension.get("rotation", 0.0)
-    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    uv = document.floats(accessor) * extension.get("scale", (1.0, 1.0)) @ turn.T + extension.get("offset", (0.0, 0.0))
+    turned = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    uv = document.floats(accessor) * extension.get("scale", (1.0, 1.0)) @ turned.T + extension.get("offset", (0.0, 0.0))
     texture = document.tree.textures[info.index]
     webp = (texture.extensions or {}).get("EXT_texture_webp", {})
     image = document.image(webp.get("source", texture.source))

@@ -53,19 +53,15 @@ class Document:
         if unreadable:
             raise self.error(f"expected plain glTF, but the file requires {', '.join(sorted(unreadable))}")
         self._buffers: dict[int, bytes] = {}
-        self.parents = self._parents()
+        self.parents = [-1] * len(self.tree.nodes)
+        for index, node in enumerate(self.tree.nodes):
+            for child in node.children or []:
+                self.parents[child] = index
         self.order = self._topological_order()
 
     def error(self, sentence: str) -> UserError:
         """Return the error for a fault of this file."""
         return UserError(f"{self.path}: {sentence}.")
-
-    def _parents(self) -> list[int]:
-        parents = [-1] * len(self.tree.nodes)
-        for index, node in enumerate(self.tree.nodes):
-            for child in node.children or []:
-                parents[child] = index
-        return parents
 
     def _topological_order(self) -> list[int]:
         order = [index for index, parent in enumerate(self.parents) if parent < 0]
@@ -98,7 +94,7 @@ class Document:
         return self._buffers[index]
 
     def beside(self) -> Iterator[bytes]:
-        """Bytes of the buffers and images that lie in files of their own, in the order in which they are named."""
+        """Yield bytes of the buffers and images that lie in files of their own, in the order of the file."""
         for entry in (*self.tree.buffers, *self.tree.images):
             if entry.uri is not None and not entry.uri.startswith("data:"):
                 yield self._fetch(entry.uri)
@@ -135,22 +131,18 @@ class Document:
         if accessor.type not in COMPONENTS or accessor.componentType not in TYPES:
             raise self.error(f"expected an accessor type that skins use, but accessor {index} is {accessor.type}")
         dtype, width = TYPES[accessor.componentType], COMPONENTS[accessor.type]
-        if not 0 <= accessor.count <= MOST_VALUES:
-            raise self.error(
-                f"expected accessor {index} to hold up to {MOST_VALUES} values, but it says {accessor.count}"
-            )
+        if not 0 <= (count := accessor.count) <= MOST_VALUES:
+            raise self.error(f"expected accessor {index} to hold up to {MOST_VALUES} values, but it says {count}")
         if accessor.bufferView is None:
             values = np.zeros((accessor.count, width), dtype)
         else:
             values = self._view(accessor.bufferView, accessor.byteOffset, accessor.count, width, dtype)
         if accessor.sparse is not None:
-            sparse = accessor.sparse
-            kind = TYPES[sparse.indices.componentType]
-            rows = self._view(sparse.indices.bufferView, sparse.indices.byteOffset, sparse.count, 1, kind)
+            places, new = accessor.sparse.indices, accessor.sparse.values
+            count, kind = accessor.sparse.count, TYPES[places.componentType]
+            rows = self._view(places.bufferView, places.byteOffset, count, 1, kind)[:, 0].astype(np.int64)
             values = values.copy()
-            values[rows[:, 0].astype(np.int64)] = self._view(
-                sparse.values.bufferView, sparse.values.byteOffset, sparse.count, width, dtype
-            )
+            values[rows] = self._view(new.bufferView, new.byteOffset, count, width, dtype)
         if accessor.normalized:
             return np.maximum(values.astype(np.float64) / np.iinfo(dtype).max, -1.0)
         return values
@@ -189,11 +181,6 @@ class Document:
         """Return weights of the morph targets that a node gives instead of its mesh's; None where it gives none."""
         weights: list[float] | None = self._written["nodes"][index].get("weights")
         return weights
-
-    def animated_nodes(self, animation: int) -> set[int]:
-        """Return nodes that an animation moves."""
-        channels = self.tree.animations[animation].channels
-        return {channel.target.node for channel in channels if channel.target.node is not None}
 
     def clip_range(self, animation: int) -> tuple[float, float]:
         """Return the first and last key time of an animation in seconds."""
@@ -264,7 +251,7 @@ def consistent(path: Path) -> Iterator[None]:
 
 
 def sample(keys: Floats, values: Floats, interpolation: str | None, times: Floats, is_rotation: bool) -> Floats:
-    """Value of an animation channel at the given times, held constant outside its keys (specification, appendix C).
+    """Return an animation channel at the given times, held constant outside its keys (specification, appendix C).
 
     Args:
         keys: increasing key times in seconds, [k].
@@ -327,7 +314,7 @@ def compose(translation: Floats, rotation: Floats, scale: Floats) -> Floats:
     """Return T R S matrices from [t, 3], xyzw quaternions [t, 4] and [t, 3] (leading sizes broadcast), [t, 4, 4]."""
     count = max(len(translation), len(rotation), len(scale))
     x, y, z, w = (rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).T
-    turn = np.array(
+    rotations = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -335,7 +322,7 @@ def compose(translation: Floats, rotation: Floats, scale: Floats) -> Floats:
         ]
     ).transpose(2, 0, 1)
     matrix = np.zeros((count, 4, 4))
-    matrix[:, :3, :3] = turn * scale[:, None, :]
+    matrix[:, :3, :3] = rotations * scale[:, None, :]
     matrix[:, :3, 3] = translation
     matrix[:, 3, 3] = 1.0
     return matrix

@@ -77,9 +77,8 @@ def _read_rig(path: Path, clip: str, shares: Floats) -> AnimatedAnimal:
     document = Document(path)
     names = _clip_names(document)
     visible = document.scene_nodes()
-    skinned = [
-        i for i in visible if document.tree.nodes[i].mesh is not None and document.tree.nodes[i].skin is not None
-    ]
+    nodes = document.tree.nodes
+    skinned = [i for i in visible if nodes[i].mesh is not None and nodes[i].skin is not None]
     if not skinned:
         raise document.error("expected a skinned mesh, but the file has none")
     if clip not in names:
@@ -90,7 +89,7 @@ def _read_rig(path: Path, clip: str, shares: Floats) -> AnimatedAnimal:
     skeleton = _Skeleton(document, animation, times)
     surfaces = [surface for index in skinned for surface in _skinned_surfaces(document, skeleton, index)]
     for index in visible:
-        if document.tree.nodes[index].mesh is not None and document.tree.nodes[index].skin is None:
+        if nodes[index].mesh is not None and nodes[index].skin is None:
             surfaces += _attached_surfaces(document, skeleton, index)
     bones = document.global_matrices(document.local_matrices(animation, times))[:, skeleton.nodes]
     return skeleton.sorted(
@@ -99,7 +98,7 @@ def _read_rig(path: Path, clip: str, shares: Floats) -> AnimatedAnimal:
             species=path.stem,
             licence=document.tree.asset.copyright or f"that of the rig file {path.name}",
             surfaces=tuple(surfaces),
-            bone_names=tuple(document.tree.nodes[i].name or f"node_{i}" for i in skeleton.nodes),
+            bone_names=tuple(nodes[i].name or f"node_{i}" for i in skeleton.nodes),
             parents=skeleton.parents(),
             bones_rest=np.stack(skeleton.rest),
             bones=bones,
@@ -138,10 +137,11 @@ class _Skeleton:
     def __post_init__(self) -> None:
         self.local = self.document.local_matrices(None, np.zeros(1))[0]
         self.default = self.document.global_matrices(self.local[None])[0]
-        self.animated = self.document.animated_nodes(self.animation)
+        channels = self.document.tree.animations[self.animation].channels
+        self.animated = {channel.target.node for channel in channels} - {None}
 
     def add(self, node: int, rest: Floats) -> int:
-        """Index of the bone of a node with this rest matrix, new where there is none.
+        """Return the index of the bone of a node with this rest matrix, new where there is none.
 
         Two skins may bind one joint differently; then it becomes two bones, and the skinning stays exact.
         """
@@ -187,21 +187,26 @@ def _skinned_surfaces(document: Document, skeleton: _Skeleton, node: int) -> lis
     root = next(k for k, joint in enumerate(joints) if not set(skeleton.ancestors(joint)) & set(joints))
     to_world = skeleton.default[joints[root]] @ inverse_bind[root]  # mesh space -> the rest pose in the world
     bones = np.array([skeleton.add(j, to_world @ np.linalg.inv(m)) for j, m in zip(joints, inverse_bind, strict=True)])
+    return _bound_surfaces(document, skeleton, node, to_world, bones, is_skinned=True)
+
+
+def _bound_surfaces(
+    document: Document, skeleton: _Skeleton, node: int, to_world: Floats, bones: NDArray[np.int64], is_skinned: bool
+) -> list[Surface]:
+    """Return the triangles of a node, bound to a skin's ``bones`` by their weights, or rigidly to the only one."""
     surfaces = []
     for primitive in document.tree.meshes[document.tree.nodes[node].mesh].primitives:
         if primitive.mode in (None, TRIANGLES, STRIP, FAN):
-            indices, weights = influences(document, primitive, len(bones))
+            count = document.tree.accessors[primitive.attributes.POSITION].count
+            rigid = np.zeros((count, 1), dtype=np.int64), np.ones((count, 1))
+            indices, weights = influences(document, primitive, len(bones)) if is_skinned else rigid
             offsets = still_offsets(document, skeleton.animation, node, primitive, skeleton.times)
             surfaces.append(read_surface(document, primitive, to_world, bones[indices], weights, offsets))
     return surfaces
 
 
 def inverse_binds(document: Document, skin: int) -> Floats:
-    """Return the mesh space -> joint space of each joint of a skin, [joints, 4, 4].
-
-    Raises:
-        UserError: too few, or one that cannot be inverted.
-    """
+    """Return the transform from mesh to joint space of each joint of a skin, [joints, 4, 4]."""
     found = document.tree.skins[skin]
     if not found.joints:
         raise document.error(f"expected joints, but skin {skin} has none")
@@ -214,7 +219,7 @@ def inverse_binds(document: Document, skin: int) -> Floats:
 
 
 def _attached_surfaces(document: Document, skeleton: _Skeleton, node: int) -> list[Surface]:
-    """Parts that hang from a joint without a skin: rigid. Parts that hang from none are scenery and give nothing."""
+    """Return the rigid parts that hang from a joint without a skin; parts that hang from none are scenery."""
     line = [node, *skeleton.ancestors(node)]
     above = next((k for k, n in enumerate(line) if n in skeleton.nodes), None)
     if above is None:
@@ -226,14 +231,7 @@ def _attached_surfaces(document: Document, skeleton: _Skeleton, node: int) -> li
     to_world = skeleton.rest[bone] @ between
     if skeleton.animated & set(line[:above]):  # it moves against the joint, so it is a bone of its own
         bone = skeleton.add(node, to_world)
-    surfaces = []
-    for primitive in document.tree.meshes[document.tree.nodes[node].mesh].primitives:
-        if primitive.mode in (None, TRIANGLES, STRIP, FAN):
-            count = document.tree.accessors[primitive.attributes.POSITION].count
-            indices, weights = np.full((count, 1), bone), np.ones((count, 1))
-            offsets = still_offsets(document, skeleton.animation, node, primitive, skeleton.times)
-            surfaces.append(read_surface(document, primitive, to_world, indices, weights, offsets))
-    return surfaces
+    return _bound_surfaces(document, skeleton, node, to_world, np.array([bone]), is_skinned=False)
 
 
 def influences(document: Document, primitive: pygltflib.Primitive, count: int) -> tuple[NDArray[np.int64], Floats]:
@@ -251,9 +249,8 @@ def influences(document: Document, primitive: pygltflib.Primitive, count: int) -
     shares = np.concatenate([document.floats(i) for i in weights if i is not None], axis=1)
     vertices = document.tree.accessors[primitive.attributes.POSITION].count
     if not len(joints) == len(shares) == vertices:
-        raise document.error(
-            f"expected joints and weights of {vertices} vertices, but {len(joints)}, {len(shares)} came"
-        )
+        came = f"{len(joints)}, {len(shares)} came"
+        raise document.error(f"expected joints and weights of {vertices} vertices, but {came}")
     total = shares.sum(1, keepdims=True)
     shares[:, :1] = np.where(total <= 0, 1.0, shares[:, :1])  # a vertex without weights follows its first joint
     joints = np.where(shares > 0, joints, joints[:, :1])
@@ -270,16 +267,14 @@ def read_surface(
     weights: Floats,
     offsets: Floats | float = 0.0,
 ) -> Surface:
-    """One primitive with its colours, vertices moved by ``offsets``, then by ``to_world``, and bound as given."""
+    """Return one primitive with its colours; ``offsets``, then ``to_world`` move its vertices."""
     positions = document.floats(primitive.attributes.POSITION) + offsets
     material = document.tree.materials[primitive.material] if primitive.material is not None else None
     factor, picture = base_color(material) if material else (None, None)
     color = np.tile(np.array(factor or (1.0, 1.0, 1.0, 1.0))[:3], (len(positions), 1))
     if primitive.attributes.COLOR_0 is not None:
         color = color * document.floats(primitive.attributes.COLOR_0)[:, :3]
-    uv, texture = None, None
-    if picture is not None:
-        uv, texture = base_texture(document, primitive, picture)
+    uv, texture = (None, None) if picture is None else base_texture(document, primitive, picture)
     return Surface(
         vertices=positions @ to_world[:3, :3].T + to_world[:3, 3],
         faces=_faces(document, primitive, len(positions)),

@@ -4,26 +4,15 @@ Every split file of APTv2 lists all images, so clips are found through annotatio
 """
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from rewild4d.datasets.keypoints.entries import (
-    Entry,
-    LeftOut,
-    Unusable,
-    box_of,
-    by_id,
-    image_of,
-    listed,
-    look_up,
-    numbers,
-    shown,
-    triples_of,
-)
+from rewild4d.datasets.keypoints import entries as coco
+from rewild4d.datasets.keypoints.entries import Entry, LeftOut, Unusable, shown
 from rewild4d.datasets.keypoints.keypoints import APT, coco_keypoints, read_json
+from rewild4d.datasets.masking.masks import last_number
 from rewild4d.errors import UserError
 from rewild4d.types import Keypoints
 
@@ -110,20 +99,11 @@ def read_annotations(root: Path) -> Annotations:
 
 
 def _add(path: Path, table: dict[str, Any], subjects: dict[str, Subject], seen: set[tuple[str, int]]) -> LeftOut:
-    """Add one file's annotations; gives those that did not fit.
-
-    Args:
-        path: of the file.
-        table: what it holds.
-        subjects: by name, which gain sightings.
-        seen: file and track of every sighting so far: splits overlap.
-    """
+    """Add one file's annotations to ``subjects`` and ``seen`` (splits overlap); return those that did not fit."""
     try:
-        entries = listed(table, "annotations")
-        images, kinds = (
-            by_id(listed(table, "images"), "file_name", str),
-            by_id(listed({"categories": []} | table, "categories"), "name", str),
-        )
+        entries = coco.listed(table, "annotations")
+        images = coco.by_id(coco.listed(table, "images"), "file_name", str)
+        kinds = coco.by_id(coco.listed({"categories": []} | table, "categories"), "name", str)
     except ValueError as error:
         raise UserError(f"{path}: expected COCO-like annotations, got {error}.") from error
     for key in ("video_id", "track_id"):
@@ -143,25 +123,17 @@ def _add(path: Path, table: dict[str, Any], subjects: dict[str, Subject], seen: 
 
 
 def _sighting(images: dict[Any, Entry], kinds: dict[Any, Entry], entry: Entry) -> tuple[str, int, int, Sighting]:
-    """Return species, track, the number of keypoints outside the image, and the sighting of one annotation.
-
-    Raises:
-        Unusable: one that is not there or makes no sense.
-    """
-    image, kind = image_of(images, entry), look_up(kinds, entry, "category_id")
+    """Return species, track, the number of keypoints outside the image, and the sighting of one annotation."""
+    image, kind = coco.image_of(images, entry), coco.look_up(kinds, entry, "category_id")
     species = str(kind["name"]) if kind else UNLISTED
     file = clean_path(image["file_name"])
     try:
         size = _size(image)
-        box = _within(box_of(entry), size, entry)
-        values = triples_of(entry, len(APT)) if entry.get("keypoints") else [0.0] * (3 * len(APT))
+        box = _within(coco.box_of(entry), size, entry)
+        values = coco.triples_of(entry, len(APT)) if entry.get("keypoints") else [0.0] * (3 * len(APT))
         keypoints, outside = coco_keypoints(values, APT, size)
-        return (
-            NAMES.get(species, species),
-            _track(entry),
-            outside,
-            Sighting(file, _number(file.stem), size, box, keypoints),
-        )
+        sighting = Sighting(file, last_number(file.stem) or 0, size, box, keypoints)
+        return NAMES.get(species, species), _track(entry), outside, sighting
     except Unusable as fault:
         fault.group = str(file.parent)
         raise
@@ -177,7 +149,7 @@ def _size(image: Entry) -> tuple[int, int]:
 
 def _track(entry: Entry) -> int:
     """Return the number of an animal in its clip; nobody may guess it."""
-    found = numbers([entry.get("track_id")])
+    found = coco.numbers([entry.get("track_id")])
     if not found or not found[0].is_integer():
         raise Unusable("have no whole number as track_id", shown(entry, "track_id"))
     return int(found[0])
@@ -204,14 +176,3 @@ def clean_path(text: str) -> PurePosixPath:
     if re.match(r"^[A-Za-z]:", str(path)) or path.is_absolute():
         return PurePosixPath(*path.parts[-3:])
     return path
-
-
-def _number(stem: str) -> int:
-    digits = re.findall(r"[0-9]+", stem)
-    return int(digits[-1]) if digits else 0
-
-
-def image_places(root: Path, file: PurePosixPath) -> Iterator[Path]:
-    """Yield where an image may lie."""
-    for folder in ("data", "", "images"):
-        yield root / folder / file

@@ -1,4 +1,4 @@
-"""Reads APTv2 and APT-36K (Yang et al. 2022, 2023): short clips with boxes, tracks and 17 keypoints, without masks.
+"""Read APTv2 and APT-36K (Yang et al. 2022, 2023): short clips with boxes, tracks and 17 keypoints, without masks.
 
     annotations/*.json    data/<easy | hard>/<species>/<clip>/0000.jpg    masks/<same path>/0000_<track>.png
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from rewild4d.contracts import Finding, Selection
 from rewild4d.datasets.masking.makers import Unmasked
 from rewild4d.datasets.masking.masks import open_masks
-from rewild4d.datasets.video.apt_files import UNLISTED, Annotations, Sighting, Subject, image_places, read_annotations
+from rewild4d.datasets.video.apt_files import UNLISTED, Annotations, Sighting, Subject, read_annotations
 from rewild4d.datasets.video.frame_files import image_size, read_images, read_masks
 from rewild4d.datasets.video.parts import with_parts
 from rewild4d.datasets.video.reader import VideoDataset
@@ -144,7 +144,7 @@ class AptV2(VideoDataset):
         return files, size
 
     def _image(self, sighting: Sighting) -> Path:
-        places = list(image_places(self.root, sighting.file))
+        places = [self.root / folder / sighting.file for folder in ("data", "", "images")]
         found = next((place for place in places if place.is_file()), None)
         if found is None:
             raise UserError(f"{places[0]}: expected this image of the annotations (or {places[1]}), got neither.")

@@ -33,9 +33,9 @@ def follow(times: Sequence[float], boxes: Sequence[Box], wanted: Sequence[float]
     """
     edges = np.asarray(boxes, dtype=np.float64)
     middle = gaussian_filter1d((edges[:, :2] + edges[:, 2:]) / 2, SMOOTH, axis=0, mode="nearest")
-    reach = np.maximum(middle - edges[:, :2], edges[:, 2:] - middle).max(axis=1)
+    extent = np.maximum(middle - edges[:, :2], edges[:, 2:] - middle).max(axis=1)
     span = 2 * math.ceil(2 * SMOOTH) + 1
-    half = gaussian_filter1d(maximum_filter1d(reach, span, mode="nearest"), SMOOTH, mode="nearest", truncate=2.0)
+    half = gaussian_filter1d(maximum_filter1d(extent, span, mode="nearest"), SMOOTH, mode="nearest", truncate=2.0)
     sides = 2 * (1 + MARGIN) * half
     known = np.asarray(times)
     at = [np.interp(wanted, known, values) for values in (middle[:, 0], middle[:, 1], sides)]

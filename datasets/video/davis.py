@@ -1,4 +1,4 @@
-"""Reads DAVIS 2016 and 2017 (Perazzi et al. 2016; Pont-Tuset et al. 2017).
+"""Read DAVIS 2016 and 2017 (Perazzi et al. 2016; Pont-Tuset et al. 2017).
 
     JPEGImages/<480p | ...>/<sequence>/00000.jpg
     Annotations/<480p | ...>/<sequence>/00000.png
@@ -10,7 +10,6 @@ BADJA's joints are read where they lie beside it.
 """
 
 import tomllib
-from collections.abc import Iterator
 from functools import cached_property, partial
 from importlib import resources
 from pathlib import Path
@@ -31,13 +30,11 @@ FPS = 24.0
 RESOLUTIONS = ("480p", "1080p", "Full-Resolution")
 """Of which the first that is there is read."""
 LICENCE = "CC BY-NC 4.0 (DAVIS, Perazzi et al. 2016, Pont-Tuset et al. 2017): attribute, non-commercial"
+_ANNOTATIONS = ("Annotations", "Annotations_unsupervised")
+_JOINTS = ("badja", "joint_annotations", "BADJA/joint_annotations")
 
 
-Facts = dict[str, Any]
-"""What davis.toml says of a sequence."""
-
-
-def known_sequences() -> dict[str, Facts]:
+def known_sequences() -> dict[str, dict[str, Any]]:
     """Return what is known of the animals in DAVIS, by sequence (davis.toml)."""
     return tomllib.loads((resources.files("rewild4d.datasets.video") / "davis.toml").read_text(encoding="utf-8"))
 
@@ -104,7 +101,9 @@ class Davis(VideoDataset):
         facts = known_sequences().get(sequence, {})
         species, strangers = str(facts.get("species", sequence)), self._strangers(case)
         told = f"no {species}: object {', '.join(map(str, strangers))} of its masks" if strangers else ""
-        notes = (note, outside, str(facts.get("note", "")), _odd_animal(facts), told)
+        is_odd = not facts.get("quadruped", True)
+        odd = f"a {species} is no quadruped: no four-legged template fits" if is_odd else ""
+        notes = (note, outside, str(facts.get("note", "")), odd, told)
         video = Video(
             title=str(files[0].parent), name=case, species=case if object_id in strangers else species, fps=FPS,
             licence=LICENCE, identity=files_identity(*files, *own.files, *used.files) + f" {object_id}", size=size,
@@ -155,11 +154,7 @@ class Davis(VideoDataset):
         return MaskFiles((None,) * len(files), ())
 
     def _given_masks(self, sequence: str, files: list[Path], object_id: int | None) -> tuple[MaskFiles | None, str]:
-        """Return masks of --masks, and a sentence on them; those without object ids are of the one animal of the case.
-
-        Raises:
-            UserError: they hold object ids, but not this one.
-        """
+        """Return masks of --masks and a note on them; those without object ids are of the one animal of the case."""
         if self.masks is None:
             return None, ""
         folder = self.masks / sequence
@@ -177,7 +172,8 @@ class Davis(VideoDataset):
     def _joints(self, sequence: str, files: list[Path], size: tuple[int, int]) -> tuple[dict[str, Keypoints], str]:
         """Return keypoints by the frame's stem, and a sentence on what their file holds but is not used."""
         stems = [file.stem for file in files]
-        own = next((file for file in _badja_files(self.root, sequence) if file.is_file()), None)
+        files_of_joints = [self.root / folder / f"{sequence}.json" for folder in _JOINTS]
+        own = next((file for file in files_of_joints if file.is_file()), None)
         if self.keypoints is not None:
             found, told = read_keypoints(self.keypoints, stems, size)
         elif own is not None:
@@ -188,7 +184,7 @@ class Davis(VideoDataset):
         return known, told
 
     def _strangers(self, case: str) -> list[int]:
-        """Ids of the objects of a case that are known to be no animal of the sequence (`animals` in davis.toml)."""
+        """Return ids of a case's objects that are known to be no animal (`animals` in davis.toml)."""
         sequence, object_id = self._table[case]
         facts, masks = known_sequences().get(sequence, {}), self._mask_folder(sequence)
         # masks from elsewhere may number their objects otherwise
@@ -196,15 +192,3 @@ class Davis(VideoDataset):
             return []
         ids = [number for name, number in self._table.values() if name == sequence and object_id in (None, number)]
         return [number for number in ids if number is not None and number not in facts["animals"]]
-
-
-_ANNOTATIONS = ("Annotations", "Annotations_unsupervised")
-
-
-def _badja_files(root: Path, sequence: str) -> Iterator[Path]:
-    for folder in ("badja", "joint_annotations", "BADJA/joint_annotations"):
-        yield root / folder / f"{sequence}.json"
-
-
-def _odd_animal(facts: Facts) -> str:
-    return "" if facts.get("quadruped", True) else f"a {facts['species']} is no quadruped: no four-legged template fits"

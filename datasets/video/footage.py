@@ -1,4 +1,4 @@
-"""Folders of images or of clips as they come: listed in natural order, read when asked for, matched by name.
+"""List folders of images or of clips in natural order, match them by name, read them on demand.
 
 A folder holds either images, or clips: subfolders of frames, or video files. An image is a PNG, a JPEG or an .npy array
 [h, w], [h, w, 3] or [h, w, 4] (floats in [0, 1], or unsigned integers over their full range).
@@ -82,7 +82,7 @@ class Reel:
         return Picture(self.label(index), _planes(rgb), None if alpha is None else _planes(alpha))
 
     def matte(self, index: int) -> Tensor:
-        """One image as a mask: its alpha where it has one that is not opaque, else its luminance, [1, h, w] in [0, 1].
+        """Return one image as a mask: its alpha where that is not opaque, else its luminance, [1, h, w] in [0, 1].
 
         Raises:
             UserError: as `picture`, or a mask whose inside is not white: labels, palette indices, 0 and 1 in bytes.

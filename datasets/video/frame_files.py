@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rewild4d.datasets.images import read_rgb
+from rewild4d.datasets.images import expect_size, read_rgb
 from rewild4d.datasets.masking.masks import MaskFiles
-from rewild4d.errors import UserError
 
 FRAME_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -26,11 +25,7 @@ def read_images(files: Sequence[Path], size: tuple[int, int]) -> Iterator[np.nda
     """
     for file in files:
         image = read_rgb(file, upright=True)
-        if (image.shape[1], image.shape[0]) != size:
-            raise UserError(
-                f"{file}: expected {size[0]}x{size[1]} pixels like {files[0].name}, "
-                f"got {image.shape[1]}x{image.shape[0]}."
-            )
+        expect_size(file, image, size, files[0].name)
         yield image
 
 

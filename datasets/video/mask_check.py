@@ -78,7 +78,8 @@ def check_video(video: Video, sheets: Path | None) -> list[Finding]:
             tiles[index] = tile(image, mask)
     if len(facts) < count:
         raise UserError(f"{video.title}: expected {count} frames, got {len(facts)}: it is cut off.")
-    troubles = {what: test(facts) for what, test in _TESTS.items()}
+    found = {what: [i for i, fact in enumerate(facts) if test(fact or _NO_MASK)] for what, test in _TESTS.items()}
+    troubles = found | {"a jump from the frame before": _jumps(facts)}
     findings = [Finding("warning", video.name, note) for note in video.notes]
     for what, indices in troubles.items():
         if indices:
@@ -108,22 +109,6 @@ def _fault(error: UserError) -> Finding:
     return Finding("error", path, sentence.rstrip("."))
 
 
-def _empty(facts: Sequence[MaskFacts | None]) -> list[int]:
-    return [i for i, fact in enumerate(facts) if fact is None or fact.area < LEAST_AREA]
-
-
-def _holed(facts: Sequence[MaskFacts | None]) -> list[int]:
-    return [i for i, fact in enumerate(facts) if fact is not None and fact.holes > HOLES]
-
-
-def _split(facts: Sequence[MaskFacts | None]) -> list[int]:
-    return [i for i, fact in enumerate(facts) if fact is not None and PART < fact.second <= TWIN]
-
-
-def _twins(facts: Sequence[MaskFacts | None]) -> list[int]:
-    return [i for i, fact in enumerate(facts) if fact is not None and fact.second > TWIN]
-
-
 def _jumps(facts: Sequence[MaskFacts | None]) -> list[int]:
     """Return frames whose mask differs much from that of the frame before."""
     found = []
@@ -139,18 +124,14 @@ def _jumps(facts: Sequence[MaskFacts | None]) -> list[int]:
     return found
 
 
-def _framed(facts: Sequence[MaskFacts | None]) -> list[int]:
-    return [i for i, fact in enumerate(facts) if fact is not None and fact.framed > FRAMED]
-
-
 _SECOND, _TWO = "a second part beside the animal", "two parts of like size (two animals?)"
-_TESTS: dict[str, Callable[[Sequence[MaskFacts | None]], list[int]]] = {
-    "no mask or an empty one": _empty,
-    "animal all along the image's border (is the mask inverted?)": _framed,
-    f"holes (or gaps between legs) above {HOLES:.0%} of the animal": _holed,
-    _SECOND: _split,
-    _TWO: _twins,
-    "a jump from the frame before": _jumps,
+_NO_MASK = MaskFacts(None, False, (), 0.0)
+_TESTS: dict[str, Callable[[MaskFacts], bool]] = {
+    "no mask or an empty one": lambda fact: fact.area < LEAST_AREA,
+    "animal all along the image's border (is the mask inverted?)": lambda fact: fact.framed > FRAMED,
+    f"holes (or gaps between legs) above {HOLES:.0%} of the animal": lambda fact: fact.holes > HOLES,
+    _SECOND: lambda fact: PART < fact.second <= TWIN,
+    _TWO: lambda fact: fact.second > TWIN,
 }
 
 
@@ -174,7 +155,7 @@ def tile(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
 
 
 def contact_sheet(tiles: dict[int, np.ndarray], labels: Sequence[str], marked: set[int]) -> np.ndarray:
-    """Tiles in reading order, each under its label; those that a warning names have red labels, uint8 [H, W, 3]."""
+    """Return tiles in reading order under their labels, in red where a warning names them, uint8 [H, W, 3]."""
     cells = []
     for index, picture in tiles.items():
         strip = np.full((18, picture.shape[1], 3), 255, np.uint8)

@@ -1,4 +1,4 @@
-"""Reads a person's own video: a file or a folder of frames, and masks of the animal in it.
+"""Read a person's own video: a file or a folder of frames, and masks of the animal in it.
 
 Masks are a folder (named or numbered like the frames, or as many), a second video, or the alpha channel of the frames
 themselves; root/masks is looked at where nothing is named. Images are turned as their EXIF says and videos as their
@@ -112,12 +112,12 @@ class Online(VideoDataset):
         masks, note = self._masks(self._table[case])
         points, outside = self._keypoints
         settings = f"{indices} {self._table[case]} {self.fps}"
-        sources = self._mask_sources
+        sources, labels = self._mask_sources, [file.name for file in material.files]
         video = Video(
             title=str(self.root), name=case, species="animal", fps=(len(times) - 1) / span if span else FOLDER_FPS,
             licence=LICENCE, identity=files_identity(*(material.files or (self.root,)), *sources) + settings,
             size=material.size,
-            moments=tuple(Moment(self._label(i), material.times[i], points[i]) for i in indices),
+            moments=tuple(Moment(labels[i] if labels else f"frame {i}", material.times[i], points[i]) for i in indices),
             images=self._images, masks=masks,
             notes=(*material.notes, *(text for text in (thinned, note, outside) if text)),
         )  # fmt: skip
@@ -150,11 +150,6 @@ class Online(VideoDataset):
         return self.root.stem if self.root.is_file() else self.root.resolve().name
 
     @cached_property
-    def _frames_root(self) -> Path:
-        inner = [self.root / name for name in ("frames", "images") if (self.root / name).is_dir()]
-        return inner[0] if inner else self.root
-
-    @cached_property
     def _material(self) -> Material:
         if self.root.is_file():
             if self.root.suffix.lower() in FRAME_SUFFIXES:
@@ -164,12 +159,14 @@ class Online(VideoDataset):
             order = f"time stamps are missing or out of order: {ASSUMED_FPS:g} frames a second assumed"
             notes = (*((fault,) if facts.faults else ()), *(() if facts.is_stamped else (order,)))
             return Material((), facts.times, (facts.width, facts.height), facts.has_alpha, notes)
-        files = tuple(mask_files.list_images(self._frames_root, FRAME_SUFFIXES))
+        inner = (self.root / name for name in ("frames", "images"))
+        folder = next((path for path in inner if path.is_dir()), self.root)
+        files = tuple(mask_files.list_images(folder, FRAME_SUFFIXES))
         if not files:
             expected = f"frames ({', '.join(FRAME_SUFFIXES)})"
-            videos = [entry.name for entry in self._frames_root.iterdir() if entry.suffix.lower() in SUFFIXES]
+            videos = [entry.name for entry in folder.iterdir() if entry.suffix.lower() in SUFFIXES]
             hint = f", but there is {videos[0]}: name that file" if videos else ", got none"
-            raise UserError(f"{self._frames_root}: expected {expected}{hint}.")
+            raise UserError(f"{folder}: expected {expected}{hint}.")
         rate = self.fps or FOLDER_FPS
         size = image_size(files[0])
         has_alpha = any(alpha is not None and bool((alpha < 255).any()) for alpha in map(read_transparency, files))
@@ -197,7 +194,7 @@ class Online(VideoDataset):
     def _table(self) -> dict[str, int | None]:
         """Case -> object id (None: all that the masks hold)."""
         name = self.name
-        ids = self._mask_files.ids if self._mask_files else ()
+        ids = self._mask_match[0].ids if self._mask_match else ()
         return {name: None} | {f"{name}@{number}": number for number in ids if len(ids) > 1}
 
     @cached_property
@@ -230,13 +227,9 @@ class Online(VideoDataset):
         return open_masks(matched), note
 
     @property
-    def _mask_files(self) -> MaskFiles | None:
-        return self._mask_match[0] if self._mask_match else None
-
-    @property
     def _mask_sources(self) -> Sequence[Path | None]:
-        if self._mask_files:
-            return self._mask_files.files
+        if self._mask_match:
+            return self._mask_match[0].files
         return (self._mask_place,) if self._mask_place else ()
 
     def _masks(self, object_id: int | None) -> tuple[Masks, str]:
@@ -271,11 +264,10 @@ class Online(VideoDataset):
     def _alphas(self) -> Iterator[np.ndarray | None]:
         indices = self._chosen[0]
         if self._material.files:
-            return (_file_alpha(self._material.files[i], self._material.size) for i in indices)
+            chosen = [self._material.files[i] for i in indices]
+            found, size = zip(chosen, map(read_transparency, chosen), strict=True), self._material.size
+            return (None if alpha is None else fit_size(alpha, size, str(file)) for file, alpha in found)
         return (frame[..., 3] for frame in _picked(read_video(self.root), indices))
-
-    def _label(self, index: int) -> str:
-        return self._material.files[index].name if self._material.files else f"frame {index}"
 
 
 def _thinned(times: list[float], indices: list[int], fps: float) -> list[int]:
@@ -300,13 +292,5 @@ def _picked(frames: Iterator[np.ndarray], indices: Sequence[int]) -> Iterator[np
 
 def _mask_stream(path: Path, indices: Sequence[int], size: tuple[int, int], alpha: bool) -> Iterator[np.ndarray | None]:
     for frame in _picked(read_video(path), indices):
-        values = (
-            np.ascontiguousarray(frame[..., 3]) if alpha else mask_files.shades(frame[..., :3], mask_files.FILM_TINT)
-        )
-        yield fit_size(values, size, str(path))
-
-
-def _file_alpha(file: Path, size: tuple[int, int]) -> np.ndarray | None:
-    """Return the alpha channel of an image that has one, uint8 [h, w]."""
-    alpha = read_transparency(file)
-    return None if alpha is None else fit_size(alpha, size, str(file))
+        shades = frame[..., 3] if alpha else mask_files.shades(frame[..., :3], mask_files.FILM_TINT)
+        yield fit_size(np.ascontiguousarray(shades), size, str(path))

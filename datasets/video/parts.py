@@ -1,4 +1,4 @@
-"""Masks in several parts: all of them, or the one that is the animal where a segmenter took in something else.
+"""Keep all parts of masks, or the one that is the animal where a segmenter took in something else.
 
 An animal behind a pole is in parts too, so by itself nothing is left out but what stands well apart, time and again.
 """
@@ -68,9 +68,6 @@ def standing_apart(masks: Masks) -> tuple[int, int]:
 
     A part counts from `NOISE` of the largest one's area on; the animal's length is the median, over the masks, of the
     longer side of the largest one's box.
-
-    Args:
-        masks: uint8 [h, w], or None where a frame has none.
     """
     gaps, lengths = [], []
     for mask in masks():
@@ -89,14 +86,11 @@ def standing_apart(masks: Masks) -> tuple[int, int]:
 
 
 def main_parts(masks: Masks, held: Collection[int] = ()) -> Iterator[np.ndarray | None]:
-    """Of every mask the part that shares most pixels with what was kept before it, or the largest where none does.
+    """Yield of every mask the part that shares most pixels with the one kept before it, or the largest part.
 
     Args:
         masks: uint8 [h, w], or None where a frame has none.
         held: moments whose masks decide nothing for those after them.
-
-    Yields:
-        The same, with the other parts and their soft rims at 0.
     """
     before: np.ndarray | None = None
     for moment, mask in enumerate(masks()):

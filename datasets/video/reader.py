@@ -40,19 +40,11 @@ class VideoDataset(VideoReader):
         """
 
     def load(self, case: str, selection: Selection) -> tuple[Clip, Truth]:
-        """Decode one case.
-
-        Raises:
-            UserError: as `video`.
-        """
+        """Decode one case; its errors are those of `video`."""
         return split_video(self.video(case), selection)
 
     def originals(self, case: str, selection: Selection) -> Iterator[np.ndarray]:
-        """Return the whole frames that the images of a clip were cut from, uint8 [h, w, 3]; for pictures alone.
-
-        Raises:
-            UserError: as `video`.
-        """
+        """Return the whole frames behind the images of a clip, uint8 [h, w, 3]; its errors are those of `video`."""
         return original_images(self.video(case), selection)
 
     def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:

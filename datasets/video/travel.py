@@ -22,12 +22,7 @@ class TravelMeter:
         self._steps: list[np.ndarray] = []
 
     def add(self, image: np.ndarray, mask: np.ndarray) -> None:
-        """The next frame.
-
-        Args:
-            image: the whole frame, uint8, [h, w, 3].
-            mask: of the same size, uint8, 255 inside the animal, [h, w].
-        """
+        """Add the next whole frame, uint8 [h, w, 3], and its mask, uint8 [h, w], 255 inside the animal."""
         scale = max(1.0, max(mask.shape) / LONGEST)
         grey = cv2.cvtColor(reduced(image), cv2.COLOR_RGB2GRAY)
         solid = (reduced(mask) > 127).astype(np.uint8)
@@ -41,7 +36,7 @@ class TravelMeter:
         self._before = (grey, solid, middle)
 
     def result(self) -> Tensor:
-        """Motion of the mask's centre against the background from each frame to the next, their pixels, [T - 1, 2]."""
+        """Return the motion of the mask's centre over the background from frame to frame in pixels, [T - 1, 2]."""
         return torch.from_numpy(np.array(self._steps, dtype=np.float32).reshape(-1, 2))
 
 

@@ -1,4 +1,4 @@
-"""A video's frames uncut, as a clip to fit a prior to: no split, and cameras that see whole frames."""
+"""Make a clip of a video's whole frames, without a split, to fit a prior to."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from rewild4d.datasets.video.travel import TravelMeter, reduced
 from rewild4d.datasets.video.wild import Video, usable
 from rewild4d.errors import UserError
 from rewild4d.files import digest
-from rewild4d.types import Clip, Frame, Keypoints
+from rewild4d.types import Clip, Frame
 
 LONGEST = 960
 """Frames are averaged down to this many pixels on the longer side: a fit looks at 80 pixels of the animal."""
@@ -32,7 +32,8 @@ def whole_clip(video: Video) -> Clip:
         meter.add(small, matte)
         alpha = torch.from_numpy(matte.astype(np.float32))[None] / 255
         rgb = torch.from_numpy(small.astype(np.float32)).permute(2, 0, 1) / 255 * alpha
-        points = _scaled(video.moments[index].keypoints, matte.shape[1] / video.size[0])
+        points = video.moments[index].keypoints
+        points = points and replace(points, points=points.points * (matte.shape[1] / video.size[0]))
         frames.append(Frame(video.moments[index].time, None, rgb, alpha, keypoints=points))
     if len(frames) < len(used):
         raise UserError(f"{video.title}: expected {len(used)} frames to read, got {len(frames)}: it is cut off.")
@@ -40,7 +41,3 @@ def whole_clip(video: Video) -> Clip:
     key = digest(*(part for frame in frames for part in (repr(frame.time), frame.mask)), travel)
     return Clip(video.name, video.species, tuple(frames), video.fps, video.licence, key, (*video.notes, *notes),
                 travel=travel)  # fmt: skip
-
-
-def _scaled(points: Keypoints | None, scale: float) -> Keypoints | None:
-    return points and replace(points, points=points.points * scale)

@@ -19,7 +19,7 @@ from rewild4d.datasets.masking.masks import MaskFacts, mask_facts
 from rewild4d.datasets.video.crops import cut, follow, lost_share
 from rewild4d.datasets.video.travel import TravelMeter
 from rewild4d.errors import UserError
-from rewild4d.files import atomic, cache_folder, digest, file_state
+from rewild4d.files import atomic, cache_folder, digest, file_state, write_text
 from rewild4d.types import Clip, Crop, Frame, Keypoints, Truth
 
 LEAST_FRAMES = 4
@@ -123,22 +123,18 @@ def split_video(video: Video, selection: Selection) -> tuple[Clip, Truth]:
             f"{video.title}: expected a protocol for videos (cameras = 'unknown', framing = 'crop', split = 2 or more)."
         )
     layout, folder = _laid_out(video, selection)
-    frames = _Frames(video, layout, np.load(folder / "rgba.npy", mmap_mode="r"))
-    shown = tuple(frames[i] for i in layout.shown)
-    hidden = _Chosen(frames, [i for i, tested in enumerate(layout.tested) if tested])
-    travel = _travel_in_crops(layout, selection.size)
+    rgba = np.load(folder / "rgba.npy", mmap_mode="r")
+    shown = _Frames(video, layout, rgba, layout.shown)
+    hidden = _Frames(video, layout, rgba, [row for row, tested in enumerate(layout.tested) if tested])
+    sides = torch.tensor([layout.crops[row].side for row in layout.shown[1:]])
+    # in pixels of the crop that each step leads to
+    travel = torch.tensor(layout.travel).reshape(-1, 2) * (selection.size / sides)[:, None]
     clip = Clip(
-        video.name, video.species, shown, video.fps / selection.stride, video.licence,
-        digest(frames.digest(layout.shown), travel), (*video.notes, *layout.notes),
+        video.name, video.species, tuple(shown), video.fps / selection.stride, video.licence,
+        digest(shown.digest(), travel), (*video.notes, *layout.notes),
         start=video.moments[layout.used[0]].time, travel=travel,
     )  # fmt: skip
-    return clip, Truth(hidden, None, frames.digest(hidden.indices))
-
-
-def _travel_in_crops(layout: Layout, size: int) -> torch.Tensor:
-    """Return the travel in pixels of the crop that each step leads to, [T - 1, 2]."""
-    sides = torch.tensor([layout.crops[row].side for row in layout.shown[1:]])
-    return torch.tensor(layout.travel).reshape(-1, 2) * (size / sides)[:, None]
+    return clip, Truth(hidden, None, hidden.digest())
 
 
 def usable(
@@ -157,21 +153,21 @@ def usable(
     Raises:
         UserError: there are fewer.
     """
-    kept = [(i, facts[i]) for i in range(0, len(facts), stride)]
-    missing = [i for i, fact in kept if fact is None]
-    empty = [i for i, fact in kept if fact is not None and (fact.box is None or fact.area < LEAST_AREA)]
-    seen = [i for i, fact in kept if fact is not None and fact.box is not None and fact.area >= LEAST_AREA]
-    is_cut = [i for i in seen if (fact := facts[i]) is not None and fact.is_cut]
-    notes = [_told(video, missing, "without a mask left out"), _told(video, empty, "without the animal left out")]
-    used = [i for i in seen if i not in set(is_cut)]
+    kept = range(0, len(facts), stride)
+    seen = {i: fact for i in kept if (fact := facts[i]) and fact.box and fact.area >= LEAST_AREA}
+    missing = [i for i in kept if facts[i] is None]
+    empty = [i for i in kept if facts[i] is not None and i not in seen]
+    is_cut = [i for i in seen if seen[i].is_cut]
+    used, cut_note = [i for i in seen if not seen[i].is_cut], "where the image's border cuts the animal left out"
     if len(used) < max(LEAST_FRAMES, len(seen) // 4):
-        used, cut_note = seen, "where the image's border cuts the animal kept, because most are like that"
-    else:
-        cut_note = "where the image's border cuts the animal left out"
-    notes.append(_told(video, is_cut, cut_note))
-    twins = [i for i in used if (fact := facts[i]) is not None and fact.second > TWIN]
-    notes.append(
-        _told(video, twins, "with two parts of like size (two animals?) taken as one animal (--parts main takes one)")
+        used, cut_note = [*seen], "where the image's border cuts the animal kept, because most are like that"
+    twins = [i for i in used if seen[i].second > TWIN]
+    twin_note = "with two parts of like size (two animals?) taken as one animal (--parts main takes one)"
+    notes = (
+        _told(video, missing, "without a mask left out"),
+        _told(video, empty, "without the animal left out"),
+        _told(video, is_cut, cut_note),
+        _told(video, twins, twin_note),
     )
     if len(used) < least:
         reasons = [f"{len(missing)} have no mask" if missing else "", f"{len(empty)} an empty one" if empty else ""]
@@ -184,14 +180,15 @@ def usable(
 
 
 def original_images(video: Video, selection: Selection) -> Iterator[np.ndarray]:
-    """The whole frames that the images were cut from, held-out ones too, in the order of time, uint8 [h, w, 3]."""
+    """Return the whole frames behind the images, held-out ones too, in the order of time, uint8 [h, w, 3]."""
     used = {*_laid_out(video, selection)[0].used}
     return (image for index, image in enumerate(video.images()) if index in used)
 
 
 def _laid_out(video: Video, selection: Selection) -> tuple[Layout, Path]:
     """Return the layout of a video and the folder of its cut frames, made where they are not there yet."""
-    folder = cache_folder() / "wild" / _key(video, selection)
+    parts = [_CACHE_VERSION, video.identity, str(selection.size), str(selection.stride), str(selection.split)]
+    folder = cache_folder() / "wild" / digest(*parts)[:32]
     if not (folder / "rgba.npy").is_file():
         layout = lay_out(video, _facts(video.masks), selection)
         if video.masks_without:  # which are held out is known now
@@ -202,16 +199,7 @@ def _laid_out(video: Video, selection: Selection) -> tuple[Layout, Path]:
 
 
 def lay_out(video: Video, facts: Sequence[MaskFacts | None], selection: Selection) -> Layout:
-    """Choose frames and crops from what the masks say.
-
-    Args:
-        video: whose frames.
-        facts: of each moment's mask; None where there is none.
-        selection: its stride and split.
-
-    Raises:
-        UserError: too few usable frames.
-    """
+    """Choose frames and crops from the facts of each moment's mask; too few usable frames are a `UserError`."""
     used, notes = usable(video, facts, selection.stride, LEAST_FRAMES)
     tested = split_frames(len(used), selection.split or len(used))
     return Layout(tuple(used), tuple(tested), _crops(video, facts, used, tested), notes)
@@ -233,7 +221,7 @@ def _crops(
 
 
 def split_frames(count: int, split: int) -> list[bool]:
-    """Which of the usable frames are held out: the middle one of every ``split``, never the first or the last."""
+    """Return which usable frames are held out: the middle one of every ``split``, never the first or the last."""
     return [i % split == split // 2 and 0 < i < count - 1 for i in range(count)]
 
 
@@ -279,12 +267,7 @@ def _fill(video: Video, layout: Layout, size: int, folder: Path) -> None:
             raise UserError(f"{video.title}: expected {len(layout.used)} frames to cut, got {written}: it is cut off.")
         note = _told(video, lost, f"held out reach over their crop with more than {LOST:.0%} of the animal")
         notes, travel = (*layout.notes, note) if note else layout.notes, tuple(meter.result().tolist())
-        _write_layout(folder / "layout.json", replace(layout, notes=notes, travel=travel))
-
-
-def _write_layout(path: Path, layout: Layout) -> None:
-    with atomic(path) as temporary:
-        temporary.write_text(json.dumps(asdict(layout)), encoding="utf-8")
+        write_text(folder / "layout.json", json.dumps(asdict(replace(layout, notes=notes, travel=travel))))
 
 
 def _read_layout(path: Path) -> Layout:
@@ -293,57 +276,38 @@ def _read_layout(path: Path) -> Layout:
     return Layout(crops=crops, **{name: tuple(values) for name, values in parts.items()})
 
 
-def _key(video: Video, selection: Selection) -> str:
-    parts = [_CACHE_VERSION, video.identity, str(selection.size), str(selection.stride), str(selection.split)]
-    return digest(*parts)[:32]
-
-
 def files_identity(*files: Path | None) -> str:
     """Return the path, size and time of change of some files, as text."""
     return digest(*(file_state(file) for file in files if file is not None))
 
 
 class _Frames(Sequence[Frame]):
-    """All used frames, from the memory map on access."""
+    """Some of the used frames, from the memory map on access."""
 
-    def __init__(self, video: Video, layout: Layout, rgba: np.ndarray) -> None:
-        self.layout, self._rgba = layout, rgba
-        moments = [video.moments[i] for i in layout.used]
-        start = moments[0].time
-        self.times = [moment.time - start for moment in moments]
-        self.keypoints = [
-            in_crop(moment.keypoints, crop, rgba.shape[1]) for moment, crop in zip(moments, layout.crops, strict=True)
+    def __init__(self, video: Video, layout: Layout, rgba: np.ndarray, rows: Sequence[int]) -> None:
+        moments = [video.moments[layout.used[row]] for row in rows]
+        start = video.moments[layout.used[0]].time
+        self._rows, self._rgba = rows, rgba
+        self._times = [moment.time - start for moment in moments]
+        self._crops = [layout.crops[row] for row in rows]
+        self._keypoints = [
+            in_crop(moment.keypoints, crop, rgba.shape[1]) for moment, crop in zip(moments, self._crops, strict=True)
         ]
 
     def __len__(self) -> int:
-        return len(self.times)
+        return len(self._rows)
 
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
             return [self[item] for item in range(*index.indices(len(self)))]
-        rgba = torch.from_numpy(self._rgba[index].astype(np.float32) / 255).permute(2, 0, 1).contiguous()
-        crop, points = self.layout.crops[index], self.keypoints[index]
-        return Frame(self.times[index], None, rgba[:3], rgba[3:], 0, crop, points)
+        rgba = torch.from_numpy(self._rgba[self._rows[index]].astype(np.float32) / 255)
+        rgba = rgba.permute(2, 0, 1).contiguous()
+        return Frame(self._times[index], None, rgba[:3], rgba[3:], 0, self._crops[index], self._keypoints[index])
 
-    def digest(self, indices: Sequence[int]) -> str:
-        """Return SHA-256 over times, crops, keypoints and pixels of some frames."""
+    def digest(self) -> str:
+        """Return SHA-256 over times, crops, keypoints and pixels."""
         parts: list[str | torch.Tensor | np.ndarray] = []
-        for index in indices:
-            parts += [repr(self.times[index]), repr(self.layout.crops[index]), self._rgba[index]]
-            points = self.keypoints[index]
+        for row, time, crop, points in zip(self._rows, self._times, self._crops, self._keypoints, strict=True):
+            parts += [repr(time), repr(crop), self._rgba[row]]
             parts += [points.points, points.visible] if points else []
         return digest(*parts)
-
-
-class _Chosen(Sequence[Frame]):
-    """Some of the frames, read on access."""
-
-    def __init__(self, frames: _Frames, indices: list[int]) -> None:
-        self.frames, self.indices = frames, indices
-
-    def __len__(self) -> int:
-        return len(self.indices)
-
-    def __getitem__(self, index: Any) -> Any:
-        chosen = self.indices[index]
-        return [self.frames[item] for item in chosen] if isinstance(index, slice) else self.frames[chosen]

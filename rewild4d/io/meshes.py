@@ -93,7 +93,7 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def discs(meshes: Sequence[Mesh], count: int, seed: int) -> list[Discs]:
-    """Area-uniform points on each mesh; meshes with the same faces get the same points, so that they move with them.
+    """Draw area-uniform points on each mesh; meshes with the same faces get the same points, which move with them.
 
     Raises:
         ValueError: a mesh without area.
@@ -129,10 +129,10 @@ def _colors(mesh: Mesh, face: Tensor, shares: Tensor) -> Tensor | None:
     own = None if mesh.colors is None else (shares[..., None] * mesh.colors[mesh.faces[face]]).sum(1)
     if mesh.uv is not None and mesh.texture is not None:
         height, width = mesh.texture.shape[:2]
-        place = (shares[..., None] * mesh.uv[face]).sum(1)
-        place = torch.where((place < 0) | (place > 1), place % 1.0, place)  # repeated outside
-        column = (place[:, 0] * width).long().clamp(max=width - 1)
-        row = ((1 - place[:, 1]) * height).long().clamp(max=height - 1)
+        uv = (shares[..., None] * mesh.uv[face]).sum(1)
+        uv = torch.where((uv < 0) | (uv > 1), uv % 1.0, uv)  # repeated outside
+        column = (uv[:, 0] * width).long().clamp(max=width - 1)
+        row = ((1 - uv[:, 1]) * height).long().clamp(max=height - 1)
         texels = mesh.texture[row, column]
         return texels if own is None else texels * own
     return own
@@ -170,7 +170,7 @@ def _read_obj(path: Path) -> Mesh:
 
 
 def _index(number: int, count: int) -> int:
-    """Return OBJ counts from 1, and backwards from the latest with negative numbers."""
+    """Return an index from 0; OBJ counts from 1, and backwards from the latest with negative numbers."""
     return number - 1 if number > 0 else count + number
 
 
@@ -213,7 +213,7 @@ def _require_finite(path: Path, what: str, values: Tensor, row: str) -> None:
 
 
 def _texture(path: Path, library: str) -> Tensor | None:
-    """The first picture that the material library names; a library that is not there is not asked for (3D-Fauna)."""
+    """Read the first picture of the material library; a missing library counts as none (3D-Fauna)."""
     materials = path.parent / library
     if not library or not materials.is_file():
         return None

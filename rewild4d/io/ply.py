@@ -30,22 +30,12 @@ BRIGHTEST_LOGIT = 15.0
 """Opacities are written within this logit of 0 and 1, so that 0 and 1 themselves stay finite."""
 
 
-def read_points(path: Path) -> Tensor:
-    """Return the vertices of any PLY file, float64, [n, 3].
-
-    Raises:
-        UserError: no such file, not a PLY, damaged, without x, y and z, or with a NaN.
-    """
-    return _points(Path(path), _vertices(Path(path), read_elements(Path(path))))
-
-
 def read_mesh(path: Path) -> tuple[Tensor, Tensor]:
     """Return vertices, float64, [n, 3], and triangles, int64, [f, 3]; polygons are cut into fans, [0, 3] without faces.
 
     Raises:
-        UserError: as `read_points`, or a face that names a vertex which is not there.
+        UserError: no such file, not a PLY, damaged, without x, y and z, with a NaN, or a face without its vertex.
     """
-    path = Path(path)
     elements = read_elements(path)
     points = _points(path, _vertices(path, elements))
     return points, _triangles(path, elements, len(points))
@@ -55,9 +45,8 @@ def read_splats(path: Path) -> Splats:
     """Return the Gaussians of a PLY file, activated values in single precision.
 
     Raises:
-        UserError: as `read_points`, a property of a Gaussian is missing, or a value is beyond `LARGEST`.
+        UserError: as `read_mesh`, a property of a Gaussian is missing, or a value is beyond `LARGEST`.
     """
-    path = Path(path)
     splats = _splats(path, _vertices(path, read_elements(path)))
     require_at_most(path, "coordinates", splats.means, LARGEST["means"])
     require_at_most(path, "scales (e to the power of scale_0 to scale_2)", splats.scales, LARGEST["scales"])
@@ -74,7 +63,6 @@ def read_surface(path: Path, count: int, seed: int) -> Tensor:
     Raises:
         UserError: as `read_mesh` and `read_splats`, or a mesh without area.
     """
-    path = Path(path)
     elements = read_elements(path)
     vertices = _vertices(path, elements)
     if set(SPLAT_PROPERTIES) <= vertices.columns.keys():
@@ -90,7 +78,7 @@ def read_surface(path: Path, count: int, seed: int) -> Tensor:
 
 
 def is_mesh(path: Path) -> bool:
-    """Tell whether `read_surface` samples what a PLY file holds; its errors."""
+    """Tell whether `read_surface` samples a mesh of a PLY file; its errors are those of `read_surface`."""
     elements = read_elements(path)
     vertices = _vertices(path, elements)
     if set(SPLAT_PROPERTIES) <= vertices.columns.keys():
@@ -132,7 +120,7 @@ def write_splats(path: Path, splats: Splats) -> None:
         raise ValueError("expected orientations (quats) of any length but zero, got a zero")
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     header = "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""])
-    with atomic(Path(path)) as temporary:
+    with atomic(path) as temporary:
         temporary.write_bytes(header.encode("ascii") + values.astype("<f4").tobytes())
 
 

@@ -1,4 +1,4 @@
-"""From meshes and Gaussians to points of their surface: what geometry is compared by. Drawn by a seed, on the CPU."""
+"""Sample points of the surface of meshes and Gaussians, by a seed, on the CPU."""
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ def sample_mesh(vertices: Tensor, faces: Tensor, count: int, seed: int) -> Tenso
     ends = np.cumsum(np.linalg.norm(cross, axis=1))
     if not len(ends) or not 0 < ends[-1] < np.inf:
         raise ValueError(f"expected triangles with an area, got {len(ends)} triangles without")
-    chosen = corners[_draw(ends, count, rng)]
+    chosen = corners[np.searchsorted(ends, rng.random(count) * ends[-1], side="right").clip(max=len(ends) - 1)]
     root, along = np.sqrt(rng.random(count)), rng.random(count)
     shares = np.stack((1 - root, root * (1 - along), root * along), axis=1)
     return torch.from_numpy(np.einsum("nk,nkd->nd", shares, chosen))
@@ -58,8 +58,3 @@ def sample_gaussians(splats: Splats, count: int, seed: int, opacity: float = OPA
     if len(centers) <= count:
         return centers
     return centers[torch.from_numpy(np.sort(np.random.default_rng(seed).permutation(len(centers))[:count]))]
-
-
-def _draw(ends: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return rows drawn with chances proportional to the steps of a rising sum, [count]."""
-    return np.searchsorted(ends, rng.random(count) * ends[-1], side="right").clip(max=len(ends) - 1)

@@ -1,11 +1,10 @@
-"""Writes an animated, skinned glTF 2.0 binary (.glb): any 3D program plays it.
+"""Write an animated, skinned glTF 2.0 binary (.glb): any 3D program plays it.
 
 Every Gaussian is a flat, coloured square in the plane of its two longer axes. Influences are sorted by weight, so that
 viewers that read the first four of each vertex lose as little as possible; all that count are in the file.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from rewild4d.harmonics import C0
 from rewild4d.transforms import matrix_to_quat, quat_to_matrix, split_similarity
 from rewild4d.types import Splats
 
-REACH = 1.5
+HALF_SIDE = 1.5
 """Half the side of a square in standard deviations of its Gaussian."""
 SEEN = 0.1
 """Gaussians less opaque than this are left out: a square has no soft edge."""
@@ -29,21 +28,6 @@ NEGLIGIBLE = 1e-5
 """Influences below this weight are left out and the others scaled to one."""
 FLOAT, SHORT, INT = 5126, 5123, 5125
 VERTICES, INDICES = 34962, 34963
-
-
-@dataclass(frozen=True)
-class Motion:
-    """What moves, sampled at key times.
-
-    Attributes:
-        times: seconds, ascending, [T].
-        joints: transform of each bone's node to that of its parent (of the root node, for a root bone), [T, J, 4, 4].
-        root: object_to_world, a similarity, [T, 4, 4].
-    """
-
-    times: Tensor
-    joints: Tensor
-    root: Tensor
 
 
 def write_glb(path: Path, reconstruction: Articulated, times: Sequence[float], name: str, copyright: str) -> None:
@@ -82,7 +66,7 @@ def write_glb(path: Path, reconstruction: Articulated, times: Sequence[float], n
         attributes[f"WEIGHTS_{part}"] = builder.add(shares[:, chosen].repeat_interleave(4, 0).float().numpy(), VERTICES)
     indices = builder.add(faces.reshape(-1, 1).numpy().astype(np.uint32), INDICES)
     tree = _scene(builder, name, copyright, attributes, indices, pivots, parents)
-    _animate(tree, builder, motion(reconstruction, times))
+    _animate(tree, builder, keys, *_motion(reconstruction, times))
     tree.buffers = [pygltflib.Buffer(byteLength=len(builder.data))]
     tree.bufferViews, tree.accessors = builder.views, builder.accessors
     tree.set_binary_blob(bytes(builder.data))
@@ -90,8 +74,8 @@ def write_glb(path: Path, reconstruction: Articulated, times: Sequence[float], n
         temporary.write_bytes(b"".join(tree.save_to_bytes()))
 
 
-def motion(reconstruction: Articulated, times: Sequence[float]) -> Motion:
-    """Return the motion of a reconstruction's skeleton; each bone's node stands in its pivot at rest."""
+def _motion(reconstruction: Articulated, times: Sequence[float]) -> tuple[Tensor, Tensor]:
+    """Return each bone's node (in its pivot at rest) in its parent's, [T, J, 4, 4], and object_to_world, [T, 4, 4]."""
     moved = [reconstruction.articulation(time) for time in times]
     transforms = torch.stack([bones.double().cpu() for bones, _ in moved])
     root = torch.stack([matrix.double().cpu() for _, matrix in moved])
@@ -100,7 +84,7 @@ def motion(reconstruction: Articulated, times: Sequence[float]) -> Motion:
     local = [
         standing[:, j] if p < 0 else torch.linalg.inv(standing[:, p]) @ standing[:, j] for j, p in enumerate(parents)
     ]
-    return Motion(torch.tensor(list(times), dtype=torch.float64), torch.stack(local, dim=1), root)
+    return torch.stack(local, dim=1), root
 
 
 def squares(splats: Splats) -> tuple[Tensor, Tensor, Tensor]:
@@ -113,7 +97,7 @@ def squares(splats: Splats) -> tuple[Tensor, Tensor, Tensor]:
     axes = quat_to_matrix(splats.quats).transpose(1, 2)
     rows = torch.arange(len(splats), device=order.device)
     first, second = (axes[rows, order[:, k]] for k in (0, 1))
-    lengths = splats.scales.gather(1, order)[:, :2, None] * REACH
+    lengths = splats.scales.gather(1, order)[:, :2, None] * HALF_SIDE
     u, v = first * lengths[:, 0], second * lengths[:, 1]
     corners = torch.stack([splats.means + a * u + b * v for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))], dim=1)
     normals = torch.linalg.cross(first, second)[:, None].expand(-1, 4, -1)
@@ -217,9 +201,9 @@ def _scene(
     )  # fmt: skip
 
 
-def _animate(tree: pygltflib.GLTF2, builder: _Builder, moving: Motion) -> None:
+def _animate(tree: pygltflib.GLTF2, builder: _Builder, times: Tensor, joints: Tensor, root: Tensor) -> None:
     """Add one animation: the root's similarity and every bone's rigid motion."""
-    keys = builder.add(moving.times.float().numpy()[:, None], bounds=True)
+    keys = builder.add(times.numpy()[:, None], bounds=True)
     clip = pygltflib.Animation(name="motion", samplers=[], channels=[])
 
     def channel(node: int, path: str, values: Tensor) -> None:
@@ -228,18 +212,18 @@ def _animate(tree: pygltflib.GLTF2, builder: _Builder, moving: Motion) -> None:
         target = pygltflib.AnimationChannelTarget(node=node, path=path)
         clip.channels.append(pygltflib.AnimationChannel(sampler=len(clip.samplers) - 1, target=target))
 
-    parts = [split_similarity(matrix) for matrix in moving.root]
+    parts = [split_similarity(matrix) for matrix in root]
     channel(0, "scale", torch.stack([scale.expand(3) for scale, _, _ in parts]))
-    channel(0, "rotation", _steady(matrix_to_quat(torch.stack([turn for _, turn, _ in parts]))))
-    channel(0, "translation", moving.root[:, :3, 3])
-    for bone in range(moving.joints.shape[1]):
-        channel(bone + 1, "rotation", _steady(matrix_to_quat(moving.joints[:, bone, :3, :3])))
-        channel(bone + 1, "translation", moving.joints[:, bone, :3, 3])
+    channel(0, "rotation", _steady(matrix_to_quat(torch.stack([rotation for _, rotation, _ in parts]))))
+    channel(0, "translation", root[:, :3, 3])
+    for bone in range(joints.shape[1]):
+        channel(bone + 1, "rotation", _steady(matrix_to_quat(joints[:, bone, :3, :3])))
+        channel(bone + 1, "translation", joints[:, bone, :3, 3])
     tree.animations = [clip]
 
 
 def _steady(quats: Tensor) -> Tensor:
-    """xyzw quaternions whose signs do not jump between keys, from wxyz ones, [T, 4]."""
+    """Return xyzw quaternions whose signs do not jump between keys, from wxyz ones, [T, 4]."""
     signs = torch.ones(len(quats), 1, dtype=quats.dtype)
     dots = (quats[1:] * quats[:-1]).sum(dim=1)
     signs[1:, 0] = torch.where(dots < 0, -1.0, 1.0).to(quats).cumprod(dim=0)

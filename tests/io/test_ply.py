@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rewild4d.errors import UserError
 from rewild4d.harmonics import C0
-from rewild4d.io.ply import read_mesh, read_points, read_splats, read_surface, write_splats
+from rewild4d.io.ply import read_mesh, read_splats, read_surface, write_splats
 from rewild4d.types import Splats
 
 XYZ = "property float x\nproperty float y\nproperty float z\n"
@@ -123,7 +123,7 @@ def test_what_cannot_be_written_leaves_nothing(change: str, value: float, tmp_pa
 
 
 def check_points(path: Path) -> None:
-    assert read_points(path).tolist() == POINTS
+    assert read_mesh(path)[0].tolist() == POINTS
     assert read_surface(path, 50, 0).tolist() == POINTS
     assert len(read_mesh(path)[1]) == 0
 
@@ -188,7 +188,7 @@ def test_gaussians_stand_with_their_centres(tmp_path: Path) -> None:
     write_splats(tmp_path / "a.ply", one)
     torch.testing.assert_close(read_surface(tmp_path / "a.ply", 500, 0), one.means[4:].double())
     assert len(read_surface(tmp_path / "a.ply", 2, 0)) == 2
-    assert len(read_points(tmp_path / "a.ply")) == 7
+    assert len(read_mesh(tmp_path / "a.ply")[0]) == 7
     header = f"{ASCII}element vertex 2\n{XYZ}{WHOLE}"
     vast = file(tmp_path, header, b"1 2 3 0 0 0 9 888 88 88 1 0 0 0 4 5 6 0 0 0 -888 0 0 0 1 0 0 0")
     assert read_surface(vast, 9, 0).tolist() == [[1, 2, 3]], "sizes do not count, a faint one does not"
@@ -196,7 +196,7 @@ def test_gaussians_stand_with_their_centres(tmp_path: Path) -> None:
 
 def test_a_file_without_points_is_no_error(tmp_path: Path) -> None:
     for order in ("ascii", "binary_little_endian"):
-        assert read_points(file(tmp_path, f"format {order} 1.0\nelement vertex 0\n{XYZ}")).shape == (0, 3)
+        assert read_mesh(file(tmp_path, f"format {order} 1.0\nelement vertex 0\n{XYZ}"))[0].shape == (0, 3)
 
 
 ASCII = "format ascii 1.0\n"
@@ -310,7 +310,7 @@ def test_other_files_are_no_ply(content: bytes | None, text: str, tmp_path: Path
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(UserError) as caught:
-        read_points(path)
+        read_mesh(path)
     assert str(caught.value) == f"{path}: {text}"
 
 
@@ -318,4 +318,4 @@ def test_windows_line_ends(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     text = f"ply\nformat binary_little_endian 1.0\nelement vertex 2\n{XYZ}end_header\n".replace("\n", "\r\n")
     path.write_bytes(text.encode() + struct.pack("<6f", *sum(POINTS, [])))
-    assert read_points(path).tolist() == POINTS
+    assert read_mesh(path)[0].tolist() == POINTS
