@@ -137,6 +137,4 @@ def coco_keypoints(values: Sequence[float], names: Sequence[str], size: tuple[in
 
 def in_crop(keypoints: Keypoints | None, crop: Crop, size: int) -> Keypoints | None:
     """Return the same points in the pixels of a crop."""
-    if keypoints is None:
-        return None
-    return Keypoints(keypoints.names, crop.from_original(keypoints.points, size), keypoints.visible)
+    return keypoints and Keypoints(keypoints.names, crop.from_original(keypoints.points, size), keypoints.visible)

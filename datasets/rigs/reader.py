@@ -197,9 +197,11 @@ def _bound_surfaces(
     surfaces = []
     for primitive in document.tree.meshes[document.tree.nodes[node].mesh].primitives:
         if primitive.mode in (None, TRIANGLES, STRIP, FAN):
-            count = document.tree.accessors[primitive.attributes.POSITION].count
-            rigid = np.zeros((count, 1), dtype=np.int64), np.ones((count, 1))
-            indices, weights = influences(document, primitive, len(bones)) if is_skinned else rigid
+            if is_skinned:
+                indices, weights = influences(document, primitive, len(bones))
+            else:
+                count = document.tree.accessors[primitive.attributes.POSITION].count
+                indices, weights = np.zeros((count, 1), dtype=np.int64), np.ones((count, 1))
             offsets = still_offsets(document, skeleton.animation, node, primitive, skeleton.times)
             surfaces.append(read_surface(document, primitive, to_world, bones[indices], weights, offsets))
     return surfaces

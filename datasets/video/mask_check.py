@@ -5,7 +5,6 @@ Nothing here changes a mask. A person looks at the contact sheet and decides.
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -28,38 +27,6 @@ MOST_CASES = 12
 """Contact sheets are drawn, and files decoded, for no more cases than these where none is named."""
 SPLIT = Selection(cameras="unknown", size=256, framing="crop", split=5)
 """The split of the protocols, to see whether enough frames remain."""
-
-
-class VideoReader(Protocol):
-    """A reader of real videos."""
-
-    def cases(self, selection: Selection) -> list[str]: ...
-    def default_cases(self, selection: Selection) -> list[str]: ...
-    def video(self, case: str) -> Video: ...
-
-
-def check_videos(reader: VideoReader, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
-    """Look at every frame and mask of some cases.
-
-    Args:
-        reader: of the data set.
-        cases: which; the first few of its default ones where none is named.
-        sheets: folder for contact sheets; None draws none.
-    """
-    try:
-        names = list(cases) or reader.default_cases(SPLIT)
-    except UserError as error:
-        return [_fault(error)]
-    findings = []
-    for name in names if cases else names[:MOST_CASES]:
-        try:
-            findings += check_video(reader.video(name), sheets)
-        except UserError as error:
-            findings.append(_fault(error))
-    if not cases and len(names) > MOST_CASES:
-        told = f"{MOST_CASES} of {len(names)} cases looked at; --case names others"
-        findings.append(Finding("warning", "check", told))
-    return findings
 
 
 def check_video(video: Video, sheets: Path | None) -> list[Finding]:
@@ -95,7 +62,7 @@ def check_video(video: Video, sheets: Path | None) -> list[Finding]:
         said = f"{count} frames of {video.size[0]}x{video.size[1]} at {video.fps:.4g} a second: {train} to learn from, "
         findings.append(Finding("ok", video.name, f"{said}{len(layout.used) - train} to test"))
     except UserError as error:
-        findings.append(_fault(error))
+        findings.append(finding_of(error))
     if sheets is not None:
         marked = {index for indices in troubles.values() for index in indices}
         path = sheets / f"{video.name.replace('/', '__')}.png"
@@ -104,7 +71,8 @@ def check_video(video: Video, sheets: Path | None) -> list[Finding]:
     return findings
 
 
-def _fault(error: UserError) -> Finding:
+def finding_of(error: UserError) -> Finding:
+    """Return an error as a finding."""
     path, _, sentence = str(error).partition(": ")
     return Finding("error", path, sentence.rstrip("."))
 

@@ -1,18 +1,19 @@
 """What the readers of real videos share."""
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from rewild4d.contracts import Finding, Selection
-from rewild4d.datasets.video.mask_check import VideoReader, check_videos
+from rewild4d.datasets.video.mask_check import MOST_CASES, SPLIT, check_video, finding_of
 from rewild4d.datasets.video.wild import Video, original_images, split_video
+from rewild4d.errors import UserError
 from rewild4d.types import Clip, Truth
 
 
-class VideoDataset(VideoReader):
+class VideoDataset(ABC):
     """Videos with masks, each one a case. Keeps contracts.DatasetReader.
 
     Attributes:
@@ -32,6 +33,14 @@ class VideoDataset(VideoReader):
         }
 
     @abstractmethod
+    def cases(self, selection: Selection) -> list[str]:
+        """Return the names of all cases."""
+
+    @abstractmethod
+    def default_cases(self, selection: Selection) -> list[str]:
+        """Return the cases that are taken where none is named."""
+
+    @abstractmethod
     def video(self, case: str) -> Video:
         """Return the frames and masks of a case, and its keypoints where it has some.
 
@@ -48,5 +57,21 @@ class VideoDataset(VideoReader):
         return original_images(self.video(case), selection)
 
     def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
-        """Verify some cases, each file decoded; contact sheets go to ``sheets``."""
-        return check_videos(self, cases, sheets)
+        """Verify every frame and mask of some cases (the first few default ones where none is named).
+
+        Contact sheets go to the folder ``sheets``; None draws none.
+        """
+        try:
+            names = list(cases) or self.default_cases(SPLIT)
+        except UserError as error:
+            return [finding_of(error)]
+        findings = []
+        for name in names if cases else names[:MOST_CASES]:
+            try:
+                findings += check_video(self.video(name), sheets)
+            except UserError as error:
+                findings.append(finding_of(error))
+        if not cases and len(names) > MOST_CASES:
+            told = f"{MOST_CASES} of {len(names)} cases looked at; --case names others"
+            findings.append(Finding("warning", "check", told))
+        return findings

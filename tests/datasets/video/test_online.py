@@ -12,7 +12,6 @@ from PIL import Image
 from rewild4d import cli
 from rewild4d.datasets.video import video_file
 from rewild4d.datasets.video.davis import Davis
-from rewild4d.datasets.video.mask_check import check_videos
 from rewild4d.datasets.video.online import Online
 from rewild4d.datasets.video.video_file import ascending, video_facts
 from rewild4d.errors import UserError
@@ -221,7 +220,7 @@ def test_check_tells_what_a_person_should_look_at(walk: Path, tmp_path: Path) ->
     masks[8][50:60, 80:84] = 255
     for i, values in enumerate(masks):
         moving.save(walk / "masks" / f"{i:05d}.png", values)
-    findings = check_videos(Online(walk, parts="all"), sheets=tmp_path / "sheets")
+    findings = Online(walk, parts="all").check(sheets=tmp_path / "sheets")
     said = "\n".join(finding.message for finding in findings)
     assert "holes (or gaps between legs) above 1% of the animal in 1 of 12 frames: 00002.png" in said
     assert "two parts of like size (two animals?) in 1 of 12 frames: 00004.png" in said
@@ -230,7 +229,7 @@ def test_check_tells_what_a_person_should_look_at(walk: Path, tmp_path: Path) ->
     assert "a jump from the frame before in 3 of 12 frames: 00004.png, 00005.png, 00008.png" in said
     sheet = np.asarray(Image.open(tmp_path / "sheets" / "clip.png"))
     assert sheet.shape[1] == 6 * 240
-    clean = check_videos(Davis(moving.davis(tmp_path / "d")))
+    clean = Davis(moving.davis(tmp_path / "d")).check()
     assert [finding.level for finding in clean] == ["ok"]
 
 

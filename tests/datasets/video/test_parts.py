@@ -9,7 +9,6 @@ from films import SELECTION, iou, restored
 
 from rewild4d import cli
 from rewild4d.datasets.video.davis import Davis
-from rewild4d.datasets.video.mask_check import check_videos
 from rewild4d.datasets.video.online import Online
 from rewild4d.datasets.video.parts import NOTE, main_parts, standing_apart
 from rewild4d.errors import UserError
@@ -73,7 +72,7 @@ def test_a_video_of_two_animals_is_that_of_one(tmp_path: Path) -> None:
     both = Online(tmp_path / "clip", parts="all")
     assert both.load("clip", SELECTION)[0].digest != clip.digest and both.settings == {"parts": "all"}
     advice = "--parts main keeps to its own"
-    assert [advice in "".join(f.message for f in check_videos(each)) for each in (both, reader)] == [True, False]
+    assert [advice in "".join(f.message for f in each.check()) for each in (both, reader)] == [True, False]
 
 
 @pytest.mark.parametrize(("count", "parts"), [(12, "main"), (2, "main"), (1, "all")])
