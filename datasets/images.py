@@ -104,10 +104,7 @@ def read_picture(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Read colour and, where there is one, straight alpha of a PNG or JPEG of any mode, turned as its EXIF tag says.
 
     Returns:
-        Colour in [0, 1], float32 [h, w, 3], and alpha in [0, 1], float32 [h, w], or None.
-
-    Raises:
-        UserError: as `read_rgb`.
+        Colour in [0, 1], float32 [h, w, 3], and alpha in [0, 1], float32 [h, w], or None; errors as `read_rgb`.
     """
     image = _upright(path, _decode(path, cv2.IMREAD_UNCHANGED))
     scaled = image.astype(np.float32) / np.iinfo(image.dtype).max

@@ -142,11 +142,7 @@ def _expect_tree(path: Path, parents: np.ndarray) -> None:
 
 
 def read_sequences(path: Path) -> dict[str, int]:
-    """Return motions and their frame counts, from lines "<motion> <n_frames>".
-
-    Raises:
-        UserError: a line of another form.
-    """
+    """Return motions and their frame counts, from lines "<motion> <n_frames>"; `UserError` for another line."""
     motions: dict[str, int] = {}
     for number, line in enumerate(_lines(path), start=1):
         if not line.strip():
@@ -159,7 +155,7 @@ def read_sequences(path: Path) -> dict[str, int]:
 
 
 def list_motions(animal: Path) -> dict[str, int]:
-    """Motions of an animal and their frame counts: the folders under img/, held against `sequences` where it is there.
+    """Return an animal's motions and their frame counts: the folders under img/, checked against `sequences` if there.
 
     Raises:
         UserError: no motions, a gap in the numbering of the frames, or folders and `sequences` that disagree.

@@ -102,11 +102,7 @@ def read_pose(animal: Path, motion: str, frame: int, bones: int) -> np.ndarray:
 
 
 def read_surface(animal: Path) -> Voxels | None:
-    """Return the voxels of an animal that miss one of their six neighbours, or None where it has no folder of volumes.
-
-    Raises:
-        UserError: as `read_voxels`.
-    """
+    """Return the voxels (see `read_voxels`) that miss one of their six neighbours, or None without volumes."""
     voxels = read_voxels(animal)
     return voxels and voxels.rows(np.flatnonzero(is_surface(voxels.cells)))
 

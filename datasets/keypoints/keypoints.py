@@ -119,16 +119,7 @@ def _named_joints(entry: Entry, size: tuple[int, int]) -> tuple[str, Keypoints]:
 
 
 def coco_keypoints(values: Sequence[float], names: Sequence[str], size: tuple[int, int]) -> tuple[Keypoints, int]:
-    """Return one annotation's keypoints; those outside the image are taken as not visible.
-
-    Args:
-        values: x, y, v of each, [3 n].
-        names: [n].
-        size: width and height of the image.
-
-    Returns:
-        The keypoints and how many lay outside the image.
-    """
+    """Return keypoints from (x, y, v) of each, [3 n], and how many lay outside the image: those are not visible."""
     table = torch.tensor(values, dtype=torch.float32).reshape(len(names), 3)
     seen = table[:, 2] > 0
     found = bounded(names, table[:, :2] + 0.5, seen, size)

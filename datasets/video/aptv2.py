@@ -114,11 +114,7 @@ class AptV2(VideoDataset):
         return faults + super().check(cases, sheets)
 
     def unmasked(self, case: str) -> Unmasked:
-        """Return the frames of a case and the annotated box in each, for programs that make masks.
-
-        Raises:
-            UserError: as `load`.
-        """
+        """Return the frames of a case and the annotated box in each, for programs that make masks."""
         if case not in self._annotations.subjects:
             raise unknown_name("case", case, self._annotations.subjects)
         subject = self._annotations.subjects[case]

@@ -124,11 +124,7 @@ class Online(VideoDataset):
         return with_parts(video, self.parts, is_named=self._table[case] is None and len(self._table) > 1)
 
     def unmasked(self, case: str) -> Unmasked:
-        """Return the chosen frames without their masks, for programs that make some; masks are named by frame number.
-
-        Raises:
-            UserError: as `load`.
-        """
+        """Return the chosen frames for programs that make masks; these are named by frame number."""
         stems = tuple(self._stems[i] for i in self._chosen[0])
         return Unmasked(str(self.root), stems, self._material.size, self._images, {})
 
@@ -139,14 +135,14 @@ class Online(VideoDataset):
 
     @cached_property
     def _keypoints(self) -> tuple[list[Keypoints | None], str]:
-        """Of every frame, and a sentence on what of their file is not used."""
+        """The keypoints of every frame, and a note on what of their file is not used."""
         if self.keypoints is None:
             return [None] * len(self._material.times), ""
         return read_keypoints(self.keypoints, self._stems, self._material.size)
 
     @property
     def name(self) -> str:
-        """Of the video: its file's or folder's name."""
+        """Return the name of the video's file or folder."""
         return self.root.stem if self.root.is_file() else self.root.resolve().name
 
     @cached_property

@@ -142,16 +142,13 @@ def usable(
 ) -> tuple[list[int], tuple[str, ...]]:
     """Return indices of the frames that show the whole animal, and what was left out and why, a sentence each.
 
-    Frames that the image's border cuts stay where most are like that.
+    Frames that the image's border cuts stay where most are like that. Fewer than ``least`` frames are a `UserError`.
 
     Args:
         video: whose frames.
         facts: of each moment's mask; None where there is none.
-        stride: every so many frames are looked at.
+        stride: of the frames that are looked at.
         least: how many frames there must be.
-
-    Raises:
-        UserError: there are fewer.
     """
     kept = range(0, len(facts), stride)
     seen = {i: fact for i in kept if (fact := facts[i]) and fact.box and fact.area >= LEAST_AREA}

@@ -88,11 +88,7 @@ def _motion(reconstruction: Articulated, times: Sequence[float]) -> tuple[Tensor
 
 
 def squares(splats: Splats) -> tuple[Tensor, Tensor, Tensor]:
-    """Return a square for each Gaussian.
-
-    Returns:
-        Corners, [4 n, 3]; two triangles each, int64, [2 n, 3]; normals of the corners, unit, [4 n, 3].
-    """
+    """Return Gaussians as squares: corners [4 n, 3], triangles [2 n, 3], unit normals of the corners [4 n, 3]."""
     order = splats.scales.argsort(dim=1, descending=True)
     axes = quat_to_matrix(splats.quats).transpose(1, 2)
     rows = torch.arange(len(splats), device=order.device)
@@ -107,10 +103,7 @@ def squares(splats: Splats) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def influences(weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the joints that move each row, most important first, in sets of four.
-
-    Args:
-        weights: rows sum to one, [n, J].
+    """Return the joints that move each row of weights [n, J], most important first, in sets of four.
 
     Returns:
         Joint numbers (0 where the share is 0) and shares that sum to one, both [n, 4 k].
