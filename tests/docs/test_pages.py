@@ -8,7 +8,9 @@ import pytest
 from rewild4d.cli import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = sorted(path for pattern in ("*.md", "docs/**/*.md", "results/**/*.md") for path in ROOT.glob(pattern))
+PAGES = sorted(
+    path for pattern in ("*.md", "docs/**/*.md", "results/**/*.md", "rewild4d/**/*.md") for path in ROOT.glob(pattern)
+)
 CODE = re.compile(r"^```.*?^```$|^ {4,}.*?$|`[^`\n]+`", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
