@@ -12,7 +12,9 @@ STEP = """
 import msgspec, torch
 from rewild4d.benchmarks.scenes import training
 from rewild4d.kernels.switch import KERNELS
+from rewild4d.rasterizer import set_default
 
+set_default("reference")  # nothing to compile
 step, index = training(32, 60, "quick")
 geometry = msgspec.structs.replace(step.config.geometry, solid=0.01)
 step.config = msgspec.structs.replace(step.config, geometry=geometry)
