@@ -280,7 +280,7 @@ def plot(frame: "pd.DataFrame", metric: str = "psnr") -> "Figure":
     unit = chosen["unit"].iloc[0]
     axes.set_ylabel(metric if unit == "1" else f"{metric}, {unit}")
     axes.set_title(", ".join(sorted(chosen["protocol"].unique())))
-    axes.legend()
+    axes.legend(loc="center left", bbox_to_anchor=(1, 0.5))  # beside the bars, not over them
     return figure
 
 

@@ -20,7 +20,7 @@ from types import CodeType
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from rewild4d.errors import UserError, unknown_name
 
@@ -31,6 +31,8 @@ VARIABLE = "REWILD4D_KERNELS"
 KERNELS: dict[str, "Kernel"] = {}
 """All imported fused kernels by name."""
 _without: set[str] = set()
+LAYERS = {nn.Linear, nn.LayerNorm, nn.ModuleList}
+"""Layers of torch that kernels know; those of this package are in their digests."""
 
 
 def choose_kernels(mode: str | None) -> None:
@@ -89,10 +91,12 @@ class Kernel:
         name: in records and in `bench step`.
         digest: `source_digest` of the twins that the kernel was written for.
         twins: "module:function" or "module:Class.method" of all torch code that the kernel repeats.
+        reads_layers: whether it reads the layers of the network that calls; one with other layers runs in torch.
     """
 
-    def __init__(self, name: str, digest: str, *twins: str) -> None:
+    def __init__(self, name: str, digest: str, *twins: str, reads_layers: bool = False) -> None:
         self.name, self.digest, self.twins, self.calls = name, digest, twins, 0
+        self.reads_layers = reads_layers
         KERNELS[name] = self
 
     def takes(self, *tensors: Tensor, owner: object = None) -> bool:
@@ -105,11 +109,25 @@ class Kernel:
         self.calls += 1
         if not all(tensor.is_cpu and tensor.dtype == torch.float32 for tensor in tensors):
             return False
-        return self.name not in _without and kernel_mode() == "auto" and self.is_current(type(owner))
+        switched_on = self.name not in _without and kernel_mode() == "auto"
+        return switched_on and self.is_current(type(owner)) and (owner is None or not _unknown_layers(self, owner))
 
     def is_current(self, owner: type = type(None)) -> bool:
         """Tell whether the twins are those that the kernel was written for."""
         return not self.twins or _verdict(self, tuple(_code(twin, owner) for twin in self.twins))
+
+
+def _unknown_layers(kernel: Kernel, owner: object) -> bool:
+    """Tell whether a network has layers that no kernel reads, such as one that was put in the place of another."""
+    layers = owner.modules() if isinstance(owner, nn.Module) and kernel.reads_layers else ()
+    kinds = {type(each) for each in layers if each is not owner} - LAYERS
+    return any(not kind.__module__.startswith("rewild4d.") and _tell_layer(kernel.name, kind) for kind in kinds)
+
+
+@cache
+def _tell_layer(name: str, kind: type) -> bool:
+    logger.warning("the fused kernel of '%s' does not know layers of type %s: torch runs.", name, kind.__name__)
+    return True
 
 
 @cache

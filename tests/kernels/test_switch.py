@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 from numba.core.registry import CPUDispatcher
+from torch import nn
 
 import rewild4d.ours.fused
 from rewild4d.benchmarks.scenes import training
@@ -27,9 +28,10 @@ from rewild4d.kernels.switch import (
     twin_digest,
     without_kernels,
 )
-from rewild4d.ours.config import Deform
+from rewild4d.ours.config import Deform, Pose
 from rewild4d.ours.deform import DeformNetwork, Posed
 from rewild4d.ours.losses import regularizers
+from rewild4d.ours.pose import PoseNetwork
 
 for module in pkgutil.iter_modules(rewild4d.ours.fused.__path__, "rewild4d.ours.fused."):
     importlib.import_module(module.name)
@@ -131,6 +133,24 @@ def test_a_subclass_that_overrides_a_layer_gets_its_own_code() -> None:
     made.__class__ = Louder
     with pytest.raises(ZeroDivisionError):
         made(*given)
+
+
+def test_a_subclass_with_another_constructor_and_a_layer_put_in_later_are_seen(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    class Wider(PoseNetwork):
+        def __init__(self, joints: int, config: Pose, generator: torch.Generator) -> None:
+            super().__init__(joints, config, generator)
+            self.norm = nn.Sequential(self.norm, nn.Tanh())  # type: ignore[assignment]
+
+    made = [kind(5, Pose(width=32, heads=2), torch.Generator().manual_seed(0)) for kind in (PoseNetwork, Wider)]
+    late = PoseNetwork(5, Pose(width=32, heads=2), torch.Generator().manual_seed(0))
+    late.norm = made[1].norm
+    code = torch.rand(2, 2 + 2 * Pose().frequencies)
+    with caplog.at_level(logging.WARNING):
+        plain, subclassed, changed = (network(code).features for network in (*made, late))
+    assert torch.equal(subclassed, changed) and torch.allclose(plain.tanh(), changed, atol=1e-5)
+    assert any("does not know layers of type Sequential" in record.message for record in caplog.records)
 
 
 def test_one_kernel_can_be_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,11 +29,13 @@ from rewild4d.ours.fused.sampled_rows import sample_rows
 
 DEFORMATION = Kernel(
     "deformation",
-    "0688f8e6e69d",
+    "9a70e27e7c54",
+    "rewild4d.ours.deform:DeformNetwork.__init__",
     "rewild4d.ours.deform:DeformNetwork.forward",
     "rewild4d.ours.deform:DeformNetwork._position_code",
     "rewild4d.ours.deform:DeformNetwork._attend",
     "rewild4d.ours.deform:DeformNetwork._attention",
+    reads_layers=True,
 )
 
 CHUNK = 11 * BLOCK

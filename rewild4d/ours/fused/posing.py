@@ -20,11 +20,14 @@ from rewild4d.ours.fused.quaternions import unit, unit_grad
 
 POSE_NETWORK = Kernel(
     "pose network",
-    "558c5ae3e3ae",
+    "ad9a48aee607",
+    "rewild4d.ours.pose:PoseNetwork.__init__",
     "rewild4d.ours.pose:PoseNetwork._plain",
     "rewild4d.ours.pose:PoseNetwork.forward",
+    "rewild4d.ours.pose:Block.__init__",
     "rewild4d.ours.pose:Block.forward",
     "rewild4d.ours.pose:time_code",
+    reads_layers=True,
 )
 
 
