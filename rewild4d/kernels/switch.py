@@ -121,12 +121,14 @@ def _unknown_layers(kernel: Kernel, owner: object) -> bool:
     """Tell whether a network has layers that no kernel reads, such as one that was put in the place of another."""
     layers = owner.modules() if isinstance(owner, nn.Module) and kernel.reads_layers else ()
     kinds = {type(each) for each in layers if each is not owner} - LAYERS
-    return any(not kind.__module__.startswith("rewild4d.") and _tell_layer(kernel.name, kind) for kind in kinds)
+    return any(
+        not kind.__module__.startswith("rewild4d.") and _tell_layer(kernel.name, kind.__name__) for kind in kinds
+    )
 
 
 @cache
-def _tell_layer(name: str, kind: type) -> bool:
-    logger.warning("the fused kernel of '%s' does not know layers of type %s: torch runs.", name, kind.__name__)
+def _tell_layer(name: str, kind: str) -> bool:
+    logger.warning("the fused kernel of '%s' does not know layers of type %s: torch runs.", name, kind)
     return True
 
 
