@@ -42,6 +42,7 @@ importlib.import_module("rewild4d.harmonics")
 def mode(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Each test starts with fused kernels and forgets what it was told."""
     monkeypatch.setenv(switch.VARIABLE, "auto")
+    switch._tell_layer.cache_clear()
     yield
     switch._verdict.cache_clear()
 
