@@ -120,7 +120,7 @@ class Kernel:
 def _unknown_layers(kernel: Kernel, owner: object) -> bool:
     """Tell whether a network has layers that no kernel reads, such as one that was put in the place of another."""
     layers = owner.modules() if isinstance(owner, nn.Module) and kernel.reads_layers else ()
-    kinds = {type(each) for each in layers if each is not owner} - LAYERS
+    kinds = dict.fromkeys(type(each) for each in layers if each is not owner and type(each) not in LAYERS)
     return any(
         not kind.__module__.startswith("rewild4d.") and _tell_layer(kernel.name, kind.__name__) for kind in kinds
     )
