@@ -4,9 +4,17 @@ import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from threading import RLock
 from types import MappingProxyType
 
 from tqdm import tqdm
+
+
+class _Bar(tqdm):
+    """A bar with a lock of this process: tqdm's own holds a semaphore, and Python warns of it after a sudden end."""
+
+
+_Bar.set_lock(RLock())
 
 
 class Progress:
@@ -19,7 +27,7 @@ class Progress:
     def __call__(self, step: int, total: int, values: Mapping[str, float] = MappingProxyType({})) -> None:
         if self.bar is None:
             pause = 0.5 if sys.stderr.isatty() else 10.0
-            self.bar = tqdm(desc=self.title, total=total, file=sys.stderr, mininterval=pause)
+            self.bar = _Bar(desc=self.title, total=total, file=sys.stderr, mininterval=pause)
         self.bar.total = total
         self.bar.update(step - self.bar.n)
         if values:

@@ -144,7 +144,11 @@ def test_ctrl_c_ends_workers_that_start_wait_or_work_without_a_word(name: str, t
         workers.map(work, [(0,), (1,), (2,)], lambda *_: print("lost"))
 
 def work(number):
+    import contextlib, io
+    from rewild4d.progress import Progress
     library.__dict__['__name__'] = {name!r}
+    with contextlib.redirect_stderr(io.StringIO()):
+        Progress("its lock may be a semaphore, which Python tells of where nobody closed it")(1, 2)
     if number:
         library.swallow(os.killpg, os.getpgid(0))
 """
