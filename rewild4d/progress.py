@@ -17,6 +17,11 @@ class _Bar(tqdm):
 _Bar.set_lock(RLock())
 
 
+def is_shown() -> bool:
+    """Tell whether a bar stands on the last line of standard error."""
+    return len(getattr(_Bar, "_instances", ())) > 0
+
+
 class Progress:
     """A contracts.Log that shows a bar on standard error and appends every line to a file."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -32,7 +33,8 @@ def answer_interrupts(owner: CodeType, line: str = "") -> bool:
             frame = frame.f_back
         if frame is not None and frame.f_code is owner:
             raise KeyboardInterrupt
-        os.write(2, line.encode())
+        bar_is_shown = getattr(sys.modules.get("rewild4d.progress"), "is_shown", bool)  # it may not be imported yet
+        os.write(2, ("\n" * bar_is_shown() + line).encode())
         os._exit(STATUS)
 
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
