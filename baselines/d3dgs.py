@@ -145,7 +145,7 @@ class D3dgs:
         log: Log,
         workdir: Path | None,
     ) -> D3dgsReconstruction:
-        """Return the reconstruct from the clip; see contracts.Method."""
+        """Reconstruct from the clip; see contracts.Method."""
         config = for_clip(config, len(clip.frames))
         generator = torch.Generator().manual_seed(seed)
         frame, values = self._start(clip, prior, config, generator)

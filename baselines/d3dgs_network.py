@@ -56,7 +56,7 @@ class DeformationNetwork(nn.Module):
         return move, turn, grow
 
     def _hidden(self, place: Tensor, moment: Tensor) -> Tensor:
-        """Return codes of place [n, .] and of the one moment [.] -> what the heads read, [n, width]."""
+        """Compute what the heads read from codes of position [n, .] and of the one time [.], [n, width]."""
         hidden = torch.relu(_together(self.first, place, moment))
         for index, layer in enumerate(self.layers):
             hidden = layer(hidden)
@@ -67,7 +67,7 @@ class DeformationNetwork(nn.Module):
 
 
 def _together(layer: nn.Linear, place: Tensor, moment: Tensor) -> Tensor:
-    """Return a layer on [place, moment] where the moment is the same for all rows: its share becomes a bias."""
+    """Apply a layer to [position, time] where the time is the same for all rows: its share becomes a bias."""
     columns = place.shape[1]
     bias = linear(moment, layer.weight[:, columns:], layer.bias)
     return linear(place, layer.weight[:, :columns], bias)

@@ -178,7 +178,7 @@ def _run(work: Path, clip: Clip, prior: Prior, profile: Profile, config: Externa
 def _read(
     folder: Path, clip: Clip, prior: Prior, profile: Profile, config: ExternalConfig, seed: int, log: Log
 ) -> ExternalReconstruction:
-    """Return files to Gaussians in the world."""
+    """Read files as Gaussians in the world."""
     paths = find_outputs(folder, profile, len(clip.frames))
     moments = read_moments(paths, clip.times, config.points, seed)
     times = _times(clip, len(moments), profile.spread)

@@ -139,7 +139,7 @@ class _Search:
         return float(np.mean([-10 * math.log10(max(error, 1e-10)) for error in errors]))
 
     def refined(self, candidate: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the best near a candidate, by the simplex method."""
+        """Search near a candidate by the simplex method."""
         free = [0, 1, 2, 3, 4, *([5] if self.moves else [])]
         steps = np.array([8.0, 8.0, 0.08, 0.03, 0.03, 0.08])
 
@@ -154,7 +154,7 @@ class _Search:
         return -float(found.fun), full(found.x)
 
     def matrix(self, candidate: np.ndarray) -> Tensor:
-        """Return the object -> world, [4, 4]."""
+        """Return the transform from object to world, [4, 4]."""
         azimuth, elevation, scale, column, row, deeper = (float(value) for value in candidate)
         angle, height = math.radians(azimuth), math.radians(max(-89.0, min(89.0, elevation)))
         side = torch.linalg.cross(self.up, self.ahead)

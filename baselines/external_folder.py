@@ -220,7 +220,7 @@ def _wanted(profile: Profile, frames: int, found: int) -> tuple[tuple[int, ...],
 
 
 def _fault(numbers: list[int], count: int) -> str | None:
-    """Return what keeps ascending numbers from being ``count``, from 0 or from 1 on; None where nothing does."""
+    """Say what keeps ascending numbers from being ``count``, from 0 or from 1 on; None where nothing does."""
     first = 1 if numbers[0] == 1 else 0
     twice = next((one for one, other in pairwise(numbers) if one == other), None)
     missing = next((wanted for wanted in range(first, first + count) if wanted not in numbers), None)

@@ -77,7 +77,7 @@ def _bones(document: Document, skin: int, world: Floats) -> Floats:
 
 
 def _mesh(surface: Surface, points: Floats) -> Mesh:
-    """Return a surface of the rig reader at one moment; its texture coordinates begin at the upper left corner."""
+    """Convert a surface of the rig reader at one moment; its texture coordinates begin at the upper left corner."""
     uv: Tensor | None = None
     texture: Tensor | None = None
     if surface.uv is not None and surface.texture is not None:

@@ -44,14 +44,14 @@ def read_moments(paths: Sequence[Path], times: Sequence[float], count: int, seed
 
 
 def moved_discs(found: Discs, matrix: Tensor) -> Discs:
-    """Return points on a mesh under a proper similarity [4, 4]."""
+    """Move points on a mesh by a proper similarity [4, 4]."""
     scale, turn, shift = split_similarity(matrix.double())
     points = found.points.double() @ (scale * turn).T + shift
     return Discs(points.float(), (found.normals.double() @ turn.T).float(), found.radius * float(scale), found.colors)
 
 
 def painted(moments: Sequence[Discs], shots: Sequence[tuple[Frame, Camera]]) -> list[Splats]:
-    """Return Gaussians of meshes without colour: what the input frame of the same moment shows where a point is seen.
+    """Colour Gaussians of meshes without colour: what the input frame of the same moment shows where a point is seen.
 
     Points that move from moment to moment keep the mean of what the frames show of them. A point that no frame shows
     has the colour of the nearest one that is shown.

@@ -114,7 +114,7 @@ class GartTraining(SplatTraining):
         return losses, info, target
 
     def _alike(self) -> dict[str, Tensor]:
-        """Return neighbours alike, and no Gaussian large."""
+        """Hold neighbours alike, and no Gaussian large."""
         own, config = self.model.gaussians, self.config.regularisers
         if self.near is None:
             others = neighbours(own.means, min(config.neighbours, len(own)) - 1).to(own.means.device)
@@ -133,7 +133,7 @@ class GartTraining(SplatTraining):
         return {"alike": total}
 
     def _refine_step(self, done: int) -> dict[str, float]:
-        """Return one step of SGD on the pose of one frame; white background, as the original's."""
+        """Take one step of SGD on the pose of one frame; white background, as the original's."""
         assert isinstance(self.config, GartStarConfig)
         frame, step = divmod(done, self.config.refine.steps)
         model = self.model
@@ -170,7 +170,7 @@ class Gart:
         log: Log,
         workdir: Path | None,
     ) -> GartReconstruction:
-        """Return the reconstruct from the clip and the prior; see contracts.Method."""
+        """Reconstruct from the clip and the prior; see contracts.Method."""
         config = for_clip(config, len(clip.frames))
         generator = torch.Generator().manual_seed(seed)
         supervision = Supervision(clip, prior, config.image_size, device)

@@ -21,7 +21,7 @@ from rewild4d.types import Frame
 def refine_step(
     own: Gaussians, weights: Tensor, poses: PoseTable, frame: int, target: Target, step: int, config: GartStarConfig
 ) -> float:
-    """Return one step; white background, as the original's.
+    """Take one step; white background, as the original's.
 
     Args:
         own: canonical Gaussians.
@@ -54,7 +54,7 @@ def refine_moments(
     own: Gaussians, weights: Tensor, poses: PoseTable, root: Root, frames: Sequence[Frame], config: GartStarConfig,
     log: Log,
 ) -> tuple[PoseTable, Root]:  # fmt: skip
-    """Poses for further moments of the input view, each begun between those of its neighbours and fitted to its image.
+    """Fit poses for further times of the input view, each begun between those of its neighbours, to its images.
 
     Args:
         own: canonical Gaussians.

@@ -39,7 +39,7 @@ class PoseTable(nn.Module):
         return self._chained(self._local(frame), self.offsets[frame], self.shifts[frame])
 
     def between(self, position: float) -> tuple[Tensor, Tensor]:
-        """Return the pose at a place between frames (1.5: half-way from the second to the third): joints slerp."""
+        """Return the pose at a position between frames (1.5: half-way from the second to the third): joints slerp."""
         return self._chained(*self._at(position))
 
     @torch.no_grad()
@@ -56,7 +56,7 @@ class PoseTable(nn.Module):
         return table.to(local.device)
 
     def _at(self, position: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what `_chained` takes, at a place between frames."""
+        """Return what `_chained` takes, at a position between frames."""
         low = int(position)
         part = position - low
         if part == 0:
@@ -71,7 +71,7 @@ class PoseTable(nn.Module):
         return quat_multiply(self.quats[frame], exponential_quats(self.turns[frame]))
 
     def _chained(self, local: Tensor, offsets: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
-        """Return P_j = P_parent T(c + d) R T(-c): root to leaf, level by level."""
+        """Chain P_j = P_parent T(c + d) R T(-c) from root to leaf, level by level."""
         rotation = quat_to_matrix(local)
         moves = self.pivots + offsets - (rotation @ self.pivots[..., None])[..., 0]
         quats, turns, places = local, rotation, moves
@@ -85,7 +85,7 @@ class PoseTable(nn.Module):
 
 
 def pose_table(transforms: Tensor, pivots: Tensor, parents: Tensor) -> PoseTable:
-    """Return the table that starts at given poses.
+    """Make the table that starts at given poses.
 
     Args:
         transforms: rest -> posed, rigid, [T, J, 4, 4].

@@ -69,7 +69,7 @@ class PriorOnlyReconstruction:
         return self.prior.parents
 
     def articulation(self, time: float) -> tuple[Tensor, Tensor]:
-        """Return the rest -> posed transforms, [J, 4, 4], and object_to_world, [4, 4]."""
+        """Return transforms from rest to pose, [J, 4, 4], and object_to_world, [4, 4]."""
         object_to_world, transforms = pose_at(self.prior, time)
         return transforms, object_to_world
 

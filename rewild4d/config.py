@@ -51,7 +51,7 @@ def load_preset(method: str, config_type: type[T], preset: str) -> T:
 
 
 def _over(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """Return the nested values with others in their place."""
+    """Deep-merge two nested mappings; the second wins."""
     made = dict(base)
     for key, value in own.items():
         nested = isinstance(value, dict) and isinstance(base.get(key), dict)
@@ -144,7 +144,7 @@ def _require_ranges(config: msgspec.Struct, prog: str) -> None:
 
 
 def _first_words(box: str) -> str:
-    """Return what the parser complains of, out of the frame that it draws around it."""
+    """Extract the parser's complaint from the box that it draws around it."""
     plain = re.sub(r"\x1b\[[0-9;]*m", "", box)
     sections = re.split(r"^.*(?:──|-----).*$", plain, flags=re.MULTILINE)
     sentences = [" ".join(section.replace("│", " ").split()) for section in sections]

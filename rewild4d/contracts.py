@@ -116,7 +116,7 @@ class Method(Protocol):
         log: Log,
         workdir: Path | None,
     ) -> Reconstruction:
-        """Return the reconstruct from the clip and the prior, and nothing else.
+        """Reconstruct from the clip and the prior, and nothing else.
 
         Args:
             clip: the frames that the method may see.

@@ -188,7 +188,7 @@ def command_words(command: str) -> list[str]:
 
 
 def natural(path: Path) -> list[str | int]:
-    """Return sorts files by name so that 2 comes before 10."""
+    """Return a key that sorts files by name so that 2 comes before 10."""
     return [int(part) if index % 2 else part for index, part in enumerate(re.split(r"([0-9]+)", path.name))]
 
 

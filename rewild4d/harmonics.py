@@ -64,7 +64,7 @@ def _table(level: int, device: torch.device, dtype: torch.dtype) -> Tensor:
 
 
 def rotated(coefficients: Tensor, rotations: Tensor) -> Tensor:
-    """Return coefficients of the same colours on a sphere that turns: rotated(c, R) seen along R d is c seen along d.
+    """Rotate the coefficients of colours: rotated(c, R) seen along R d is c seen along d.
 
     The functions of one degree are closed under rotation, so matching them at enough directions is exact.
 
@@ -148,7 +148,7 @@ def seen_colors(splats: Splats, eye: Tensor) -> Tensor:
 
 
 def products(a: Tensor, b: Tensor) -> Tensor:
-    """Return all a_i b_j, i the slower index, [..., n] and [..., m] -> [..., n m].
+    """Compute all a_i b_j, i the slower index, [..., n] and [..., m] -> [..., n m].
 
     The components are spread by matrices of zeros and ones: the gradient of a broadcast product would be a sum along
     short axes, which takes a CPU twice as long.

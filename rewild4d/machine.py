@@ -65,7 +65,7 @@ def _sources(package: str) -> str:
 
 
 def machine(device: torch.device, rasterizer: str) -> dict[str, str]:
-    """Return the processor, system, threads, what renders, and the versions that decide the last digit."""
+    """Describe processor, system, threads, backends, and the versions that decide the last digit."""
     packages = ["numpy", "numba"]
     if rasterizer in ("triton", "gsplat"):
         packages.append(rasterizer)

@@ -16,7 +16,7 @@ from rewild4d.types import Camera, Splats
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Return the hamilton product a ⊗ b of wxyz quaternions, [..., 4]."""
+    """Compute the Hamilton product a ⊗ b of wxyz quaternions, [..., 4]."""
     return products(a, b) @ _table(HAMILTON, a.device, a.dtype)
 
 
@@ -145,7 +145,7 @@ def between_intrinsics(first: Tensor, second: Tensor, part: float) -> Tensor:
 
 
 def mirror_camera(camera: Camera) -> Camera:
-    """Return the proper camera whose image of the reflected scene is the horizontally flipped image.
+    """Mirror a camera: the proper one whose image of the reflected scene is the horizontally flipped image.
 
     R' = S R S, t' = S t, cx' = W - cx (pixel centres at +0.5); det R' = +1. A bare reflection of the camera would be
     improper and must not reach a rasterizer.
@@ -169,7 +169,7 @@ def camera_in_object(camera: Camera, object_to_world: Tensor) -> Camera:
 
 
 def transform_splats(splats: Splats, matrix: Tensor) -> Splats:
-    """Return Gaussians moved by a proper similarity, [4, 4]; colours that depend on the view turn with them."""
+    """Move Gaussians by a proper similarity, [4, 4]; colours that depend on the view rotate with them."""
     scale, rotation, translation = split_similarity(matrix.double())
     turn = matrix_to_quat(rotation).to(splats.quats)
     moved = splats.means.double() @ matrix.double()[:3, :3].T + translation
@@ -186,7 +186,7 @@ def transform_splats(splats: Splats, matrix: Tensor) -> Splats:
 
 
 def skin_points(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
-    """Return the linear blend skinning: x -> sum_j w_j P_j x.
+    """Apply linear blend skinning: x -> sum_j w_j P_j x.
 
     Args:
         points: rest positions, [n, 3].

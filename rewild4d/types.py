@@ -140,7 +140,7 @@ class Frame:
     keypoints: Keypoints | None = None
 
     def over(self, background: float | Tensor) -> Tensor:
-        """Return the frame composited on a background colour (a number or a tensor that broadcasts), [3, h, w]."""
+        """Composite the frame on a background colour (a number or a tensor that broadcasts), [3, h, w]."""
         return self.rgb + (1.0 - self.mask) * background
 
 

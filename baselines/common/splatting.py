@@ -123,7 +123,7 @@ class SplatTraining(ABC):
         """Return the learning rate of a group that is not the Gaussians'."""
 
     def step(self, index: int) -> dict[str, float]:
-        """Return one iteration; gives the figures for the log."""
+        """Take one iteration; return the figures for the log."""
         progress = index / self.settings.iterations
         self.optimizer.param_groups[NAMES.index("means")]["lr"] = exponential(*self.settings.rates.means, progress)
         for name, group in zip(self.groups, self.others.param_groups, strict=True):
@@ -181,7 +181,7 @@ class SplatTraining(ABC):
             reset_opacities(self.gaussians, self.optimizer, resets.opacity)
 
     def state(self) -> dict[str, Any]:
-        """Return the everything that a resumed fit needs."""
+        """Return everything that a resumed fit needs."""
         return {
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),

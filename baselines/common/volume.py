@@ -20,7 +20,7 @@ DRAWS = 8
 
 
 def scene_frame(clip: Clip, prior: Prior) -> Prior:
-    """Return a "prior" whose root stands still: the shared volume's frame, with the clip's cameras in it.
+    """Make a "prior" whose root stands still: the shared volume's frame, with the clip's cameras in it.
 
     Args:
         clip: its cameras decide; the prior's are taken for frames without one.

@@ -122,7 +122,7 @@ def check_seeds(seeds: Sequence[int]) -> None:
 
 
 def floor_entry(name: str) -> Entry:
-    """Return a floor as a row of a plan: its first preset, one seed."""
+    """Return a lower bound as a row of a plan: its first preset, one seed."""
     from rewild4d.running.runner import Entry
 
     presets, config_type = preset_names(name), load_config(name)

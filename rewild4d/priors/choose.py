@@ -114,7 +114,7 @@ class PriorChoice:
 
 
 def split_marks(found: Marks, use: Use) -> tuple[Marks | None, Marks | None]:
-    """Return marks for the fit and marks to score it by; None for no marks."""
+    """Split marks into those for the fit and those to score it by; None for no marks."""
     moments, step = found.moments.unique(), {"all": 1, "half": 2, "none": 0}[use]
     seen = torch.isin(found.moments, moments[::step] if step else moments[:0])
     given, scored = found.chosen(seen), found.chosen(~seen)
@@ -122,7 +122,7 @@ def split_marks(found: Marks, use: Use) -> tuple[Marks | None, Marks | None]:
 
 
 def make_prior(choice: PriorChoice, clip: Clip, truth: Truth, path: Path, log: Log) -> Prior:
-    """Return the chosen prior; a fitted one is kept at ``path`` and read from there the next time.
+    """Make the chosen prior; a fitted one is kept at ``path`` and read from there the next time.
 
     For a clip without cameras it has a row for each frame whose camera agrees with the others' (`steady`), and `notes`
     say what was left out and what speaks against it.

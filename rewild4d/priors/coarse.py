@@ -28,7 +28,7 @@ SHAPE_NOISE = 0.3
 def coarse_prior(
     clip: Clip, many_views: Sequence[Frame], *, noise: float, seed: int, config: PriorConfig, log: Log
 ) -> Prior:
-    """Return the template with nearly the true root and joint angles, plus noise.
+    """Make the template with nearly the true root and joint angles, plus noise.
 
     Args:
         clip: what the method sees; the prior's frames and cameras are its.

@@ -128,7 +128,7 @@ def _unposed(posed: Tensor, angles: Tensor) -> tuple[Tensor, float]:
 
 
 def _bones(vertices: Tensor) -> tuple[Tensor, tuple[int, ...]]:
-    """Return `estimate_bones` of vertices that have room for them.
+    """Run `estimate_bones` on vertices that have room for bones.
 
     Raises:
         ValueError: they lie in a plane, too few of them are low enough to be feet, or a bone has no direction.

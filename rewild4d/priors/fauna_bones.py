@@ -55,7 +55,7 @@ def _foot(vertices: Tensor, side: int, end: int) -> Tensor:
 
 
 def skinning_weights(vertices: Tensor, bones: Tensor) -> Tensor:
-    """Return Softmax over bones of minus the distance to the bone over the temperature, [n, 20]."""
+    """Compute the softmax over bones of minus the distance to the bone over the temperature, [n, 20]."""
     start, along = bones[:, 0], bones[:, 1] - bones[:, 0]
     offset = vertices[:, None] - start
     share = ((offset * along).sum(-1) / along.square().sum(-1).clamp_min(1e-12)).clamp(0, 1)
@@ -64,7 +64,7 @@ def skinning_weights(vertices: Tensor, bones: Tensor) -> Tensor:
 
 
 def joint_transforms(bones: Tensor, parents: tuple[int, ...], angles: Tensor) -> Tensor:
-    """Return the rest -> posed of every bone: the product from root to leaf of M R M^-1, M the bone's frame at rest.
+    """Chain each bone's transform from rest to pose, from root to leaf: M R M^-1, M the bone's frame at rest.
 
     Args:
         bones: [20, 2, 3].
@@ -90,7 +90,7 @@ def joint_transforms(bones: Tensor, parents: tuple[int, ...], angles: Tensor) ->
 
 
 def _euler(angles: Tensor) -> Tensor:
-    """Return the rx @ Ry @ Rz, [j, 3] -> [j, 3, 3]."""
+    """Compute Rx @ Ry @ Rz, [j, 3] -> [j, 3, 3]."""
     (cx, cy, cz), (sx, sy, sz) = angles.cos().unbind(-1), angles.sin().unbind(-1)
     zero, one = torch.zeros_like(cx), torch.ones_like(cx)
     about_x = torch.stack((one, zero, zero, zero, cx, -sx, zero, sx, cx), -1).unflatten(-1, (3, 3))

@@ -22,7 +22,7 @@ _NAME = re.compile(r"(?P<step>\d+)_\s*(?P<frame>\S+)_mesh\.obj")
 
 
 def stems(folder: Path) -> dict[str, str]:
-    """Return the frame name -> file stem, of the latest step, in order of the frames.
+    """Return file stems by frame name, of the latest step, in order of the frames.
 
     Raises:
         UserError: no folder, or no meshes in it.
@@ -85,7 +85,7 @@ def _placed(camera: Camera, box: Path | None, size: int, flipped: bool) -> Camer
 
 
 def _numbers(path: Path, count: int) -> Tensor:
-    """Return whitespace-separated numbers, float64, [count].
+    """Read whitespace-separated numbers, float64, [count].
 
     Raises:
         UserError: no such file, or other numbers of numbers.
@@ -104,7 +104,7 @@ def _numbers(path: Path, count: int) -> Tensor:
 
 
 def read_obj(path: Path) -> tuple[Tensor, Tensor]:
-    """Return vertices, float64, [n, 3], and triangles, int64, [f, 3].
+    """Read vertices, float64, [n, 3], and triangles, int64, [f, 3].
 
     Raises:
         UserError: the file cannot be read, a line is cut off or no triangle, or a vertex is not there or not finite.
@@ -137,7 +137,7 @@ def read_obj(path: Path) -> tuple[Tensor, Tensor]:
 
 
 def _vertex(words: list[str]) -> tuple[float, ...]:
-    """Return the three coordinates; what stands behind them is a colour or a weight."""
+    """Read the three coordinates; numbers behind them are a colour or a weight."""
     x, y, z = (float(word) for word in words[:3])
     if not all(math.isfinite(value) for value in (x, y, z)):
         raise ValueError("not finite")

@@ -96,7 +96,7 @@ class StandingCamera(Race):
         return super().verdict(stage) + self.config.travel_weight * self._against_travel()
 
     def _against_travel(self) -> Tensor | float:
-        """Tell whether heads point against (1) or along (-1) the way the animal goes over the ground, [B]."""
+        """Measure how far heads point against (1) or along (-1) the motion over the ground, [B]."""
         if self.said.travel is None or not len(self.said.travel):
             return 0.0
         walked = self.said.travel / self.boxes[1:, 2:]
@@ -160,7 +160,7 @@ def _run(
     clip: Clip, frames: tuple[Frame, ...], said: Evidence, config: PriorConfig, seed: int, log: Log, total: int,
     known: Views | None,
 ) -> StandingCamera:  # fmt: skip
-    """Return all rounds, from all starts to one guess; ``known`` is the animal whose proportions are taken over."""
+    """Run all rounds, from all starts to one guess; ``known`` is the animal whose proportions are taken over."""
     boxes = windows(frames)
     seen = [
         replace(frame, camera=fauna_camera(box, frame.mask.shape[2], frame.mask.shape[1]))

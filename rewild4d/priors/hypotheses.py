@@ -141,7 +141,7 @@ class Hypotheses:
         return torch.einsum("bvnac,bnc->bvna", blended[..., :3], points) + blended[..., 3]
 
     def backward_gait(self) -> Tensor:
-        """Tell whether low feet move towards the head (against every gait, up to 1) or the tail (down to -1), [B].
+        """Measure how far low feet move towards the head (against every gait, up to 1) or the tail (down to -1), [B].
 
         A foot that bears weight goes backwards in the body's frame, whether the animal travels or walks on the spot;
         with head and tail confused it goes forwards. Near zero where the feet hardly move.
@@ -157,7 +157,7 @@ class Hypotheses:
         return (bearing * step).sum((1, 2)) / (travel + STILL_STEP * bearing.sum((1, 2)))
 
     def penalties(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return how unusual the proportions, the relief, the joint angles and the root's motion are, each [B].
+        """Measure how unusual the proportions, the relief, the joint angles and the root's motion are, each [B].
 
         Fast terms cost more than slow ones: a moment seen by one camera says nothing of depth, its neighbours do.
         Where the animal heads on the whole costs nothing: the starts only sample it.

@@ -23,7 +23,7 @@ AGREED = 0.9
 
 
 def measured(prior: Prior, frames: Sequence[Frame]) -> dict[str, float]:
-    """Return what a prior's masks and cameras say of it.
+    """Measure a prior by its masks and cameras.
 
     Args:
         prior: one row per frame.
@@ -58,7 +58,7 @@ def agreement(cameras: Sequence[Camera], cameras_flip: Sequence[Camera]) -> floa
 
 
 def doubts(quality: Mapping[str, float]) -> tuple[str, ...]:
-    """Return what a prior's figures say against it, a sentence each."""
+    """List what a prior's figures say against it, a sentence each."""
     found = []
     iou = min(quality.get("mask_iou", 1.0), quality.get("mask_iou_flip", 1.0))
     if iou < POOR:

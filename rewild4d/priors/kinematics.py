@@ -26,7 +26,7 @@ def depth_levels(parents: Sequence[int]) -> list[list[int]]:
 
 
 def pose(angles: Tensor, pivots: Tensor, parents: Sequence[int]) -> Tensor:
-    """Return the chained transforms P_j = P_parent(j) T(c_j) R_j T(-c_j): rest -> posed, identity at zero angles.
+    """Compute the chained transforms P_j = P_parent(j) T(c_j) R_j T(-c_j): rest -> posed, identity at zero angles.
 
     The axes of every joint are the object's (x flexes in the side view, y turns sideways, z rolls), so a mirrored
     pose has angles (x, -y, -z) on the bone of the other side. Composition from leaf to root as in METHOD section 2.

@@ -112,7 +112,7 @@ def blend_similarities(a: Tensor, b: Tensor, part: float) -> Tensor:
 
 
 def pose_gaussians(sample: SurfaceSample, quats: Tensor, scales: Tensor, colors: Tensor, transforms: Tensor) -> Splats:
-    """Return the opaque Gaussians on the posed surface, in the object frame.
+    """Make opaque Gaussians on the posed surface, in the object frame.
 
     Args:
         sample: the surface at rest.
@@ -167,7 +167,7 @@ def colors_from_frames(prior: Prior, sample: SurfaceSample, frames: Sequence[Fra
 
 
 def _look_up(frame: Frame, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the bilinear colour (premultiplied) [n, 3] and matte [n] at pixel positions [n, 2]."""
+    """Sample colour (premultiplied) [n, 3] and matte [n] bilinearly at pixel positions [n, 2]."""
     height, width = frame.mask.shape[1:]
     grid = pixels / pixels.new_tensor((width, height)) * 2 - 1
     image = torch.cat((frame.rgb, frame.mask))[None]

@@ -20,7 +20,7 @@ HEAD_COLOR = (255, 0, 80)
 
 
 def overlay(clip: Clip, prior: Prior, moments: Sequence[int] | None = None, photo: float = 0.0) -> Tensor:
-    """Return masks in green, the template in magenta (grey where they agree), bones on top.
+    """Draw masks in green, the template in magenta (grey where they agree), bones on top.
 
     Left legs are drawn orange, right legs blue, the spine white and the head red, so that a turned template shows.
 

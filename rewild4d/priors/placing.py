@@ -28,7 +28,7 @@ def resized(prior: Prior, width: int, height: int) -> Prior:
 
 
 def placed(prior: Prior, clip: Clip) -> Prior:
-    """Return a prior from a file, for the frames of a clip whose cameras nobody knows.
+    """Fit a prior from a file to the frames of a clip with unknown cameras.
 
     It may have been made for the clip's own images (then its times are the clip's) or for whole frames of the video
     that the clip was cut from (then they are the video's). Frames that it does not know lie between two that it does.
@@ -50,7 +50,7 @@ def placed(prior: Prior, clip: Clip) -> Prior:
 
 
 def in_world(prior: Prior, clip: Clip, file: str) -> Prior:
-    """Return a prior from a file, for a clip whose cameras are known: at its moments, seen by its cameras.
+    """Fit a prior from a file to a clip with known cameras: at its times, seen by its cameras.
 
     Raises:
         UserError: it is for other moments, or its cameras and `object_to_world` contradict the clip's cameras, or no
@@ -140,7 +140,7 @@ def _sampled(prior: Prior, times: Tensor) -> tuple[Tensor, Tensor, tuple[Camera,
 
 
 def in_crops(prior: Prior, clip: Clip) -> Prior:
-    """Return a prior of whole frames for a clip of square crops of them; it has a row for each of the clip's frames.
+    """Convert a prior of whole frames for a clip of square crops of them; it has a row for each of the clip's frames.
 
     Raises:
         UserError: a frame is no crop, or the prior is for frames of another size.

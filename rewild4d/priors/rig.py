@@ -35,7 +35,7 @@ SAMPLES = 3000
 
 
 def rig_prior(clip: Clip, rig: Rig, template: Prior) -> Prior:
-    """Return the true animal as a prior.
+    """Make a prior of the true animal.
 
     Args:
         clip: what the method sees; the prior's frames and cameras are its.
@@ -118,7 +118,7 @@ def symmetric_frame(points: Tensor, axes: Tensor) -> Tensor:
 
 
 def _normal(guess: np.ndarray) -> np.ndarray:
-    """Return the x axis after turns about y and z, given as one axis-angle vector (0, y, z)."""
+    """Rotate the x axis about y and z, by one axis-angle vector (0, y, z)."""
     turn = axis_angle_to_matrix(torch.tensor((0.0, guess[0], guess[1]), dtype=torch.float64))
     return turn[:, 0].numpy()
 

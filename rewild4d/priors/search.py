@@ -152,7 +152,7 @@ def single_view(rays: Rays, working: Tensor) -> Tensor | None:
 
 
 def facings(count: int) -> Tensor:
-    """Return turns about y by even shares of the circle, [count, 3, 3]."""
+    """Return rotations about y by even shares of the circle, [count, 3, 3]."""
     angle = torch.arange(count) * (2 * torch.pi / count)
     zero, one = torch.zeros(count), torch.ones(count)
     rows = (angle.cos(), zero, angle.sin(), zero, one, zero, -angle.sin(), zero, angle.cos())

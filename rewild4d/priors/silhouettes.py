@@ -119,7 +119,7 @@ def _window(image: Tensor, left: int, top: int, side: int, size: int) -> Tensor:
 
 
 def splat(points: Tensor, sizes: Tensor, intrinsics: Tensor, size: int) -> Tensor:
-    """Return the soft silhouettes of round Gaussians.
+    """Render soft silhouettes of round Gaussians.
 
     Args:
         points: in camera coordinates, [..., n, 3].
@@ -143,7 +143,7 @@ def splat(points: Tensor, sizes: Tensor, intrinsics: Tensor, size: int) -> Tenso
 
 
 def rasterized(vertices: Tensor, quads: Tensor, intrinsics: Tensor, size: int) -> Tensor:
-    """Return silhouettes of a surface by the benchmark's rasterizer: a flat Gaussian on every quadrilateral.
+    """Render silhouettes of a surface by the benchmark's rasterizer: a flat Gaussian on every quadrilateral.
 
     Size and opacity are such that the 50 % contour is the surface's outline to a few hundredths of its area. Gradients
     reach the vertices through the Gaussians' centres alone, which is most of it and half the time.
@@ -185,7 +185,7 @@ def _blur_matrix(size: int, sigma: float) -> Tensor:
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:
-    """Return Gaussian blur of square images, zero outside, [..., s, s]."""
+    """Blur square images by a Gaussian, zero outside, [..., s, s]."""
     matrix = _blur_matrix(images.shape[-1], round(max(sigma, 0.05), 2))
     return matrix @ images @ matrix.T
 
@@ -200,7 +200,7 @@ def mismatch(rendered: Tensor, targets: Targets, sigma: float) -> Tensor:
 
 
 def outline(vertices: Tensor, faces: Tensor, camera: Camera) -> np.ndarray:
-    """Return the silhouette of a mesh, anti-aliased, uint8, [h, w].
+    """Draw the silhouette of a mesh, anti-aliased, uint8, [h, w].
 
     Args:
         vertices: in the camera's world, [n, 3].
@@ -219,7 +219,7 @@ def outline(vertices: Tensor, faces: Tensor, camera: Camera) -> np.ndarray:
 
 
 def overlap(vertices: Sequence[Tensor], faces: Tensor, cameras: Sequence[Camera], masks: Sequence[Tensor]) -> float:
-    """Return the mean intersection over union of posed meshes with masks at 0.5; empty masks do not count.
+    """Compute the mean intersection over union of posed meshes with masks at 0.5; empty masks do not count.
 
     Args:
         vertices: posed in the cameras' world, one [n, 3] per observation.

@@ -38,7 +38,7 @@ class Filtered:
 
 
 def clusters(points: Tensor, reach: float = REACH, neighbours: int = NEIGHBOURS) -> Tensor:
-    """Return DBSCAN: the cluster of each point, counted from 0; -1 is noise. int64, [n].
+    """Cluster points by DBSCAN: the cluster of each, counted from 0, -1 for noise, int64, [n].
 
     Args:
         points: [n, d].
@@ -72,7 +72,7 @@ def steady(cameras: Sequence[Camera], times: Tensor) -> Tensor:
 
 
 def _between(features: Tensor, times: Tensor) -> Tensor:
-    """Return points for up to `GAP` frames that are missing between neighbours, [m, d]."""
+    """Interpolate points for up to `GAP` frames that are missing between neighbours, [m, d]."""
     gaps = times.diff()
     missing = (gaps / gaps.median()).round().long() - 1 if len(gaps) else gaps.long()
     parts = [

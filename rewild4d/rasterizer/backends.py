@@ -87,7 +87,7 @@ def _automatic(kind: str, dtype: torch.dtype) -> str:
 
 
 def _unfit(name: str, device: torch.device, dtype: torch.dtype) -> str:
-    """Return why a backend cannot render such tensors here; empty where it can."""
+    """Say why a backend cannot render such tensors here; empty where it can."""
     single, got = dtype == torch.float32, f"got {dtype} on {device}"
     if name == "reference" or (name == "numba" and single and device.type == "cpu"):
         return ""
@@ -105,7 +105,7 @@ def _unfit(name: str, device: torch.device, dtype: torch.dtype) -> str:
 
 
 def _missing(package: str) -> str:
-    """Return why a package cannot be imported; empty where it can."""
+    """Say why a package cannot be imported; empty where it can."""
     try:
         importlib.import_module(package)
     except ModuleNotFoundError as error:

@@ -78,7 +78,7 @@ def place_in_tile(
 
 @inlined
 def alpha_at(log_opacity: Any, t: Any, u: Any, strongest: Any, terms: tuple) -> tuple:
-    """Return the alpha before the lower cut, and log2 of alpha before the upper one."""
+    """Compute alpha before the lower cut, and log2 of alpha before the upper one."""
     exponent = fnma(t, t, fnma(u, u, log_opacity))
     return minimum(exp2_with(terms, exponent), strongest), exponent
 

@@ -57,7 +57,7 @@ def slot_width(channels: int) -> int:
 
 @inlined
 def _first_channel(channels: int) -> int:
-    """Return where in a slot the channel sums begin."""
+    """Return the index in a slot where the channel sums begin."""
     return MOMENTS if channels <= FEW else LANES
 
 

@@ -31,7 +31,7 @@ _even_quarters, _odd_quarters = _pick([0, 2, 4, 6]), _pick([1, 3, 5, 7])
 
 @inlined
 def exchange_quarters(a: Any, b: Any, c: Any, d: Any) -> tuple[Any, Any, Any, Any]:
-    """Return blocks to rows and back: quarter i of vector j goes to quarter j of vector i."""
+    """Convert blocks to rows and back: quarter i of vector j goes to quarter j of vector i."""
     left, right = _first_halves(a, b), _first_halves(c, d)
     left_below, right_below = _second_halves(a, b), _second_halves(c, d)
     return (

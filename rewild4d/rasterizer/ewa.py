@@ -15,7 +15,7 @@ def project(
     height: int,
     eps2d: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return where the Gaussians fall in the images.
+    """Project Gaussians to the images.
 
     Args:
         means: [N, 3].
@@ -65,7 +65,7 @@ def determinant(matrix: Tensor) -> Tensor:
 def reach(
     centres: Tensor, cov2d: Tensor, depths: Tensor, opacities: Tensor, width: int, height: int, near: float
 ) -> Tensor:
-    """Return how far from its centre a Gaussian is drawn, where alpha falls to 1/255.
+    """Compute how far from its centre a Gaussian is drawn: where alpha falls to 1/255.
 
     Args:
         centres: in pixels, [..., N, 2].

@@ -92,7 +92,7 @@ def slope_limits(focal: float, center: float, size: int) -> tuple:
 
 @inlined
 def clamp(value: Any, limits: tuple) -> Any:
-    """Return the value, kept between two limits."""
+    """Clamp the value between two limits."""
     low, high = limits
     value = where_gt(low, value, low, value)
     return where_gt(value, high, high, value)
@@ -116,7 +116,7 @@ def factor(xx: Any, xy: Any, yy: Any, det: Any) -> tuple:
 
 @inlined
 def _in_two(value: Any) -> tuple:
-    """Return a number that single precision holds, and what the value has beyond it (Dekker 1971)."""
+    """Split a value into a number that single precision holds and the rest (Dekker 1971)."""
     shifted = value * 536870913.0  # 2^29 + 1: 53 digits less 24
     high = shifted - (shifted - value)
     return high, value - high

@@ -33,7 +33,7 @@ SIZES = ["width", "height", "across", "down", "views", "count", "channels"]
 
 @triton.jit
 def _row(pointer: tl.tensor, place: tl.tensor, real: tl.tensor) -> tuple:
-    """Return three numbers from a place on, in double precision."""
+    """Load three numbers from an address on, in double precision."""
     return (
         tl.load(pointer + place, real, 0.0).to(tl.float64),
         tl.load(pointer + place + 1, real, 0.0).to(tl.float64),
