@@ -3,7 +3,7 @@
 `--command "conda run -n theirs python run.py {clip} {out}"` runs a program; `--folder results/{case}` takes what one
 left before. `external_folder.README` says what the two folders hold, `--profile` names other layouts.
 
-A result that does not stand where the input cameras see it is rotated, scaled and shifted to the best input-view PSNR,
+A result in other coordinates than the input cameras is rotated, scaled and shifted to the best input-view PSNR,
 as the paper does for such methods. It has then been shown the answer, so it carries the mark "upper bound" in its
 record and in every table, and no rank.
 """

@@ -1,1 +1,1 @@
-"""CPU kernels for the dear parts of a training step; each has a plain torch twin that the tests compare it with."""
+"""CPU kernels for the most expensive parts of a training step; each has a plain torch twin, which tests compare."""
