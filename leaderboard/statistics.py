@@ -102,13 +102,13 @@ def ranks(estimates: Sequence[Estimate | None], better: str, digits: int) -> lis
 
     Args:
         estimates: of the competitors.
-        better: "higher" or "lower".
+        better: "higher", "lower", or "" where nothing is ranked.
         digits: printed after the point; what prints alike is alike.
     """
     sign = -1 if better == "higher" else 1
     known = sorted((sign * round(e.mean, digits), i, e.spread or 0.0) for i, e in enumerate(estimates) if e is not None)
     marks = [""] * len(estimates)
-    if len(known) < 2:
+    if len(known) < 2 or not better:
         return marks
     first = _leaders(known)
     if len(first) == 1:

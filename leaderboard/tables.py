@@ -198,7 +198,7 @@ def _leading(row: Row, columns: Sequence[Column]) -> Row:
     cells = []
     for found, column in zip(row.cells, columns, strict=True):
         low, high = found.interval or (0.0, 0.0)
-        leads = low > 0 if column.better == "higher" else high < 0
+        leads = {"higher": low > 0, "lower": high < 0}.get(column.better, False)
         cells.append(replace(found, mark="best" if leads else ""))
     return replace(row, cells=tuple(cells))
 

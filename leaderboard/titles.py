@@ -2,11 +2,15 @@
 
 from collections.abc import Mapping
 
+from rewild4d.metrics.names import SCALE
 from rewild4d.metrics.score import Score
 
 TITLES = {
     "psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS-alex", "lpips_vgg": "LPIPS-vgg",
     "psnr_fg": "PSNR foreground", "psnr_union": "PSNR union", "psnr_crop": "PSNR crop", "iou": "mask IoU",
+    "camera_scale": "scale", "psnr_rigid": "PSNR after rigid motion", "ssim_rigid": "SSIM after rigid motion",
+    "lpips_alex_rigid": "LPIPS-alex after rigid motion", "lpips_vgg_rigid": "LPIPS-vgg after rigid motion",
+    "iou_rigid": "mask IoU after rigid motion",
     "chamfer_relative": "CD / diagonal", "chamfer_relative_framewise": "CD / diagonal, per frame",
     "chamfer_relative_30k": "CD / diagonal, 30k points", "fscore_1_30k": "F@1 %, 30k points",
     "fscore_1": "F@1 %", "fscore_2": "F@2 %", "fscore_5": "F@5 %",
@@ -27,7 +31,12 @@ LESS_IS_BETTER = ("lpips", "chamfer", "kid", "fvd", "kvd")
 
 
 def better_of(name: str, known: Mapping[str, Score]) -> str:
-    """Tell whether "higher" or "lower" is better: what a known score of that name says, else what the name says."""
+    """Tell whether "higher" or "lower" is better: what a known score of that name says, else what the name says.
+
+    Neither ("") for a figure that rates nothing.
+    """
+    if name == SCALE:
+        return ""
     return known[name].better if name in known else "lower" if name.startswith(LESS_IS_BETTER) else "higher"
 
 

@@ -3,32 +3,32 @@
 Matches go in both directions, because one-directional matching shrinks the source onto a few targets. The worst share
 of them is left out, because floaters and missing parts bias the scale. The scale stays within a factor of two of a
 robust start, and there are several starts, because an animal rotated by 180 degrees is a local minimum. A reflection is
-never an alignment.
+never an alignment. Matches start from points that lie evenly on each cloud, because a denser part would otherwise
+decide the size and the rotation.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations, product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from rewild4d.metrics.clouds import Cloud, Points, as_points, check_paired, is_straight
-from rewild4d.metrics.similarity import Map, Similarity, Undetermined, fit_matched, umeyama
+from rewild4d.metrics.clouds import Points, as_points, check_paired, is_straight
+from rewild4d.metrics.icp import Moment, Track, search
+from rewild4d.metrics.similarity import Map, Similarity, Undetermined, fit_matched, scale_matched, umeyama
 
-__all__ = ["Alignment", "Similarity", "Undetermined", "align", "align_sequence", "cube_starts", "umeyama", "yaw_starts"]
+__all__ = [
+    "Alignment", "Similarity", "Undetermined", "align", "align_scale", "align_sequence", "cube_starts", "umeyama",
+    "yaw_starts",
+]  # fmt: skip
 
 TRIM = 0.1
 """Share of the matches, the longest of each direction, that a fit leaves out."""
 SCALE_CLAMP = (0.5, 2.0)
 """Bounds of the scale as multiples of the robust start's."""
-QUERIES = 20_000
-"""Points of each side, over all times, that the last stage matches; of more, so many are drawn by the seed."""
-COARSE_FRAMES = 8
-"""Times of a sequence, evenly spaced, that the stages before the last use."""
 
 
 @dataclass(frozen=True)
@@ -121,9 +121,11 @@ def align_sequence(
     starts: Mapping[str, Tensor] | None = None,
     trim: float = TRIM,
     scale_clamp: tuple[float, float] = SCALE_CLAMP,
+    scale: float | None = None,
     iterations: int = 100,
     tolerance: float = 1e-6,
     seed: int = 0,
+    even: bool = True,
 ) -> Alignment:
     """Align all times of a source with those of a target by one similarity, by iterated closest points.
 
@@ -138,9 +140,12 @@ def align_sequence(
         starts: named rotations to start from instead, each [3, 3].
         trim: share of each direction's matches, the longest, that do not count, in [0, 1).
         scale_clamp: bounds of the scale as multiples of the robust start's.
+        scale: above zero; kept instead of fitted, so that 1 gives a rigid motion.
         iterations: limit of the last stage.
         tolerance: the last stage ends when its mean squared distance changes by less than this share.
         seed: of the draws of points.
+        even: match points that lie evenly on each cloud (`clouds.even_rows`), whatever its density. False matches all
+            points alike, as the first protocols do.
 
     Raises:
         Undetermined: no time has points of both, or those of a side lie on one line at every time.
@@ -152,52 +157,112 @@ def align_sequence(
         >>> round(found.scale, 3)
         2.0
     """
-    check_paired(sources, targets)
     if not 0 <= trim < 1 or not 0 < scale_clamp[0] <= 1 <= scale_clamp[1]:
         raise ValueError(f"expected a trim in [0, 1) and a clamp around 1, got {trim} and {scale_clamp}")
+    if scale is not None and not 0 < scale < np.inf:
+        raise ValueError(f"expected a finite scale above zero, got {scale}")
+    moments = _moments(sources, targets, even)
+    for side, name in enumerate(("source", "target")):
+        if all(is_straight(pair[side].all.points) for pair in moments):
+            raise Undetermined(f"the {name}'s points lie on one line, so no rotation is unique")
+    rotations = starts if starts is not None else cube_starts() if up is None else yaw_starts(up)
+    if not rotations:
+        raise ValueError("expected at least one start, got none")
+    (source, size), (target, length) = (_middle([pair[side].queries for pair in moments]) for side in (0, 1))
+    first = scale or (length / size if size > 0 and length > 0 else 1.0)
+    bounds = (first, first) if scale else (scale_clamp[0] * first, scale_clamp[1] * first)
+
+    def begin(start: Tensor) -> Map:
+        rotation = _checked(start)
+        return Map(first, rotation, target - first * rotation @ source)
+
+    track = search(
+        moments, {name: begin(start) for name, start in rotations.items()},
+        lambda x, y, share: fit_matched(x, y, share, bounds)[0],
+        trim=trim, seed=seed, iterations=iterations, tolerance=tolerance, least=(1e-12 * length) ** 2,
+    )  # fmt: skip
+    return _alignment(track, bounds)
+
+
+def align_scale(
+    sources: Sequence[Tensor], targets: Sequence[Tensor], center: Tensor, *, trim: float = TRIM, seed: int = 0
+) -> Alignment:
+    """Find the one scale about a point by which all times of a source fit those of a target best.
+
+    One fixed camera cannot know it: a scene that is scaled about the camera's centre has the same images. Matches are
+    those of `align_sequence`, from points that lie evenly on each cloud. The search starts at the ratio of the median
+    distances from the point, at .8 and at 1.25 times it, and stays within a factor of two.
+
+    Args:
+        sources: one cloud a time, each [n, 3]; times where either cloud is empty are left out.
+        targets: the same times, each [m, 3].
+        center: the point that stays, [3].
+        trim: share of each direction's matches, the longest, that do not count, in [0, 1).
+        seed: of the draws of points.
+
+    Returns:
+        The similarity x -> center + scale * (x - center).
+
+    Raises:
+        Undetermined: no time has points of both, or half of a side lies at the point itself.
+        ValueError: unequal lengths, a NaN.
+
+    Examples:
+        >>> points = torch.tensor([[0.0, 0, 4], [1, 0, 4], [0, 2, 5], [0, 0, 5]])
+        >>> round(align_scale([points], [3 * points], torch.zeros(3)).scale, 3)
+        3.0
+    """
+    origin = center.detach().cpu().double()
+    moments = _moments([cloud.cpu() - origin for cloud in sources], [cloud.cpu() - origin for cloud in targets], True)
+    near, far = (_distance([pair[side].queries for pair in moments]) for side in (0, 1))
+    if not (near > 0 and far > 0):
+        raise Undetermined("half of the points lie at the centre, so no scale about it is determined")
+    begin, bounds = far / near, (SCALE_CLAMP[0] * far / near, SCALE_CLAMP[1] * far / near)
+    still = np.zeros(3)
+    track = search(
+        moments, {f"ratio x {factor:g}": Map(factor * begin, np.eye(3), still) for factor in (1.0, 0.8, 1.25)},
+        lambda x, y, share: Map(scale_matched(x, y, share, bounds), np.eye(3), still),
+        trim=trim, seed=seed, iterations=100, tolerance=1e-9, least=(1e-12 * far) ** 2,
+    )  # fmt: skip
+    found = track.map._replace(translation=(1 - track.map.scale) * origin.numpy())
+    return _alignment(track._replace(map=found), bounds)
+
+
+def _moments(sources: Sequence[Tensor], targets: Sequence[Tensor], even: bool) -> list[tuple[Moment, Moment]]:
+    """Check both sequences, and pair them at the times where both have points."""
+    check_paired(sources, targets)
     x = [as_points(cloud, "source", empty=True) for cloud in sources]
     y = [as_points(cloud, "target", empty=True) for cloud in targets]
-    both = [(a, b) for a, b in zip(x, y, strict=True) if len(a) and len(b)]
+    both = [(Moment(a, even), Moment(b, even)) for a, b in zip(x, y, strict=True) if len(a) and len(b)]
     if not both:
         raise Undetermined("there is no moment at which both the source and the target have points")
-    for side, name in enumerate(("source", "target")):
-        if all(is_straight(pair[side]) for pair in both):
-            raise Undetermined(f"the {name}'s points lie on one line, so no rotation is unique")
-    chosen = starts if starts is not None else cube_starts() if up is None else yaw_starts(up)
-    if not chosen:
-        raise ValueError("expected at least one start, got none")
-    return _Search(both, trim, scale_clamp, seed).best(chosen, iterations, tolerance)
+    return both
 
 
-class _Track(NamedTuple):
-    """State of one start."""
-
-    name: str
-    map: Map
-    iterations: int
-    converged: bool
-    chamfer: float
-    chamfer_kept: float
-
-
-class _Matches(NamedTuple):
-    """Kept pairs, [k, 3] each, their weights [k], mean squared distance, and the Chamfer of all and of these."""
-
-    source: Points
-    target: Points
-    share: Points
-    error: float
-    chamfer: float
-    chamfer_kept: float
+def _alignment(track: Track, bounds: tuple[float, float]) -> Alignment:
+    return Alignment(
+        **vars(track.map.similarity()),
+        start=track.name,
+        iterations=track.iterations,
+        converged=track.converged,
+        clamped=bounds[0] < bounds[1] and track.map.scale in bounds,
+        chamfer=track.chamfer,
+        chamfer_kept=track.chamfer_kept,
+    )
 
 
-class _Stage(NamedTuple):
-    """Points and limits of one stage, and how many starts go on to the next."""
+def _checked(start: Tensor) -> Points:
+    rotation: Points = start.detach().cpu().double().numpy()
+    if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
+        raise ValueError(f"expected starts that are rotations [3, 3], got {rotation.tolist()}")
+    if np.linalg.det(rotation) < 0:
+        raise ValueError("expected starts that are rotations, got a reflection")
+    return rotation
 
-    queries: int
-    iterations: int
-    tolerance: float
-    keep: int
+
+def _distance(clouds: Sequence[Points]) -> float:
+    """Compute the median over time of the median distance from the origin."""
+    return float(np.median([np.median(np.linalg.norm(points, axis=1)) for points in clouds]))
 
 
 def _middle(clouds: Sequence[Points]) -> tuple[Points, float]:
@@ -211,90 +276,3 @@ def _middle(clouds: Sequence[Points]) -> tuple[Points, float]:
     size = float(np.median([np.median(radius) for radius in radii]))
     near = [points[radius <= 3 * np.median(radius)] for points, radius in zip(clouds, radii, strict=True)]
     return np.mean([points.mean(axis=0) for points in near], axis=0), size
-
-
-class _Search:
-    """Iterated closest points over the times of a sequence."""
-
-    def __init__(self, pairs: list[tuple[Points, Points]], trim: float, clamp: tuple[float, float], seed: int) -> None:
-        self._clouds = [(Cloud(x), Cloud(y)) for x, y in pairs]
-        self._trim, self._seed = trim, seed
-        self._source, self._target = (_middle([pair[side] for pair in pairs]) for side in (0, 1))
-        start = self._target[1] / self._source[1] if self._source[1] > 0 and self._target[1] > 0 else 1.0
-        self._start_scale = start
-        self._bounds = (clamp[0] * start, clamp[1] * start)
-
-    def best(self, starts: Mapping[str, Tensor], iterations: int, tolerance: float) -> Alignment:
-        tracks = [_Track(name, self._begin(rotation), 0, False, np.inf, np.inf) for name, rotation in starts.items()]
-        last = _Stage(QUERIES, iterations, tolerance, 1)
-        for stage in (_Stage(300, 20, 1e-3, 4), _Stage(1000, 60, 1e-4, 1), last):
-            matcher = _Matcher(self._clouds, stage.queries, None if stage is last else COARSE_FRAMES, self._seed)
-            done = [self._run(track, matcher, stage) for track in tracks]
-            tracks = sorted(done, key=lambda track: track.chamfer_kept)[: stage.keep]
-        won = tracks[0]
-        return Alignment(
-            **vars(won.map.similarity()),
-            start=won.name,
-            iterations=won.iterations,
-            converged=won.converged,
-            clamped=won.map.scale in self._bounds,
-            chamfer=won.chamfer,
-            chamfer_kept=won.chamfer_kept,
-        )
-
-    def _begin(self, start: Tensor) -> Map:
-        """Map the source's centre and size to the target's under a rotation."""
-        rotation = start.detach().cpu().double().numpy()
-        if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
-            raise ValueError(f"expected starts that are rotations [3, 3], got {rotation.tolist()}")
-        if np.linalg.det(rotation) < 0:
-            raise ValueError("expected starts that are rotations, got a reflection")
-        return Map(self._start_scale, rotation, self._target[0] - self._start_scale * rotation @ self._source[0])
-
-    def _run(self, track: _Track, matcher: "_Matcher", stage: _Stage) -> _Track:
-        """Match and fit until the squared distance stays the same."""
-        found, previous, least = track.map, np.inf, (1e-12 * self._target[1]) ** 2
-        for count in range(stage.iterations + 1):
-            got = matcher.matches(found, self._trim)
-            still = abs(previous - got.error) <= stage.tolerance * got.error + least
-            if still or count == stage.iterations:
-                break
-            found, _ = fit_matched(got.source, got.target, got.share, self._bounds)
-            previous = got.error
-        return _Track(track.name, found, track.iterations + count, still, got.chamfer, got.chamfer_kept)
-
-
-class _Matcher:
-    """Matches of some points of each time, drawn once, with all points of the other side."""
-
-    def __init__(self, clouds: list[tuple[Cloud, Cloud]], queries: int, frames: int | None, seed: int) -> None:
-        kept = min(len(clouds), frames or len(clouds))
-        self._pairs = [clouds[round(i)] for i in np.linspace(0, len(clouds) - 1, kept)]
-        rng = np.random.default_rng(seed)
-        each = max(1, queries // kept)
-        self._drawn = [tuple(_draw(cloud.points, each, rng) for cloud in pair) for pair in self._pairs]
-
-    def matches(self, found: Map, trim: float) -> _Matches:
-        """Find the matches under a map."""
-        forward: list[tuple[Points, Points, Points]] = []
-        backward: list[tuple[Points, Points, Points]] = []
-        for (source, target), (x, y) in zip(self._pairs, self._drawn, strict=True):
-            distances, nearest = target.nearest(found(x))
-            forward.append((x, nearest, distances))
-            # A similarity keeps the order of distances, so the source's own tree serves every iteration.
-            distances, nearest = source.nearest(found.inverse(y))
-            backward.append((nearest, y, found.scale * distances))
-        kept, means = [], []
-        for direction in (forward, backward):
-            x, y, distances = (np.concatenate(part) for part in zip(*direction, strict=True))
-            means.append(float(distances.mean()))
-            count = max(1, round((1 - trim) * len(distances)))
-            near = np.argpartition(distances, count - 1)[:count]
-            kept.append((x[near], y[near], np.full(count, 0.5 / count), distances[near]))
-        x, y, share, distances = (np.concatenate(part) for part in zip(*kept, strict=True))
-        return _Matches(x, y, share, float(share @ distances**2), sum(means) / 2, float(share @ distances))
-
-
-def _draw(points: Points, count: int, rng: np.random.Generator) -> Points:
-    rows: NDArray[np.intp] = rng.permutation(len(points))[:count]
-    return points[np.sort(rows)]

@@ -164,6 +164,7 @@ def compare_sequence(
     seconds: Sequence[Tensor] | None = None,
     points: int = POINTS,
     seed: int = 0,
+    even: bool = True,
 ) -> Comparison:
     """Compute Chamfer distance and F-score of a sequence, each the mean over all its times.
 
@@ -186,6 +187,7 @@ def compare_sequence(
             ``points`` these are halves, and their floor is worse than one of all points.
         points: a larger cloud is compared by so many of its points.
         seed: of all draws.
+        even: see `align_sequence`; scores themselves are means over the points as they are.
 
     Raises:
         ValueError: unequal lengths, another shape, a NaN or an infinite value, an empty truth.
@@ -207,7 +209,7 @@ def compare_sequence(
     length = box_diagonal(as_points(truths[0], "truth")) if diagonal is None else diagonal
     given = [subsample(cloud, points, seed) for cloud in predictions]
     targets = [subsample(cloud, points, seed + 1) for cloud in truths]
-    moved, alignments, reason = _aligned(given, targets, fit, up, seed)
+    moved, alignments, reason = _aligned(given, targets, fit, up, seed, even)
     frames = [
         {} if cloud is None else _values(distances(cloud, truth), length)
         for cloud, truth in zip(moved, targets, strict=True)
@@ -220,7 +222,7 @@ def compare_sequence(
 
 
 def _aligned(
-    predictions: list[Tensor], truths: list[Tensor], fit: Fit, up: Tensor | None, seed: int
+    predictions: list[Tensor], truths: list[Tensor], fit: Fit, up: Tensor | None, seed: int, even: bool
 ) -> tuple[list[Tensor | None], tuple[Alignment | None, ...], str]:
     """Align the predictions; None where no similarity is determined, and the reason."""
     if fit == "none":
@@ -232,7 +234,7 @@ def _aligned(
     for group in groups:
         clouds = [predictions[t].double() for t in group]
         try:
-            found = align_sequence(clouds, [truths[t] for t in group], up=up, seed=seed)
+            found = align_sequence(clouds, [truths[t] for t in group], up=up, seed=seed, even=even)
         except Undetermined as error:
             reason = str(error).replace("source", "prediction").replace("target", "truth")
             moved += [cloud if not len(cloud) else None for cloud in clouds]

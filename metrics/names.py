@@ -1,7 +1,8 @@
 """Names of all scores that a protocol may ask for, with their units.
 
 The name of an image score is a metric and a region: "psnr", "ssim_fg", "lpips_alex_crop"; without a region it covers
-the full frame. The name of a geometry score is a quantity, an alignment and a number of points.
+the full frame; "_rigid" behind it says that a rigid motion laid the reconstruction on the true shape first. The name of
+a geometry score is a quantity, an alignment and a number of points.
 """
 
 from typing import Literal
@@ -12,7 +13,12 @@ COLOR_METRICS = {
 }  # fmt: skip
 """Metric -> its unit, and which way is better."""
 SILHOUETTES = ("iou", "dice", "boundary_f")
+RIGID = "_rigid"
+"""End of the name of an image score: rendered after a rigid motion that lays the shape on the truth."""
 IMAGES = (*(m if r == "full" else f"{m}_{r}" for m in COLOR_METRICS for r in REGIONS), *SILHOUETTES)
+HELD_OUT = (*IMAGES, *(name + RIGID for name in IMAGES))
+SCALE = "camera_scale"
+"""The one scale about the input camera by which a reconstruction is laid on the truth: a figure, not a rating."""
 
 THRESHOLDS = (1, 2, 5)
 """F-scores, in percent of the rest pose's diagonal."""
@@ -34,16 +40,17 @@ KINDS = {
 """Kind of sets -> its scores, in the order of `metrics.sets.distances`, and the title of each distance."""
 SETS = tuple(name for scores in KINDS.values() for name in scores)
 
-ALL = (*IMAGES, *GEOMETRY, *SETS)
+ALL = (*HELD_OUT, SCALE, *GEOMETRY, *SETS)
 
 
 def split_name(name: str) -> tuple[str, str]:
     """Split an image score's name into metric and region.
 
     Examples:
-        >>> split_name("lpips_alex_fg"), split_name("psnr")
-        (('lpips_alex', 'fg'), ('psnr', 'full'))
+        >>> split_name("lpips_alex_fg"), split_name("psnr"), split_name("psnr_rigid")
+        (('lpips_alex', 'fg'), ('psnr', 'full'), ('psnr', 'full'))
     """
+    name = name.removesuffix(RIGID)
     metric, _, region = name.rpartition("_")
     return (metric, region) if region in REGIONS else (name, "full")
 

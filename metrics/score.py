@@ -11,7 +11,7 @@ class Score(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         value: mean over ``count`` items; None where it could not be computed.
         unit: "dB", "1" for a ratio, "world" for the data's own unit of length, ...
-        better: "higher" or "lower".
+        better: "higher" or "lower"; "" for a figure that rates nothing.
         count: items that the mean is over.
         per_item: value of each item, in the order of the record's ``items``; None for an item without a value.
         note: why there is no value, or what the mean leaves out.

@@ -112,3 +112,16 @@ def fit_matched(x: Points, y: Points, share: Points, bounds: tuple[float, float]
     variance = max(share @ (centred_x**2).sum(axis=1), np.finfo(float).tiny)
     scale = float(np.clip(spread @ signs / variance, *bounds))
     return Map(scale, rotation, centre_y - scale * rotation @ centre_x), spread
+
+
+def scale_matched(x: Points, y: Points, share: Points, bounds: tuple[float, float]) -> float:
+    """Compute the scale about the origin with the least squared distance of matched points, kept within bounds.
+
+    Args:
+        x: [n, 3].
+        y: [n, 3].
+        share: weights, [n].
+        bounds: lowest and highest scale.
+    """
+    length = max(share @ (x**2).sum(axis=1), np.finfo(float).tiny)
+    return float(np.clip(share @ (x * y).sum(axis=1) / length, *bounds))

@@ -5,16 +5,25 @@ from typing import Any
 
 import msgspec
 
+from rewild4d.cameras.placement import IDENTITY, Placement
 from rewild4d.contracts import Reconstruction
+from rewild4d.evaluation.placing import describe
 from rewild4d.io.sampling import sample_gaussians
 from rewild4d.metrics.geometry import Comparison, compare_sequence
-from rewild4d.metrics.names import ALIGNMENTS, DENSE, Fit, geometry_unit
+from rewild4d.metrics.names import ALIGNMENTS, DENSE, geometry_unit
 from rewild4d.metrics.score import Score
 from rewild4d.types import Truth
 
 
 def score_geometry(
-    reconstruction: Reconstruction, truth: Truth, times: Sequence[float], names: Sequence[str], points: int
+    reconstruction: Reconstruction,
+    truth: Truth,
+    times: Sequence[float],
+    names: Sequence[str],
+    points: int,
+    *,
+    placement: Placement = IDENTITY,
+    even: bool = True,
 ) -> tuple[dict[str, Score], list[dict[str, Any]]]:
     """Compare shapes.
 
@@ -24,6 +33,8 @@ def score_geometry(
         times: seconds.
         names: out of `metrics.names.GEOMETRY`.
         points: drawn from each cloud.
+        placement: applied to the reconstruction first.
+        even: see `metrics.alignment.align_sequence`.
 
     Returns:
         The scores by name, each with its sampling floor, and the alignments.
@@ -40,17 +51,21 @@ def score_geometry(
         if not asked:
             continue
         drawn = count or points
-        predictions = [sample_gaussians(reconstruction.at(time), drawn, seed=0) for time in times]
+        predictions = [placement.apply(sample_gaussians(reconstruction.at(time), drawn, seed=0)) for time in times]
         truths, seconds = ([truth.sample(time, drawn, seed) for time in times] for seed in (1, 2))
         for fit, suffix in ALIGNMENTS.items():
             wanted = [name for name in asked if _parts(name)[0] == suffix]
             if not wanted:
                 continue
             found = compare_sequence(
-                predictions, truths, fit=fit, diagonal=truth.diagonal, up=truth.up, seconds=seconds, points=drawn
-            )
+                predictions, truths, fit=fit, diagonal=truth.diagonal, up=truth.up, seconds=seconds, points=drawn,
+                even=even,
+            )  # fmt: skip
             scores |= {name: _score(found, name) for name in wanted}
-            alignments += _describe(found, fit, drawn)
+            alignments += [
+                describe(one, fit, drawn, moment if fit == "frame" else None)
+                for moment, one in enumerate(found.alignments) if one is not None
+            ]  # fmt: skip
     return {name: scores[name] for name in names}, alignments
 
 
@@ -64,14 +79,3 @@ def _parts(name: str) -> tuple[str, str]:
 def _score(found: Comparison, name: str) -> Score:
     score = found.scores[name.removesuffix(_parts(name)[1])]
     return score if score.value is None else msgspec.structs.replace(score, note=found.note)
-
-
-def _describe(found: Comparison, fit: Fit, points: int) -> list[dict[str, Any]]:
-    return [
-        {
-            "fit": fit, "points": points, "moment": index if fit == "frame" else None, "scale": one.scale,
-            "matrix": one.matrix.tolist(), "start": one.start, "iterations": one.iterations,
-            "converged": one.converged, "clamped": one.clamped,
-        }
-        for index, one in enumerate(found.alignments) if one is not None
-    ]  # fmt: skip

@@ -1,17 +1,19 @@
 """Score a reconstruction by a protocol: render, composite, align, compare."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import torch
 from torch import Tensor
 
 from rewild4d.cameras.input_view import finite_at, input_camera
+from rewild4d.cameras.placement import IDENTITY, Placement
 from rewild4d.cameras.rendering import render
 from rewild4d.contracts import Log, Reconstruction
 from rewild4d.errors import UserError
-from rewild4d.evaluation import geometry_scores, image_scores, novel_views
+from rewild4d.evaluation import geometry_scores, image_scores, novel_views, placing
 from rewild4d.evaluation.networks import Networks, families_of, family_of, load_networks
 from rewild4d.evaluation.protocol import Protocol
 from rewild4d.metrics import names
@@ -61,10 +63,19 @@ def evaluate(
         device: of the metric networks.
     """
     networks = load_networks(families_of(protocol.scores), device)
-    scores, items = _score_images(reconstruction, truth, protocol, networks, log)
+    points = protocol.points or 0
+    placed = placing.Placed()
+    if protocol.free_scale:
+        placed = placing.free_scale(reconstruction, clip, truth, points)
     shape = [name for name in protocol.scores if name in names.GEOMETRY]
-    found, alignments = geometry_scores.score_geometry(reconstruction, truth, clip.times, shape, protocol.points or 0)
-    scores |= found
+    scores, alignments = geometry_scores.score_geometry(
+        reconstruction, truth, clip.times, shape, points, placement=placed.scale, even=bool(protocol.even_alignment)
+    )
+    scores[names.SCALE] = placing.scale_score(placed)
+    drawn = {"": placed.scale, names.RIGID: placed.rigid}
+    measured, items = _score_images(reconstruction, truth, protocol, networks, log, drawn)
+    scores |= measured
+    alignments += placed.alignments
     sets = [name for name in protocol.scores if name in names.SETS]
     distances: list[Distance] = []
     compared: list[Compared] = []
@@ -96,27 +107,54 @@ def input_psnr(reconstruction: Reconstruction, shown: Clip, background: float) -
 
 
 def _score_images(
-    reconstruction: Reconstruction, truth: Truth, protocol: Protocol, networks: Networks, log: Log
+    reconstruction: Reconstruction,
+    truth: Truth,
+    protocol: Protocol,
+    networks: Networks,
+    log: Log,
+    placed: Mapping[str, Placement],
 ) -> tuple[dict[str, Score], list[str]]:
-    """Compute the scores of held-out images, and the label of each image."""
-    asked = [name for name in protocol.scores if name in names.IMAGES]
-    absent = {name: networks.missing.get(family_of(name)) for name in asked}
+    """Compute the scores of held-out images, and the label of each image.
+
+    Args:
+        reconstruction: to render.
+        truth: with the images.
+        protocol: what is measured.
+        networks: of LPIPS.
+        log: progress.
+        placed: end of a score's name -> how its images are drawn.
+    """
+    asked = {name: placed[_placing(name)] for name in protocol.scores if name in names.HELD_OUT}
+    absent = {name: one.reason or networks.missing.get(family_of(name)) for name, one in asked.items()}
     values: dict[str, list[float | None]] = {name: [] for name in asked if not absent[name]}
     labels = []
     total = len(truth.held_out) if asked else 0
     for batch in batches(truth.held_out if asked else (), 16, _size):
-        rendered = list(_render_frames(reconstruction, batch))
-        shown = _beside(batch, rendered, protocol.background)
-        for name in values:
-            values[name] += image_scores.measure(name, shown, networks.lpips)
+        for end, placement in placed.items():
+            here = [name for name in values if _placing(name) == end]
+            if here:
+                rendered = list(_render_frames(reconstruction, batch, placement))
+                shown = _beside(batch, rendered, protocol.background)
+            for name in here:
+                values[name] += image_scores.measure(name, shown, networks.lpips)
         labels += [f"view {frame.view} at {frame.time:.4f} s" for frame in batch]
         log(len(labels), total, {})
-    scores = {name: image_scores.summarize(name, items) for name, items in values.items()}
+    scores = {name: _noted(image_scores.summarize(name, items), asked[name].note) for name, items in values.items()}
     scores |= {name: image_scores.without_value(name, reason) for name, reason in absent.items() if reason}
     return scores, labels
 
 
-def _render_frames(reconstruction: Reconstruction, frames: Iterable[Frame]) -> Iterator[tuple[Tensor, Tensor]]:
+def _placing(name: str) -> str:
+    return names.RIGID if name.endswith(names.RIGID) else ""
+
+
+def _noted(score: Score, note: str) -> Score:
+    return msgspec.structs.replace(score, note="; ".join(filter(None, (score.note, note))))
+
+
+def _render_frames(
+    reconstruction: Reconstruction, frames: Iterable[Frame], placement: Placement = IDENTITY
+) -> Iterator[tuple[Tensor, Tensor]]:
     """Render each frame's camera at its time; the Gaussians of one time are computed once."""
     time, splats = None, None
     for frame in frames:
@@ -124,7 +162,7 @@ def _render_frames(reconstruction: Reconstruction, frames: Iterable[Frame]) -> I
             time, splats = frame.time, finite_at(reconstruction, frame.time)
         camera = input_camera(reconstruction, frame)
         if camera is not None:
-            yield render(splats, camera)
+            yield render(splats, placement.camera(camera))
         elif not len(splats):
             yield torch.zeros_like(frame.rgb), torch.zeros_like(frame.mask)
         else:

@@ -45,6 +45,10 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         default: whether it is the data set's default; of several, the highest version.
         points: drawn from each cloud for scores of the shape.
         novel: settings of novel views for scores of sets.
+        even_alignment: shapes are aligned by points that lie evenly on them (`metrics.alignment.align_sequence`). Where
+            left out (first versions), by all points alike.
+        free_scale: one scale a sequence about the input camera's centre is taken from the true surface before held-out
+            views are drawn (`evaluation.placing`), because one fixed camera cannot know it.
     """
 
     name: str
@@ -58,6 +62,8 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     default: bool = False
     points: int | None = None
     novel: NovelViews | None = None
+    even_alignment: Literal[True] | None = None
+    free_scale: Literal[True] | None = None
 
     def __post_init__(self) -> None:
         for name in self.scores:
@@ -67,13 +73,20 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("scores of the shape need 'points'")
         if self.novel is None and any(name in names.SETS for name in self.scores):
             raise ValueError("scores of novel views need a table 'novel'")
+        if self.free_scale and (self.selection.cameras != "fixed" or self.points is None or self.novel):
+            raise ValueError("'free_scale' needs cameras = 'fixed' and 'points', and no table 'novel'")
+        for name in self.scores:
+            if (name == names.SCALE or name.endswith(names.RIGID)) and not self.free_scale:
+                raise ValueError(f"the score '{name}' needs 'free_scale'")
 
     @property
     def digest(self) -> str:
         """SHA-256 over every setting; a setting newer than the protocol, left out, changes nothing."""
         given = msgspec.to_builtins(self)
         novel, selection = given["novel"], given["selection"]
-        for part, name in ((given, "points"), (novel, "upright"), (given, "novel"), (selection, "split")):
+        newer = ((given, "points"), (novel, "upright"), (given, "novel"), (selection, "split"),
+                 (given, "even_alignment"), (given, "free_scale"))  # fmt: skip
+        for part, name in newer:
             if part is not None and part[name] is None:
                 del part[name]
         return digest(msgspec.json.encode(given))

@@ -12,6 +12,7 @@ from rewild4d.contracts import DatasetReader
 from rewild4d.errors import UserError
 from rewild4d.evaluation.coverage import coverage
 from rewild4d.evaluation.measuring import evaluate
+from rewild4d.evaluation.placing import scale_of
 from rewild4d.evaluation.protocol import find_protocol
 from rewild4d.evaluation.refining import ready_to_score
 from rewild4d.leaderboard.records import FILE, RunRecord, Timing, read_record, write_record
@@ -89,7 +90,7 @@ def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: s
         found = evaluate(reconstruction, clip, truth, protocol, log, device)
     seconds = time.perf_counter() - begin
     whole = original_frames(reader, clip, protocol.selection)
-    pictures = save_pictures(reconstruction, clip, truth, folder, whole)
+    pictures = save_pictures(reconstruction, clip, truth, folder, whole, scale_of(found.alignments))
     described = {"digest": protocol.digest, **msgspec.to_builtins(protocol)}
     renewed = msgspec.structs.replace(
         record, status="ok", error="", **found.keep(folder), coverage=coverage(clip, truth), pictures=pictures,

@@ -23,6 +23,7 @@ from rewild4d.errors import UserError, unknown_name
 from rewild4d.evaluation.coverage import coverage
 from rewild4d.evaluation.measuring import evaluate
 from rewild4d.evaluation.networks import may_be_scored_now
+from rewild4d.evaluation.placing import scale_of
 from rewild4d.evaluation.protocol import Protocol
 from rewild4d.evaluation.refining import ready_to_score
 from rewild4d.files import held, remove_leftovers, write_text
@@ -239,7 +240,7 @@ class Job:
             seconds = time.perf_counter() - begin
             pictures = save_pictures(
                 reconstruction, clip, truth, self.folder,
-                original_frames(self.plan.reader, clip, self.plan.protocol.selection),
+                original_frames(self.plan.reader, clip, self.plan.protocol.selection), scale_of(found.alignments),
             )  # fmt: skip
             record = self._record(
                 case, "ok", "", **found.keep(self.folder), coverage=seen, pictures=pictures,

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.cameras.input_view import input_camera
+from rewild4d.cameras.placement import IDENTITY, Placement
 from rewild4d.cameras.recropping import all_moments
 from rewild4d.contracts import Reconstruction
 from rewild4d.transforms import look_at
@@ -27,6 +28,7 @@ def save_pictures(
     truth: Truth,
     folder: Path,
     originals: Iterable[np.ndarray] | None = None,
+    placement: Placement = IDENTITY,
 ) -> list[str]:
     """Write all pictures of a run into ``folder`` and return their names.
 
@@ -44,9 +46,10 @@ def save_pictures(
         truth: held out from it.
         folder: of the run.
         originals: the whole frames that both were cut from, uint8 [h, w, 3], in the order of time, or None.
+        placement: by which held-out views are drawn, as they are scored.
     """
     names = ["comparison.png", "input.mp4", "orbit.mp4", "orbit.png"]
-    save_png(comparison(reconstruction, clip, truth), folder / names[0])
+    save_png(comparison(reconstruction, clip, truth, placement), folder / names[0])
     fps = film_rate(clip.fps)
     save_mp4((beside(frame.over(1.0), _shot(reconstruction, frame)) for frame in clip.frames), folder / names[1], fps)
     framing = find_framing(reconstruction, clip, truth.up)
@@ -59,8 +62,8 @@ def save_pictures(
     return names
 
 
-def comparison(reconstruction: Reconstruction, clip: Clip, truth: Truth) -> Tensor:
-    """Draw the comparison picture, [3, H, W]."""
+def comparison(reconstruction: Reconstruction, clip: Clip, truth: Truth, placement: Placement = IDENTITY) -> Tensor:
+    """Draw the comparison picture, its held-out views by ``placement``, [3, H, W]."""
     panels, times = [], [frame.time for frame in truth.held_out]
     for row in range(ROWS):
         frame = clip.frames[row * len(clip.frames) // ROWS]
@@ -68,7 +71,7 @@ def comparison(reconstruction: Reconstruction, clip: Clip, truth: Truth) -> Tens
         images = [frame.over(1.0), _shot(reconstruction, frame)]
         if held:
             other = truth.held_out[held[(len(held) // 3 + row * len(held) // (2 * ROWS)) % len(held)]]
-            images += [other.over(1.0), _shot(reconstruction, other)]
+            images += [other.over(1.0), _shot(reconstruction, other, placement)]
         panels.append(beside(*images))
     titles = ["input", "render", "held-out truth", "held-out render"]
     return torch.cat([header(titles[: len(images)], panels[0].shape[2]), *panels], dim=1)
@@ -91,7 +94,9 @@ def canonical(splats: Splats, weights: Tensor) -> Tensor:
     return torch.cat([header(["side", "oblique", "front", "above"], 4 * PANEL), torch.cat(panels, dim=2)], dim=1)
 
 
-def _shot(reconstruction: Reconstruction, frame: Frame) -> Tensor:
+def _shot(reconstruction: Reconstruction, frame: Frame, placement: Placement = IDENTITY) -> Tensor:
     """Render from the frame's camera, on white."""
     camera = input_camera(reconstruction, frame)
-    return torch.ones_like(frame.rgb) if camera is None else over(reconstruction.at(frame.time), camera)
+    if camera is None:
+        return torch.ones_like(frame.rgb)
+    return over(reconstruction.at(frame.time), placement.camera(camera))

@@ -17,6 +17,7 @@ from rewild4d.metrics.alignment import (
     Similarity,
     Undetermined,
     align,
+    align_scale,
     align_sequence,
     cube_starts,
     umeyama,
@@ -244,9 +245,10 @@ def test_the_clamp_is_kept_and_told() -> None:
     assert free.scale == pytest.approx(2.0) and not free.clamped
     # More than half of the points in one spot: the median radius is far too small, the start far too large.
     crowded = torch.cat((target, 0.05 * animal(2400, 1)))
-    bound = align(crowded, target, up=UP, scale_clamp=(1.0, 1.0)).scale / 2
-    found = align(crowded, target, up=UP)
+    bound = align(crowded, target, up=UP, scale_clamp=(1.0, 1.0), even=False).scale / 2
+    found = align(crowded, target, up=UP, even=False)
     assert found.clamped and found.scale == pytest.approx(bound) and bound > 1
+    assert align(crowded, target, up=UP).scale == pytest.approx(1.0)
 
 
 def test_the_same_call_gives_the_same_bits() -> None:
@@ -286,3 +288,62 @@ def test_an_animal_that_walks_in_place_keeps_its_size() -> None:
     slow = [points + torch.tensor((0.0, 0.0, 0.1 * step)) for step, points in enumerate(still)]
     found = align_sequence(slow, still, up=UP)
     assert found.scale == pytest.approx(1.0, rel=0.02)
+
+
+def front(points: Tensor, share: float = 0.1) -> Tensor:
+    """The part of an animal that is nearest to its head."""
+    return points[points[:, 2] > points[:, 2].quantile(1 - share)]
+
+
+def test_points_listed_again_change_nothing() -> None:
+    target = animal(2000, 0)
+    crowded = torch.cat([target] + [front(target, 0.5)] * 10)
+    for source, truth in ((crowded, target), (target, crowded)):
+        found = align(source, truth, up=UP)
+        assert found.scale == pytest.approx(1.0, abs=1e-6) and found.chamfer < 1e-6
+
+
+@pytest.mark.parametrize("degrees", [0, 90])
+def test_a_denser_head_neither_turns_nor_scales_the_animal(degrees: int) -> None:
+    """Six times as many points on the head as on the rest: matched alike, they gave scale 1.23 and a quarter turn."""
+    source = torch.cat((animal(2000, 1), front(animal(100_000, 3)))) @ yaw(degrees).T
+    found = align(source, animal(3000, 0), up=UP)
+    assert turned_by(found, yaw(-degrees)) < 1
+    assert found.scale == pytest.approx(1.0, rel=0.01)
+    uneven = align(source, animal(3000, 0), up=UP, even=False)
+    assert uneven.scale > 1.15
+
+
+def test_a_scale_that_is_given_is_kept() -> None:
+    found = align(0.5 * animal(2000, 1) @ yaw(20).T, animal(2000, 0), up=UP, scale=2.0)
+    assert found.scale == 2.0 and not found.clamped and turned_by(found, yaw(-20)) < 1
+    with pytest.raises(ValueError, match="expected a finite scale above zero, got -1"):
+        align(cloud(9), cloud(9), scale=-1)
+
+
+CAMERA = torch.tensor((1.0, 2.0, 12.0), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("scale", [0.55, 1.0, 1.7])
+def test_a_scale_about_a_camera_is_found(scale: float) -> None:
+    truths = [animal(2000, step, swing=0.1 * step) for step in range(3)]
+    sources = [CAMERA + (animal(2000, 7 + step, swing=0.1 * step) - CAMERA) / scale for step in range(3)]
+    found = align_scale(sources, truths, CAMERA)
+    assert found.scale == pytest.approx(scale, rel=0.003) and not found.clamped
+    torch.testing.assert_close(found.rotation, torch.eye(3, dtype=torch.float64), **EXACT)
+    torch.testing.assert_close(found.apply(CAMERA[None])[0], CAMERA, **EXACT)
+
+
+def test_a_scale_about_a_camera_does_not_enlarge_points_below_the_skin() -> None:
+    """Centres of Gaussians lie inside; a similarity enlarges them, the scale about a camera moves them in depth."""
+    target = animal(3000, 0)
+    inner = 0.93 * animal(3000, 1)
+    assert align(inner, target, up=UP).scale == pytest.approx(1 / 0.93, rel=0.02)
+    assert align_scale([inner], [target], CAMERA).scale == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_scale_that_is_open_says_so() -> None:
+    with pytest.raises(Undetermined, match="half of the points lie at the centre"):
+        align_scale([torch.zeros(9, 3)], [cloud(9)], torch.zeros(3))
+    with pytest.raises(Undetermined, match="no moment at which both"):
+        align_scale([cloud(0)], [cloud(9)], torch.zeros(3))
