@@ -220,6 +220,7 @@ class Truth:
         diagonal: of the animal's bounding box in its rest pose, world units; None where unknown.
         up: direction that points up in the world, unit, float64, [3]; None where unknown.
         rig: makes the true shape and skeleton, for a bound (`--prior rig`); None where the data set has none.
+        source: what the surface is made of ("voxels", "mesh of the rig"), for the record; "" where there is none.
     """
 
     held_out: Sequence[Frame]
@@ -229,6 +230,7 @@ class Truth:
     diagonal: float | None = None
     up: Tensor | None = None
     rig: Callable[[], Rig] | None = None
+    source: str = ""
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import torch
 from rewild4d.contracts import Finding, Selection
 from rewild4d.datasets.artemis import files
 from rewild4d.datasets.artemis.check import check_animal
+from rewild4d.datasets.artemis.mesh import read_mesh
 from rewild4d.datasets.artemis.recipe import read_recipe
 from rewild4d.datasets.artemis.rig import read_rig
 from rewild4d.datasets.artemis.selection import held_out, placed_view, selected_views, up_direction
@@ -142,10 +143,12 @@ class _Motion:
         up = torch.from_numpy(up_direction(self.camera_to_world))
         if surface is None:
             return clip, Truth(hidden, None, hidden.digest(), up=up)
-        moving = MovingSurface(surface, poses, self.fps)
+        mesh = read_mesh(self.folder, surface)
+        moving = MovingSurface(mesh or surface, poses, self.fps)
         key = digest(hidden.digest(), *map(moving.at, clip.times))
         rig = partial(read_rig, self.folder, poses)
-        return clip, Truth(hidden, moving.at, key, moving.sample, surface.diagonal, up, rig)
+        diagonal, source = (mesh.diagonal, "mesh of the rig") if mesh else (surface.diagonal, "voxels")
+        return clip, Truth(hidden, moving.at, key, moving.sample, diagonal, up, rig, source)
 
     def _fixed_view(self, placement: str, surface: Voxels | None, poses: list[np.ndarray]) -> int:
         """Return the camera at a placement relative to the animal at the first frame; view 0 without one."""

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -187,30 +188,50 @@ def is_surface(cells: np.ndarray) -> np.ndarray:
     return missing
 
 
+class Posable(Protocol):
+    """Points at rest that bones move."""
+
+    def posed(self, bones: np.ndarray) -> np.ndarray:
+        """Return the points under global bone-to-world matrices [J, 4, 4], [n, 3]."""
+        ...
+
+
+class Surface(Protocol):
+    """A surface at rest, of voxels or of triangles."""
+
+    def thinned(self, count: int) -> Posable:
+        """Return at most ``count`` points, always the same ones."""
+        ...
+
+    def sampled(self, count: int, seed: int) -> Posable:
+        """Return so many points; another seed draws an independent sampling."""
+        ...
+
+
 @dataclass(frozen=True)
 class MovingSurface:
     """A surface over time, known at the kept frames only.
 
     Attributes:
-        surface: all surface voxels at rest.
+        surface: at rest.
         poses: bones of each kept frame, [J, 4, 4].
         fps: kept frames per second.
     """
 
-    surface: Voxels
+    surface: Surface
     poses: list[np.ndarray]
     fps: float
 
     @cached_property
-    def _thinned(self) -> Voxels:
+    def _thinned(self) -> Posable:
         return self.surface.thinned(SURFACE_POINTS)
 
     def at(self, time: float) -> torch.Tensor:
-        """Return at most `SURFACE_POINTS` voxel centres (see `types.Truth.surface`)."""
+        """Return at most `SURFACE_POINTS` points, of voxels their centres (see `types.Truth.surface`)."""
         return torch.from_numpy(self._thinned.posed(self._pose(time)))
 
     def sample(self, time: float, count: int, seed: int) -> torch.Tensor:
-        """Return points anywhere in the surface voxels (see `types.Truth.sample`)."""
+        """Return points anywhere on the surface (see `types.Truth.sample`)."""
         return torch.from_numpy(self.surface.sampled(count, seed).posed(self._pose(time)))
 
     def _pose(self, time: float) -> np.ndarray:

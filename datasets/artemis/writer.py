@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from rewild4d.datasets.artemis.files import write_intrinsics, write_matrices
+from rewild4d.datasets.artemis.mesh import Mesh, write_mesh
 from rewild4d.datasets.artemis.recipe import write_recipe
 from rewild4d.errors import UserError
 from rewild4d.files import save_tensors
@@ -33,6 +34,7 @@ class ArtemisWriter:
         radius: half extent of the volume's box per axis, [3].
         licence: first line of the licence file; "" writes none.
         recipe: what decides the contents, except the processor (see `recipe`); None writes none.
+        mesh: the rig's own triangles, by which shapes are scored; None: by the voxels.
 
     Raises:
         UserError: the folder is not empty or cannot be written.
@@ -51,6 +53,7 @@ class ArtemisWriter:
         radius: np.ndarray,
         licence: str = "",
         recipe: dict[str, Any] | None = None,
+        mesh: Mesh | None = None,
     ) -> None:
         self.folder = Path(folder).absolute()
         self._cameras = tuple(cameras)
@@ -62,6 +65,7 @@ class ArtemisWriter:
         self._radius = np.asarray(radius, dtype=np.float64)
         self._licence = licence
         self._recipe = recipe
+        self._mesh = mesh
         self._frames: dict[str, int] = {}
         self._written: set[tuple[str, int, int]] = set()
 
@@ -136,6 +140,8 @@ class ArtemisWriter:
         save_tensors(torch.from_numpy(self._indices), volumes / "volume_indices.pth")
         save_tensors(torch.from_numpy(self._weights), volumes / "volume_weights.pth")
         (volumes / "radius.txt").write_text(" ".join(f"{value:.9g}" for value in self._radius) + "\n", encoding="utf-8")
+        if self._mesh is not None:
+            write_mesh(build, self._mesh)
         listing = "".join(f"{name} {count}\n" for name, count in self._frames.items())
         (build / "sequences").write_text(listing, encoding="utf-8")
         if self._licence:

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rewild4d.datasets.artemis.mesh import Mesh
 from rewild4d.datasets.artemis.writer import ArtemisWriter
-from rewild4d.datasets.rigs.animal import AnimatedAnimal
+from rewild4d.datasets.rigs.animal import AnimatedAnimal, Surface
 from rewild4d.datasets.rigs.reader import content, load_rig
 from rewild4d.datasets.rigs.shading import SUN_ALONG, SUN_UP, Picture, raycaster
 from rewild4d.datasets.rigs.voxels import voxelise
@@ -66,8 +67,11 @@ def make_artemis(
     _expect_empty(out)
     animal = load_rig(rig, clip, frames)
     size = {"views": views, "frames": frames, "width": width, "height": height}
-    recipe = {"rig": content(rig), "clip": clip, **size}
-    return render_artemis([animal], out, views=views, width=width, height=height, recipe=recipe, progress=progress)
+    recipe = {"rig": content(rig), "clip": clip, "truth": "mesh", **size}
+    return render_artemis(
+        [animal], out, views=views, width=width, height=height, recipe=recipe, mesh=joined(animal.surfaces),
+        progress=progress,
+    )  # fmt: skip
 
 
 def render_artemis(
@@ -78,6 +82,7 @@ def render_artemis(
     width: int,
     height: int,
     recipe: dict[str, Any] | None = None,
+    mesh: Mesh | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Render the motions of one animal as an Artemis folder; nothing stays behind when it fails.
@@ -89,6 +94,7 @@ def render_artemis(
         width: of the images in pixels.
         height: of the images in pixels.
         recipe: what the animals were made of, by which the folder is known on every processor (see `recipe`).
+        mesh: by which shapes are scored; None: by the voxels.
         progress: called after every image.
 
     Returns:
@@ -115,6 +121,7 @@ def render_artemis(
             volume.radius,
             first.licence,
             recipe,
+            mesh,
         ) as writer,
         ThreadPoolExecutor(1) as encoder,
     ):
@@ -135,6 +142,22 @@ def render_artemis(
         for job in pending:
             job.result()
     return out
+
+
+def joined(surfaces: Sequence[Surface]) -> Mesh:
+    """Join surfaces to one mesh; a vertex with fewer influences than others gets some of no weight."""
+    most = max(surface.bone_indices.shape[1] for surface in surfaces)
+    starts = np.cumsum([0, *(len(surface.vertices) for surface in surfaces[:-1])])
+
+    def padded(rows: NDArray[Any]) -> NDArray[Any]:
+        return np.pad(rows, ((0, 0), (0, most - rows.shape[1])))
+
+    return Mesh(
+        np.concatenate([surface.vertices for surface in surfaces]),
+        np.concatenate([surface.faces + start for surface, start in zip(surfaces, starts, strict=True)]),
+        np.concatenate([padded(surface.bone_indices) for surface in surfaces]),
+        np.concatenate([padded(surface.bone_weights) for surface in surfaces]),
+    )
 
 
 def _expect_empty(out: Path) -> None:

@@ -135,8 +135,13 @@ def open_footage(path: Path) -> Footage:
     return Footage(path, not files, tuple(clips) or (Reel(path, tuple(files)),))
 
 
-def match_reels(ours: Footage, theirs: Footage) -> tuple[list[Reel], list[str]]:
+def match_reels(ours: Footage, theirs: Footage, in_order: bool = False) -> tuple[list[Reel], list[str]]:
     """Return the reels of ``ours`` in the order of ``theirs``, matched by name; and a note where order had to do.
+
+    Args:
+        ours: clips or images.
+        theirs: the same.
+        in_order: match in sorted order where no name is shared and the counts agree.
 
     Raises:
         UserError: one holds images and the other clips, or the names do not match.
@@ -146,17 +151,22 @@ def match_reels(ours: Footage, theirs: Footage) -> tuple[list[Reel], list[str]]:
         raise UserError(f"{ours.path}: expected {kinds[1]} like {theirs.path}, got {kinds[0]}.")
     if not ours.clips or len(ours.reels) == len(theirs.reels) == 1:
         return list(ours.reels), []
-    return _match(ours.reels, theirs.reels, lambda reel: reel.path.stem, ours.path, theirs.path)
+    return _match(ours.reels, theirs.reels, lambda reel: reel.path.stem, (ours.path, theirs.path), in_order)
 
 
-def match_images(ours: Reel, theirs: Reel) -> tuple[Reel, list[str]]:
+def match_images(ours: Reel, theirs: Reel, in_order: bool = False) -> tuple[Reel, list[str]]:
     """Return ``ours`` with its images in the order of ``theirs``, matched by name; and a note where order had to do.
+
+    Args:
+        ours: a clip or a folder of images.
+        theirs: the same.
+        in_order: match in sorted order where no name is shared and the counts agree.
 
     Raises:
         UserError: the names do not match, or a video has another number of frames.
     """
     if ours.files and theirs.files:
-        files, notes = _match(ours.files, theirs.files, lambda file: file.stem, ours.path, theirs.path)
+        files, notes = _match(ours.files, theirs.files, lambda file: file.stem, (ours.path, theirs.path), in_order)
         return Reel(ours.path, tuple(files)), notes
     if len(ours) != len(theirs):
         raise UserError(f"{ours.path}: expected {len(theirs)} frames like {theirs.path}, got {len(ours)}.")
@@ -164,9 +174,10 @@ def match_images(ours: Reel, theirs: Reel) -> tuple[Reel, list[str]]:
 
 
 def _match(
-    ours: Sequence[T], theirs: Sequence[T], name: Callable[[T], str], our_path: Path, their_path: Path
+    ours: Sequence[T], theirs: Sequence[T], name: Callable[[T], str], paths: tuple[Path, Path], in_order: bool
 ) -> tuple[list[T], list[str]]:
-    """Return ``ours`` in the order of ``theirs``: by name, or in order where no name is shared and the counts agree."""
+    """Return ``ours`` in the order of ``theirs``: by name, or in order if asked for and no name is shared."""
+    our_path, their_path = paths
     by_name = {name(item): item for item in ours}
     wanted = [name(item) for item in theirs]
     missing = [word for word in wanted if word not in by_name]
@@ -175,7 +186,12 @@ def _match(
         return [by_name[word] for word in wanted], []
     if len(missing) == len(extra) == len(wanted):
         first = f"{next(iter(by_name))} with {wanted[0]}"
-        return list(ours), [f"{our_path} and {their_path} share no name: matched in sorted order, {first} first"]
+        if in_order:
+            return list(ours), [f"{our_path} and {their_path} share no name: matched in sorted order, {first} first"]
+        raise UserError(
+            f"{our_path}: expected the {len(wanted)} names of {their_path}, but they share none; --pair order matches "
+            f"them in sorted order, {first} first."
+        )
     faults = [f"none for {missing[0]}" if missing else "", f"{extra[0]} too many" if extra else ""]
     raise UserError(
         f"{our_path}: expected the {len(wanted)} names of {their_path}, got {len(by_name)}: "

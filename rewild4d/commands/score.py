@@ -30,6 +30,7 @@ class Options:
         masks: true masks (white inside), laid out like --truth; the alpha of the truths where it is left out.
         pred_masks: predicted masks, laid out like --truth; the alpha of the predictions where it is left out.
         background: grey level from 0 (black) to 1 (white) behind images that have alpha; alpha is taken as straight.
+        pair: by name, or in sorted order where predictions and truths share no name: name or order.
         unpaired: the predictions are of other views than the truths: only KID, FVD and KVD.
         only: what to compute: psnr ssim lpips-alex lpips-vgg silhouette kid fvd; all where it is left out.
         fps: of clips whose files do not say it, for the record.
@@ -45,6 +46,7 @@ class Options:
     masks: Path | None = None
     pred_masks: Path | None = None
     background: float = 1.0
+    pair: Literal["name", "order"] = "name"
     unpaired: bool = False
     only: tuple[str, ...] = ()
     fps: float | None = None
@@ -103,7 +105,7 @@ def score(options: Options) -> Report:
     bar = _Bar()
     try:
         return score_pictures(
-            Inputs(options.pred, options.truth, options.masks, options.pred_masks),
+            Inputs(options.pred, options.truth, options.masks, options.pred_masks, options.pair == "order"),
             networks=load_networks(families, device),
             families=families,
             background=options.background,

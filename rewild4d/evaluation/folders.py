@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 
@@ -84,7 +85,7 @@ def score_pictures(
     return Report(
         schema=SCHEMA,
         kind="clips" if truth.clips else "images",
-        inputs={name: str(path) for name, path in vars(inputs).items() if path is not None},
+        inputs={name: str(path) for name, path in vars(inputs).items() if isinstance(path, Path)},
         settings={"background": conditions.background} | ({"fps": f"{conditions.fps:g}"} if conditions.fps else {}),
         scores=scores,
         distances=distances,

@@ -21,12 +21,14 @@ class Inputs:
         truth: the same.
         masks: true masks, laid out like ``truth``; the truths' own alpha where None.
         prediction_masks: predicted masks, laid out like ``truth``; the predictions' own alpha where None.
+        in_order: match in sorted order what shares no name.
     """
 
     prediction: Path
     truth: Path
     masks: Path | None = None
     prediction_masks: Path | None = None
+    in_order: bool = False
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,8 @@ def match_inputs(inputs: Inputs, prediction: Footage, truth: Footage) -> tuple[l
     notes: list[str] = []
 
     def aligned(footage: Footage) -> list[Reel]:
-        reels, said = match_reels(footage, truth)
-        matched = [match_images(reel, true) for reel, true in zip(reels, truth.reels, strict=True)]
+        reels, said = match_reels(footage, truth, inputs.in_order)
+        matched = [match_images(reel, true, inputs.in_order) for reel, true in zip(reels, truth.reels, strict=True)]
         notes.extend([*said, *(note for _, found in matched for note in found)])
         return [reel for reel, _ in matched]
 

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rewild4d.datasets.triangles import draw
 from rewild4d.types import Splats
 
 OPACITY = 0.1
@@ -25,16 +26,9 @@ def sample_mesh(vertices: Tensor, faces: Tensor, count: int, seed: int) -> Tenso
     Raises:
         ValueError: no triangle has an area.
     """
-    rng = np.random.default_rng(seed)
-    corners = vertices.detach().cpu().double().numpy()[faces.cpu().numpy()]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    ends = np.cumsum(np.linalg.norm(cross, axis=1))
-    if not len(ends) or not 0 < ends[-1] < np.inf:
-        raise ValueError(f"expected triangles with an area, got {len(ends)} triangles without")
-    chosen = corners[np.searchsorted(ends, rng.random(count) * ends[-1], side="right").clip(max=len(ends) - 1)]
-    root, along = np.sqrt(rng.random(count)), rng.random(count)
-    shares = np.stack((1 - root, root * (1 - along), root * along), axis=1)
-    return torch.from_numpy(np.einsum("nk,nkd->nd", shares, chosen))
+    points, rows = vertices.detach().cpu().double().numpy(), faces.cpu().numpy()
+    chosen, shares = draw(points, rows, count, np.random.default_rng(seed))
+    return torch.from_numpy(np.einsum("nk,nkd->nd", shares, points[rows[chosen]]))
 
 
 def sample_gaussians(splats: Splats, count: int, seed: int, opacity: float = OPACITY) -> Tensor:

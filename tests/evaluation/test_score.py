@@ -137,11 +137,19 @@ def test_empty_masks_are_left_out_and_said(score: Call, tmp_path: Path) -> None:
     assert small["per_item"][0] is None and small["count"] == 1, "8 pixels are less than the window"
 
 
-def test_names_in_natural_order_and_a_note_where_order_had_to_do(score: Call, tmp_path: Path) -> None:
+def test_names_in_natural_order_where_that_is_asked_for(
+    score: Call, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for number in (2, 10, 1):
         write(tmp_path / "p" / f"out_{number}.png", flat(number, number, number))
         write(tmp_path / "t" / f"frame{number:03d}.png", flat(number, number, number))
-    found = score("--pred", tmp_path / "p", "--truth", tmp_path / "t", "--only", "psnr")
+    folders = ("--pred", tmp_path / "p", "--truth", tmp_path / "t", "--only", "psnr")
+    names = f"the 3 names of {tmp_path / 't'}"
+    assert refused(capsys, *folders) == (
+        f"rewild4d-bench: {tmp_path / 'p'}: expected {names}, but they share none; --pair order "
+        "matches them in sorted order, out_1 with frame001 first."
+    )
+    found = score(*folders, "--pair", "order")
     assert found["scores"]["psnr"]["value"] == PSNR_CAP
     assert "share no name: matched in sorted order, out_1 with frame001 first" in found["notes"][0]
 
