@@ -38,6 +38,7 @@ from rewild4d.files import digest, load_tensors, save_tensors, write_text
 from rewild4d.io.meshes import Discs
 from rewild4d.ours.motion import camera_between, frame_position
 from rewild4d.priors.motion import pose_at
+from rewild4d.texts import read_json
 from rewild4d.transforms import skin_points, split_similarity, transform_splats
 from rewild4d.types import Camera, Clip, Frame, Prior, Splats
 
@@ -163,7 +164,7 @@ def _run(work: Path, clip: Clip, prior: Prior, profile: Profile, config: Externa
     """Run the program, unless it has already run in this folder on the same input to its end."""
     identity = digest(msgspec.json.encode(config), clip.digest, prior.digest, str(seed))
     done = work / DONE
-    if done.is_file() and json.loads(done.read_text(encoding="utf-8")) == identity:
+    if done.is_file() and read_json(done, "a digest of the input") == identity:
         return
     for name in ("clip", "out"):
         shutil.rmtree(work / name, ignore_errors=True)

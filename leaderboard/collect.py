@@ -20,6 +20,7 @@ from rewild4d.leaderboard.privacy import without_paths
 from rewild4d.leaderboard.records import FILE, RunRecord
 from rewild4d.leaderboard.variants import by_protocol, grouped, latest, variants
 from rewild4d.metrics.score import Score
+from rewild4d.texts import read_json
 
 MARKER = "collection.json"
 """Lies in every collected folder: its title and what was done to the records."""
@@ -97,10 +98,7 @@ def title_of(folder: Path) -> str:
     path = folder / MARKER
     if not path.is_file():
         return folder.resolve().name
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=_Titled).title
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: expected the title of a collection, but {error}.") from error
+    return read_json(path, "the title of a collection", _Titled).title
 
 
 def _write(found: Sequence[Found], folder: Path, pictures: str, made: Collection) -> None:

@@ -7,9 +7,10 @@ from typing import Any
 
 import msgspec
 
-from rewild4d.errors import UserError
+from rewild4d.errors import UserError, reason
 from rewild4d.files import digest, write_text
 from rewild4d.metrics.score import Distance, Score
+from rewild4d.texts import read_json
 
 SCHEMA = 1
 FILE = "record.json"
@@ -134,21 +135,14 @@ def read_record(path: Path) -> RunRecord:
     Raises:
         UserError: missing, cannot be read, not JSON, or not of this schema.
     """
-    try:
-        record = msgspec.json.decode(path.read_bytes(), type=RunRecord)
-    except FileNotFoundError as error:
-        raise UserError(f"{path}: expected a run record, but there is no such file.") from error
-    except OSError as error:
-        raise UserError(f"{path}: expected a run record, but it cannot be read: {error.strerror}.") from error
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: expected a run record of schema {SCHEMA}, but {error}.") from error
+    record = read_json(path, f"a run record of schema {SCHEMA}", RunRecord)
     if record.schema != SCHEMA:
         raise UserError(f"{path}: expected a run record of schema {SCHEMA}, got schema {record.schema}.")
     for place, shape in (("protocol", _Protocol), ("prior", _Prior), ("data", _Data)):
         try:
             msgspec.convert(getattr(record, place), shape)
         except msgspec.ValidationError as error:
-            raise UserError(f"{path}: expected the {place} of a run, but in `{place}`: {error}.") from error
+            raise UserError(f"{path}: expected the {place} of a run, but in `{place}`: {reason(error)}.") from error
     return record
 
 

@@ -6,7 +6,8 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from rewild4d.errors import UserError, unknown_name
+from rewild4d.errors import unknown_name
+from rewild4d.texts import parse_json, parse_toml
 
 T = TypeVar("T")
 
@@ -141,8 +142,6 @@ def _files(folder: str, suffix: str) -> Mapping[str, bytes]:
 
 
 def _decode(path: str, data: bytes, kind: type[T]) -> T:
-    decode = msgspec.json.decode if path.endswith(".json") else msgspec.toml.decode
-    try:
-        return decode(data, type=kind)
-    except (msgspec.MsgspecError, ValueError) as error:
-        raise UserError(f"leaderboard/{path}: expected {kind.__name__}, but {error}.") from error
+    parse = parse_json if path.endswith(".json") else parse_toml
+    made: T = parse(data, f"leaderboard/{path}", kind.__name__, kind)
+    return made

@@ -5,7 +5,6 @@ import dataclasses
 import io
 import math
 import re
-import tomllib
 import typing
 from collections.abc import Iterable, Iterator
 from importlib import resources
@@ -14,6 +13,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from rewild4d.errors import UserError, unknown_name
+from rewild4d.texts import read_toml
 
 T = TypeVar("T")
 PRESETS = ("default", "quick", "standard", "paper")
@@ -61,7 +61,7 @@ def _over(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 def _preset_file(method: str) -> dict[str, Any]:
     file = resources.files("rewild4d.baselines") / "presets" / f"{method}.toml"
-    return tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    return read_toml(file, "presets") if file.is_file() else {}
 
 
 def parse_flags(

@@ -13,6 +13,7 @@ from rewild4d.files import atomic, load_tensors, save_tensors
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.motion import camera_between, frame_position, interpolate_similarity
 from rewild4d.ours.symmetry import match_times
+from rewild4d.texts import read_json
 from rewild4d.transforms import transform_splats
 from rewild4d.types import Camera, Clip, Prior, Splats
 
@@ -105,10 +106,5 @@ def load_state(folder: Path, method: str, config_type: type[C]) -> tuple[dict[st
     for name in (STATE, CONFIG):
         if not (folder / name).is_file():
             raise UserError(f"{folder}: expected a reconstruction by '{method}', but it has no {name}.")
-    try:
-        config = msgspec.json.decode((folder / CONFIG).read_bytes(), type=config_type)
-    except (msgspec.MsgspecError, ValueError) as error:
-        raise UserError(
-            f"{folder}: expected a reconstruction by '{method}', but it cannot be read ({error})."
-        ) from error
+    config = read_json(folder / CONFIG, f"a reconstruction by '{method}'", config_type)
     return load_tensors(folder / STATE), config

@@ -12,13 +12,17 @@ from pathlib import Path
 import numpy as np
 
 from rewild4d.datasets.images import ImagePair
-from rewild4d.errors import UserError
+from rewild4d.errors import UserError, shown
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 PARENTS_FILES = ("bone_parents.npy", "bones_parents.npy")
 LICENCE_FILES = ("LICENSE", "LICENCE", "LICENSE.txt", "LICENCE.txt", "license.txt", "licence.txt")
 NO_LICENCE = "no licence file with the data; do not redistribute"
 _COLUMNS = (2, 0, 1, 3)
+LARGEST = 1e15
+"""Of numbers in text files: differences of larger ones are lost in rounding, and their products overflow."""
+MOST_DIGITS = 9
+"""Of a number of frames."""
 
 
 def read_matrices(path: Path, what: str) -> np.ndarray:
@@ -148,8 +152,10 @@ def read_sequences(path: Path) -> dict[str, int]:
         if not line.strip():
             continue
         words = line.strip().rsplit(maxsplit=1)
-        if len(words) != 2 or not words[1].isdecimal():
-            raise UserError(f"{path}: expected '<motion> <number of frames>' in line {number}, got '{line.strip()}'.")
+        if len(words) != 2 or not words[1].isdecimal() or len(words[1]) > MOST_DIGITS:
+            raise UserError(
+                f"{path}: expected '<motion> <number of frames>' in line {number}, got '{shown(line.strip())}'."
+            )
         motions[words[0]] = int(words[1])
     return motions
 
@@ -206,11 +212,10 @@ def list_frames(motion: Path) -> list[Path]:
             frames[number] = path
     if not frames:
         raise UserError(f"{motion}: expected frame folders 0, 1, 2, ..., got none.")
-    missing = [number for number in range(max(frames) + 1) if number not in frames]
-    if missing:
-        raise UserError(
-            f"{motion}: expected frame folders 0 to {max(frames)} without a gap, but folder {missing[0]} is missing."
-        )
+    missing = next(number for number in range(len(frames) + 1) if number not in frames)
+    if missing < len(frames):
+        last = shown(max(frames))
+        raise UserError(f"{motion}: expected frame folders 0 to {last} without a gap, but folder {missing} is missing.")
     return [frames[number] for number in range(len(frames))]
 
 
@@ -266,8 +271,10 @@ def _numbers(line: str, where: str) -> list[float]:
         try:
             value = float(token)
         except ValueError:
-            raise UserError(f"{where}: expected numbers, got '{token}'.") from None
+            raise UserError(f"{where}: expected numbers, got '{shown(token)}'.") from None
         if not np.isfinite(value):
-            raise UserError(f"{where}: expected finite numbers, got '{token}'.")
+            raise UserError(f"{where}: expected finite numbers, got '{shown(token)}'.")
+        if abs(value) > LARGEST:
+            raise UserError(f"{where}: expected numbers up to {LARGEST:g}, got '{shown(token)}'.")
         values.append(value)
     return values

@@ -67,7 +67,10 @@ def shown(entry: Entry, key: str) -> str:
 
 def short(value: Any) -> str:
     """Return a value as JSON writes it, cut where it is long."""
-    text = json.dumps(value)
+    try:
+        text = json.dumps(value)
+    except RecursionError:
+        return "what is nested too deeply"
     return text if len(text) <= 60 else f"{text[:60]}... ({len(text)} characters)"
 
 

@@ -1,16 +1,15 @@
 """Named points that people annotated: BADJA's joints on DAVIS, and COCO-like ones as in APTv2 and APT-36K."""
 
-import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from rewild4d.datasets.keypoints.entries import Entry, LeftOut, Unusable, numbers, short, shown
 from rewild4d.errors import UserError
+from rewild4d.texts import read_json
 from rewild4d.types import Crop, Keypoints
 
 BADJA = {
@@ -29,20 +28,6 @@ APT = (
     "right_knee", "right_back_paw",
 )  # fmt: skip
 """The keypoints of APTv2, APT-36K and AP-10K."""
-
-
-def read_json(path: Path) -> Any:
-    """Return the contents of a JSON file.
-
-    Raises:
-        UserError: it is missing or no JSON.
-    """
-    try:
-        return json.loads(path.read_bytes())
-    except OSError as error:
-        raise UserError(f"{path}: expected a JSON file, but: {error.strerror}.") from error
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: expected JSON, but it cannot be parsed ({error}).") from error
 
 
 OfFrames = tuple[list[Keypoints | None], str]
@@ -96,7 +81,7 @@ def read_badja(path: Path, stems: Sequence[str], size: tuple[int, int]) -> OfFra
     Raises:
         UserError: no such file, or not what BADJA writes.
     """
-    content, left = read_json(path), LeftOut()
+    content, left = read_json(path, "BADJA's joints in JSON"), LeftOut()
     named = {}
     if isinstance(content, list):
         named = dict(left.usable(content, partial(_named_joints, size=size)))

@@ -10,14 +10,22 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from rewild4d.datasets.keypoints import entries as coco
-from rewild4d.datasets.keypoints.entries import Entry, LeftOut, Unusable, shown
-from rewild4d.datasets.keypoints.keypoints import APT, coco_keypoints, read_json
+from rewild4d.datasets.keypoints.entries import Entry, LeftOut, Unusable, short, shown
+from rewild4d.datasets.keypoints.keypoints import APT, coco_keypoints
 from rewild4d.datasets.masking.masks import last_number
 from rewild4d.errors import UserError
+from rewild4d.texts import read_json
 from rewild4d.types import Keypoints
 
 NAMES = {"howling-monkey": "howling monkey", "raccon": "raccoon", "hourse": "horse"}
 """Spellings of APT-36K and what they mean."""
+
+MOST_PIXELS = 1_000_000
+"""Width or height of an image; no format of images has more."""
+MOST_TRACK = 2**53
+"""A larger number of an animal is not told from its neighbours in every program that writes JSON."""
+MOST_NAME = 255
+"""Bytes of a part of a path; file systems have no longer ones."""
 
 UNLISTED = "animal of no listed category"
 """The species where no annotation of an animal names a category that its file lists."""
@@ -81,7 +89,7 @@ def read_annotations(root: Path) -> Annotations:
     seen: set[tuple[str, int]] = set()
     read = 0
     for path in files:
-        table = read_json(path)
+        table = read_json(path, "JSON")
         if not isinstance(table, dict) or "annotations" not in table:
             continue
         read += 1
@@ -128,6 +136,8 @@ def _sighting(images: dict[Any, Entry], kinds: dict[Any, Entry], entry: Entry) -
     species = str(kind["name"]) if kind else UNLISTED
     file = clean_path(image["file_name"])
     try:
+        if ".." in file.parts or any(len(part) > MOST_NAME or "\0" in part for part in file.parts):
+            raise Unusable("name an image that no data set can hold", shown(image, "file_name"))
         size = _size(image)
         box = _within(coco.box_of(entry), size, entry)
         values = coco.triples_of(entry, len(APT)) if entry.get("keypoints") else [0.0] * (3 * len(APT))
@@ -140,17 +150,17 @@ def _sighting(images: dict[Any, Entry], kinds: dict[Any, Entry], entry: Entry) -
 
 
 def _size(image: Entry) -> tuple[int, int]:
-    try:
-        return int(image["width"]), int(image["height"])
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        got = f"image_id {image['id']} with {shown(image, 'width')} and {shown(image, 'height')}"
-        raise Unusable("name an image without width and height in pixels", got) from error
+    sides = coco.numbers([image.get("width"), image.get("height")])
+    if len(sides) < 2 or not all(1 <= side <= MOST_PIXELS for side in sides):
+        got = f"image_id {short(image['id'])} with {shown(image, 'width')} and {shown(image, 'height')}"
+        raise Unusable("name an image without width and height in pixels", got)
+    return int(sides[0]), int(sides[1])
 
 
 def _track(entry: Entry) -> int:
     """Return the number of an animal in its clip; nobody may guess it."""
     found = coco.numbers([entry.get("track_id")])
-    if not found or not found[0].is_integer():
+    if not found or not found[0].is_integer() or abs(found[0]) > MOST_TRACK:
         raise Unusable("have no whole number as track_id", shown(entry, "track_id"))
     return int(found[0])
 

@@ -9,7 +9,6 @@ A sequence with several objects gives a case for each, "dogs-jump@2", beside the
 BADJA's joints are read where they lie beside it.
 """
 
-import tomllib
 from functools import cached_property, partial
 from importlib import resources
 from pathlib import Path
@@ -24,6 +23,7 @@ from rewild4d.datasets.video.parts import with_parts
 from rewild4d.datasets.video.reader import VideoDataset
 from rewild4d.datasets.video.wild import Moment, Video, files_identity
 from rewild4d.errors import UserError, unknown_name
+from rewild4d.texts import read_toml
 from rewild4d.types import Keypoints
 
 FPS = 24.0
@@ -36,7 +36,7 @@ _JOINTS = ("badja", "joint_annotations", "BADJA/joint_annotations")
 
 def known_sequences() -> dict[str, dict[str, Any]]:
     """Return what is known of the animals in DAVIS, by sequence (davis.toml)."""
-    return tomllib.loads((resources.files("rewild4d.datasets.video") / "davis.toml").read_text(encoding="utf-8"))
+    return read_toml(resources.files("rewild4d.datasets.video") / "davis.toml", "the sequences of DAVIS")
 
 
 class Davis(VideoDataset):

@@ -17,6 +17,7 @@ from rewild4d.datasets.masking.masks import NOISE
 from rewild4d.datasets.video.wild import Masks, Video
 from rewild4d.errors import unknown_name
 from rewild4d.files import atomic, cache_folder, digest
+from rewild4d.texts import read_json
 
 NOTE = "of masks in several parts only the one that goes on from the frame before is taken"
 APART = 0.2
@@ -60,7 +61,7 @@ def _counted(video: Video) -> tuple[int, int]:
         found = standing_apart(video.masks)
         with atomic(file) as path:
             path.write_bytes(msgspec.json.encode(found))
-    return msgspec.json.decode(file.read_bytes(), type=tuple[int, int])
+    return read_json(file, "two counts of masks", tuple[int, int])
 
 
 def standing_apart(masks: Masks) -> tuple[int, int]:

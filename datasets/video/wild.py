@@ -20,6 +20,7 @@ from rewild4d.datasets.video.crops import cut, follow, lost_share
 from rewild4d.datasets.video.travel import TravelMeter
 from rewild4d.errors import UserError
 from rewild4d.files import atomic, cache_folder, digest, file_state, write_text
+from rewild4d.texts import read_json
 from rewild4d.types import Clip, Crop, Frame, Keypoints, Truth
 
 LEAST_FRAMES = 4
@@ -268,7 +269,7 @@ def _fill(video: Video, layout: Layout, size: int, folder: Path) -> None:
 
 
 def _read_layout(path: Path) -> Layout:
-    parts = json.loads(path.read_text(encoding="utf-8"))
+    parts = read_json(path, "the layout of a video")
     crops = tuple(Crop(**values) for values in parts.pop("crops"))
     return Layout(crops=crops, **{name: tuple(values) for name, values in parts.items()})
 

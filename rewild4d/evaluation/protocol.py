@@ -8,9 +8,10 @@ from typing import Literal
 import msgspec
 
 from rewild4d.contracts import Selection
-from rewild4d.errors import UserError, unknown_name
+from rewild4d.errors import UserError, reason, unknown_name
 from rewild4d.files import digest
 from rewild4d.metrics import names
+from rewild4d.texts import read_toml
 
 
 class NovelViews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -103,8 +104,8 @@ def load_protocols() -> dict[str, Protocol]:
     for entry in metadata.entry_points(group="rewild4d.protocols"):
         try:
             added = [_decode(file) for file in _tomls(resources.files(entry.value))]
-        except (ImportError, OSError, msgspec.DecodeError) as error:
-            raise UserError(f"protocols '{entry.name}': {entry.value}: {error}.") from error
+        except (ImportError, OSError, UserError) as error:
+            raise UserError(f"protocols '{entry.name}': {entry.value}: {reason(error)}.") from error
         for protocol in added:
             if found.setdefault(protocol.name, protocol) is not protocol:
                 raise UserError(f"protocols '{entry.name}': {entry.value}: the name '{protocol.name}' is taken.")
@@ -117,7 +118,7 @@ def _tomls(folder: Traversable) -> list[Traversable]:
 
 
 def _decode(file: Traversable) -> Protocol:
-    return msgspec.toml.decode(file.read_bytes(), type=Protocol)
+    return read_toml(file, "a protocol", Protocol)
 
 
 def default_name(dataset: str, protocols: Mapping[str, Protocol]) -> str | None:

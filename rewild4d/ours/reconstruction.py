@@ -18,6 +18,7 @@ from rewild4d.ours.pose import Pose
 from rewild4d.ours.schedule import ramp
 from rewild4d.ours.skinning import SkinningField
 from rewild4d.ours.symmetry import Key
+from rewild4d.texts import read_json
 from rewild4d.transforms import transform_splats
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Prior, Splats
 
@@ -137,10 +138,7 @@ def load_reconstruction(folder: Path, device: torch.device) -> OursReconstructio
     for name in (STATE, CONFIG):
         if not (folder / name).is_file():
             raise UserError(f"{folder}: expected a reconstruction by 'ours', but it has no {name}.")
-    try:
-        config = msgspec.json.decode((folder / CONFIG).read_bytes(), type=Config)
-    except (msgspec.MsgspecError, ValueError) as error:
-        raise UserError(f"{folder}: expected a reconstruction by 'ours', but it cannot be read ({error}).") from error
+    config = read_json(folder / CONFIG, "a reconstruction by 'ours'", Config)
     state = load_tensors(folder / STATE)
     saved = state["model"]
     gaussians = Gaussians({name: saved[f"gaussians.{name}"] for name in NAMES}, config.canonical.max_scale)

@@ -32,8 +32,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rewild4d.errors import UserError
+from rewild4d.errors import UserError, reason, shown
 from rewild4d.files import atomic, digest
+from rewild4d.texts import parse_json
 from rewild4d.transforms import mirror_camera, mirror_transforms
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Prior
 
@@ -162,7 +163,9 @@ def _read(path: Path) -> Mapping[str, np.ndarray]:
     except FileNotFoundError as error:
         raise UserError(f"{path}: expected a prior file, but there is no such file.") from error
     except Exception as error:  # a damaged archive fails in any way
-        raise UserError(f"{path}: expected a prior file (npz), but it cannot be read as one: {error}.") from error
+        raise UserError(
+            f"{path}: expected a prior file (npz), but it cannot be read as one: {reason(error)}."
+        ) from error
 
 
 def _text(raw: Mapping[str, np.ndarray], key: str, default: str) -> str:
@@ -171,9 +174,9 @@ def _text(raw: Mapping[str, np.ndarray], key: str, default: str) -> str:
 
 def _quality(path: Path, text: str) -> dict[str, float]:
     try:
-        found = {str(name): float(value) for name, value in json.loads(text).items()}
-    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise UserError(f"{path}: expected 'quality' to be a JSON object of numbers, got {text[:60]!r}.") from error
+        found = {str(name): float(value) for name, value in parse_json(text, path, "'quality'").items()}
+    except (ValueError, TypeError, AttributeError, OverflowError, UserError) as error:
+        raise UserError(f"{path}: expected 'quality' to be a JSON object of numbers, got '{shown(text)}'.") from error
     if bad := next((name for name, value in found.items() if not math.isfinite(value)), None):
         raise UserError(f"{path}: expected finite numbers in 'quality', got {found[bad]} for '{bad}'.")
     return found

@@ -1,6 +1,5 @@
 """Named points of the template, and the files that say which annotated keypoint is which of them."""
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -9,8 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from rewild4d.errors import UserError, unknown_name
+from rewild4d.errors import UserError, shown, unknown_name
 from rewild4d.priors.template import MIRROR
+from rewild4d.texts import read_toml
 from rewild4d.types import Camera, Keypoints, Prior
 
 
@@ -82,11 +82,9 @@ def load_mapping(name: str) -> dict[str, str]:
         file = Path(name)
         if file.suffix != ".toml" or not file.is_file():
             raise unknown_name("keypoint mapping", name, [*mapping_names(), "<your own>.toml"])
-    try:
-        points = tomllib.loads(file.read_text(encoding="utf-8"))["points"]
-        pairs = {str(key): str(value) for key, value in points.items()}
-    except (tomllib.TOMLDecodeError, KeyError, AttributeError, UnicodeDecodeError) as error:
-        raise UserError(f"{name}: expected a TOML file with a table [points], but: {error}.") from error
+    pairs = read_toml(file, "a TOML file with a table [points]").get("points")
+    if not isinstance(pairs, dict) or not all(isinstance(value, str) for value in pairs.values()):
+        raise UserError(f"{name}: expected a table [points] of names in quotes, got {shown(pairs)}.")
     for value in pairs.values():
         if value not in LANDMARKS:
             raise unknown_name(f"landmark in the mapping {name}", value, LANDMARKS)

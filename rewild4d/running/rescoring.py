@@ -23,6 +23,7 @@ from rewild4d.registry import load_dataset, load_method
 from rewild4d.running import provenance
 from rewild4d.running.runner import STAMP, fit_seconds
 from rewild4d.running.workers import share_cores, this_process
+from rewild4d.texts import parse_json
 from rewild4d.visualize.original_view import original_frames
 from rewild4d.visualize.run_pictures import save_pictures
 
@@ -41,10 +42,8 @@ def reader_of(run: Path, record: RunRecord, data: Path | None) -> DatasetReader:
     reader, root = load_dataset(record.dataset), data or record.data.get("root")
     if not root:
         raise UserError(f"{run}: expected a record that names the folder of its data; --data names one.")
-    try:
-        settings = msgspec.json.decode(record.data.get("settings", "{}"), type=dict[str, Any])
-    except msgspec.MsgspecError as error:
-        raise UserError(f"{run}: expected the record's data.settings to be a JSON object, but: {error}.") from error
+    said = record.data.get("settings", "{}")
+    settings = parse_json(said, run, "the record's data.settings to be a JSON object", dict[str, Any])
     if unknown := sorted(set(settings) - {*getattr(reader, "options", ())}):
         raise UserError(f"{run}: expected settings that data set {record.dataset} has, got {', '.join(unknown)}.")
     return reader(Path(root), **settings)

@@ -19,7 +19,7 @@ import msgspec
 import torch
 
 from rewild4d.contracts import DatasetReader, Reconstruction
-from rewild4d.errors import UserError, unknown_name
+from rewild4d.errors import UserError, reason, unknown_name
 from rewild4d.evaluation.coverage import coverage
 from rewild4d.evaluation.measuring import evaluate
 from rewild4d.evaluation.networks import may_be_scored_now
@@ -37,6 +37,7 @@ from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_method
 from rewild4d.running import provenance
 from rewild4d.running.workers import Workers, share_cores, this_process
+from rewild4d.texts import read_json
 from rewild4d.types import Case, Clip, Prior, Truth
 from rewild4d.visualize.original_view import original_frames
 from rewild4d.visualize.run_pictures import save_pictures
@@ -316,10 +317,10 @@ class Job:
 def fit_seconds(folder: Path) -> float:
     """Read how long the finished fit in a run's folder took since its last start."""
     try:
-        return float(json.loads((folder / STAMP).read_text(encoding="utf-8"))["seconds_since_last_start"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        return float(read_json(folder / STAMP, "the time of a finished fit")["seconds_since_last_start"])
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise UserError(
-            f"{folder / STAMP}: expected the time of a finished fit, got a damaged file ({error})."
+            f"{folder / STAMP}: expected the time of a finished fit, got a damaged file ({reason(error)})."
         ) from error
 
 
