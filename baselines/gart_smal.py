@@ -21,7 +21,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -32,6 +31,7 @@ from torch import Tensor
 from rewild4d.errors import UserError
 from rewild4d.priors.io import seal
 from rewild4d.priors.kinematics import depth_levels
+from rewild4d.reading import arrays_of
 from rewild4d.transforms import mirror_points, mirror_transforms, nearest_rotation, rigid, skin_points
 from rewild4d.types import OBJECT_DIAGONAL, Prior
 
@@ -187,12 +187,11 @@ def _read(path: Path) -> Mapping[str, Any]:
     try:
         content = path.read_bytes()
         if content[:2] == b"PK":
-            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-                return {name: archive[name] for name in archive.files}
+            return arrays_of(path, content, "a D-SMAL file (npz or SMAL pickle)")
         raw = _Careful(io.BytesIO(content), encoding="latin1").load()
     except FileNotFoundError as error:
         raise UserError(f"{path}: expected a D-SMAL file (npz or SMAL pickle), but there is no such file.") from error
-    except (OSError, ValueError, BadZipFile, EOFError, pickle.UnpicklingError, AttributeError, TypeError,
+    except (OSError, ValueError, EOFError, pickle.UnpicklingError, AttributeError, TypeError,
             IndexError, KeyError, ImportError) as error:  # fmt: skip
         raise UserError(
             f"{path}: expected a D-SMAL file (npz or SMAL pickle), but it cannot be read: {error}."

@@ -5,21 +5,22 @@ them. Features are stored as float32, which is what the networks compute.
 """
 
 import json
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 
-from rewild4d.errors import UserError
+from rewild4d.errors import UserError, reason, shown
 from rewild4d.files import atomic, digest
 from rewild4d.metrics.distribution import kid
 from rewild4d.metrics.names import KINDS
 from rewild4d.metrics.samples import Conditions, Distance, Features
 from rewild4d.metrics.video import feature_distances
+from rewild4d.reading import read_arrays
 
 FILE = "features.npz"
 _SIDES = ("prediction", "truth")
@@ -40,6 +41,23 @@ class Compared:
     prediction: Features
     truth: Features
     conditions: Conditions
+
+
+class _Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a file says of one side: the fields of `Features` beside its rows."""
+
+    extractor: str
+    digest: str
+    resize: str
+    frames: int | None = None
+
+
+class _About(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a file says of one kind."""
+
+    conditions: Conditions
+    prediction: _Network
+    truth: _Network
 
 
 def distances(compared: Compared) -> list[Distance]:
@@ -130,30 +148,30 @@ def read_features(path: Path, expected: str | None = None) -> dict[str, Compared
     Raises:
         UserError: no such file, not one of ours, or not the one with that digest.
     """
+    kind = "the features of a run (.npz)"
+    arrays = read_arrays(path, kind)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        about = json.loads(str(arrays["about"]))
-        found = {kind: _compared(kind, arrays, said) for kind, said in about.items()}
-    except FileNotFoundError as error:
-        raise UserError(f"{path}: expected the features of a run, but there is no such file.") from error
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path}: expected the features of a run (.npz), but it cannot be read ({error}).") from error
+        about = msgspec.json.decode(str(arrays["about"]), type=dict[str, _About])
+        found = {name: _compared(name, arrays, said) for name, said in about.items()}
+    except (ValueError, KeyError, RecursionError, msgspec.MsgspecError) as error:  # described otherwise than here
+        raise UserError(f"{path}: expected {kind}, but it cannot be read as one: {reason(error)}.") from error
     if expected is not None and _digest(arrays) != expected:
         raise UserError(f"{path}: expected the features that its record was scored with, but it holds others.")
     return found
 
 
-def _compared(kind: str, arrays: dict[str, np.ndarray], said: dict[str, Any]) -> Compared:
-    prediction, truth = (_features(arrays[f"{kind}.{side}"], said[side]) for side in _SIDES)
-    return Compared(kind, prediction, truth, Conditions(**said["conditions"]))
+def _compared(kind: str, arrays: dict[str, np.ndarray], said: _About) -> Compared:
+    if kind not in KINDS:
+        raise ValueError(f"it holds sets of the kind '{shown(kind)}'")
+    prediction, truth = (_features(arrays[f"{kind}.{side}"], getattr(said, side)) for side in _SIDES)
+    return Compared(kind, prediction, truth, said.conditions)
 
 
-def _features(values: np.ndarray, said: dict[str, Any]) -> Features:
-    if values.ndim != 2:
-        raise ValueError(f"rows of shape {values.shape}")
+def _features(values: np.ndarray, said: _Network) -> Features:
+    if values.ndim != 2 or values.dtype.kind != "f" or not np.isfinite(values).all():
+        raise ValueError(f"it holds rows of {values.dtype} of shape {list(values.shape)} or some that are not finite")
     rows = torch.from_numpy(values).double()
-    return Features(rows, torch.zeros(len(rows), dtype=torch.int64), **said)
+    return Features(rows, torch.zeros(len(rows), dtype=torch.int64), **msgspec.structs.asdict(said))
 
 
 def _stack(parts: Sequence[Features]) -> Features:

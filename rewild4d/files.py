@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import platformdirs
 
 from rewild4d.errors import UserError
+from rewild4d.reading import opened_zip, require_room, require_there
 
 if TYPE_CHECKING:
     import numpy as np
@@ -200,20 +201,49 @@ def load_tensors(path: Path, kind: str = "saved reconstruction") -> Any:
         kind: what the file should be, for the error.
 
     Raises:
-        UserError: it is missing, damaged, or holds more than tensors and numbers.
+        UserError: it is missing, damaged, or holds more than tensors and numbers, a tensor without values, or more than
+            `reading.largest` lets in.
     """
     import torch
 
+    require_there(path, f"a {kind}")
+    with path.open("rb") as stream:
+        packed = stream.read(4) == b"PK\x03\x04"
+    if packed:  # files of torch's first years are no archives
+        with path.open("rb") as stream, opened_zip(path, stream, f"a {kind}, but"):
+            pass
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of torch, about pickles of its first years
-            return torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        raise UserError(f"{path}: expected a {kind}, but there is no such file.") from error
+            content = torch.load(path, map_location="cpu", weights_only=True)
     except OSError as error:
         raise UserError(f"{path}: expected a {kind}, but: {error.strerror or error}.") from error
     except Exception as error:  # an unpickler that meets other bytes fails in any way
         raise UserError(f"{path}: expected a {kind}, but it is cut off or another file.") from error
+    _require_values(path, content, kind)
+    return content
+
+
+def _require_values(path: Path, content: Any, kind: str) -> None:
+    """Refuse tensors without values, and those that repeat few values until they fill the memory."""
+    import torch
+
+    seen: set[int] = set()
+    waiting, size = [content], 0
+    while waiting:
+        item = waiting.pop()
+        if id(item) in seen:
+            continue
+        seen.add(id(item))
+        if isinstance(item, dict):
+            waiting += item.values()
+        elif isinstance(item, list | tuple):
+            waiting += item
+        elif isinstance(item, torch.Tensor):
+            if item.device.type != "cpu":
+                raise UserError(f"{path}: expected a {kind}, got a tensor without values (device {item.device}).")
+            size += item.numel() * item.element_size()
+    require_room(path, size, f"a {kind}")
 
 
 def cache_folder() -> Path:

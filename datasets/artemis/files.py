@@ -13,6 +13,7 @@ import numpy as np
 
 from rewild4d.datasets.images import ImagePair
 from rewild4d.errors import UserError, shown
+from rewild4d.reading import read_array
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 PARENTS_FILES = ("bone_parents.npy", "bones_parents.npy")
@@ -119,12 +120,7 @@ def read_parents(folder: Path) -> np.ndarray:
     path = next((folder / name for name in PARENTS_FILES if (folder / name).is_file()), None)
     if path is None:
         raise UserError(f"{folder}: expected {' or '.join(PARENTS_FILES)}, got neither.")
-    try:
-        parents = np.load(path, allow_pickle=False)
-    except Exception as error:  # a damaged file fails in any way
-        raise UserError(f"{path}: expected a NumPy file of integers, but: {error}.") from error
-    if not isinstance(parents, np.ndarray):
-        raise UserError(f"{path}: expected a NumPy file of integers, got an archive.")
+    parents = read_array(path, "a NumPy file of integers")
     if parents.ndim != 1 or not np.issubdtype(parents.dtype, np.integer):
         raise UserError(f"{path}: expected a vector of integers, got {parents.dtype} of shape {parents.shape}.")
     _expect_tree(path, parents)

@@ -14,6 +14,10 @@ from rewild4d.files import load_tensors
 
 SURFACE_POINTS = 10_000
 """Voxels of `Truth.surface` at most; `Truth.sample` draws as many points as it is asked for."""
+PLAIN = (
+    torch.float16, torch.float32, torch.float64, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64,
+)  # fmt: skip
+"""Types of tensors that files may hold."""
 FILES = ("coords_init.pth", "volume_indices.pth", "volume_weights.pth")
 
 OFF, RARE = 0.05, 0.01
@@ -245,6 +249,6 @@ def _tensor(path: Path) -> np.ndarray:
     value = load_tensors(path, "saved torch tensor")
     if not isinstance(value, torch.Tensor):
         raise UserError(f"{path}: expected a saved torch tensor, got {type(value).__name__}.")
-    if value.layout != torch.strided or value.dtype == torch.bfloat16:
+    if value.layout != torch.strided or value.dtype not in PLAIN:
         raise UserError(f"{path}: expected a dense tensor of integers or floats, got {value.layout} of {value.dtype}.")
     return value.detach().numpy()

@@ -20,6 +20,7 @@ from rewild4d.datasets.images import read_picture
 from rewild4d.datasets.video.video_file import read_video, video_facts
 from rewild4d.errors import UserError
 from rewild4d.files import natural
+from rewild4d.reading import read_array
 
 IMAGES = (".png", ".jpg", ".jpeg", ".npy")
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
@@ -234,11 +235,8 @@ def _planes(image: np.ndarray) -> Tensor:
 
 def _read_array(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the colour and alpha of an .npy array, as `read_picture` gives them."""
-    try:
-        values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise UserError(f"{path}: expected a whole .npy array of numbers, but: {str(error).rstrip('.')}.") from error
-    if not isinstance(values, np.ndarray) or values.size == 0 or values.dtype.kind not in "bfu":
+    values = read_array(path, "a whole .npy array of numbers")
+    if values.size == 0 or values.dtype.kind not in "bfu":
         raise UserError(f"{path}: expected floats in [0, 1] or unsigned integers, got {_described(values)}.")
     if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] not in (3, 4)):
         raise UserError(f"{path}: expected an array [h, w], [h, w, 3] or [h, w, 4], got {_described(values)}.")
@@ -251,8 +249,8 @@ def _read_array(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     return scaled[..., :3], scaled[..., 3] if scaled.shape[2] == 4 else None
 
 
-def _described(values: Any) -> str:
-    return f"{values.dtype} {list(values.shape)}" if isinstance(values, np.ndarray) else "an archive"
+def _described(values: np.ndarray) -> str:
+    return f"{values.dtype} {list(values.shape)}"
 
 
 def _video(path: Path) -> Reel:

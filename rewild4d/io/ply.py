@@ -149,7 +149,8 @@ def _columns(path: Path, element: Element, names: tuple[str, ...]) -> np.ndarray
     missing = [name for name in names if name not in element.columns]
     if missing:
         raise UserError(f"{path}: expected vertices with {', '.join(names)}, got none of the name {missing[0]}.")
-    values = np.stack([element.columns[name].astype(np.float64) for name in names], axis=1)
+    with np.errstate(invalid="ignore"):  # a signalling NaN is refused below
+        values = np.stack([element.columns[name].astype(np.float64) for name in names], axis=1)
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
         what = f"{names[0]} to {names[-1]}" if len(names) > 1 else names[0]

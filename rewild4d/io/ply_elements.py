@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rewild4d.errors import UserError
+from rewild4d.reading import read_bytes
 
 TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -17,6 +18,8 @@ TYPES = {
 }  # fmt: skip
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 LONGEST_HEADER = 1 << 20
+MOST_DIGITS = 18
+"""Of a number of rows."""
 
 
 @dataclass
@@ -46,10 +49,7 @@ def read_elements(path: Path) -> dict[str, Element]:
     Raises:
         UserError: no such file, not a PLY, a format or type that does not exist, a body shorter than the header says.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: expected a PLY file that can be read, but: {error.strerror}.") from error
+    data = read_bytes(path, "a PLY file that can be read")
     if not re.match(rb"ply\r?\n", data):
         raise UserError(f"{path}: expected a PLY file, which begins with the line 'ply', got another kind of file.")
     end = re.search(rb"\nend_header\r?\n", data[:LONGEST_HEADER])
@@ -70,7 +70,7 @@ def _header(path: Path, lines: list[str]) -> tuple[str, list[tuple[str, int, lis
                 pass
             case ["format", name, "1.0"] if name in ORDERS:
                 order = ORDERS[name]
-            case ["element", name, count] if count.isdecimal():
+            case ["element", name, count] if count.isdecimal() and len(count) <= MOST_DIGITS:
                 elements.append((name, int(count), []))
             case ["property", "list", length, kind, name] if elements:
                 elements[-1][2].append(_Property(name, _type(path, kind), _type(path, length)))
@@ -80,7 +80,11 @@ def _header(path: Path, lines: list[str]) -> tuple[str, list[tuple[str, int, lis
                 raise UserError(f"{path}: expected a line of a PLY 1.0 header, got '{line.strip()[:80]}'.")
     if order is None:
         raise UserError(f"{path}: expected a line 'format' in the PLY header, got none.")
-    for name, _, properties in elements:
+    if len({name for name, _, _ in elements}) < len(elements):
+        raise UserError(f"{path}: expected elements with different names in the PLY header, got one name twice.")
+    for name, count, properties in elements:
+        if count and not properties:
+            raise UserError(f"{path}: expected properties of '{name[:40]}' in the PLY header, got none.")
         if len({item.name for item in properties}) < len(properties):
             raise UserError(f"{path}: expected properties of '{name}' with different names, got one name twice.")
     return order, elements

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import torch
@@ -18,6 +19,7 @@ from rewild4d.ours.pose import Pose
 from rewild4d.ours.schedule import ramp
 from rewild4d.ours.skinning import SkinningField
 from rewild4d.ours.symmetry import Key
+from rewild4d.states import Shape, read_as, require_skeleton, require_tensors
 from rewild4d.texts import read_json
 from rewild4d.transforms import transform_splats
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Prior, Splats
@@ -140,10 +142,25 @@ def load_reconstruction(folder: Path, device: torch.device) -> OursReconstructio
             raise UserError(f"{folder}: expected a reconstruction by 'ours', but it has no {name}.")
     config = read_json(folder / CONFIG, "a reconstruction by 'ours'", Config)
     state = load_tensors(folder / STATE)
-    saved = state["model"]
+    with read_as(folder, "ours"):
+        return _from_state(folder / STATE, state, config, device)
+
+
+def _from_state(path: Path, state: dict[str, Any], config: Config, device: torch.device) -> OursReconstruction:
+    """Return the reconstruction that a state holds, after its shapes were looked at."""
+    saved, sizes = state["model"], {}
+    require_tensors(path, saved, _shapes(config), sizes)
+    parts = config.pose.anchor_size if config.deform.anchors else sizes["J"]
+    inputs = parts + 3 * (1 + 2 * config.deform.frequencies) + 4 + 3
+    require_tensors(path, saved, {"deform.query.weight": (config.deform.width, inputs)}, {})
+    require_tensors(path, state, {"times": ("T",), "object_to_world": ("T", 4, 4)}, sizes)
+    require_skeleton(path, saved["parents"], saved["mirror"])
+    require_skeleton(path, saved["parents"], saved["field.mirror"])
     gaussians = Gaussians({name: saved[f"gaussians.{name}"] for name in NAMES}, config.canonical.max_scale)
     logits, origin, pitch, mirror = (saved[f"field.{name}"] for name in ("logits", "origin", "pitch", "mirror"))
     field = SkinningField(logits, origin, pitch, mirror, config.skinning.tied)
+    if field.resolution < 2 or field.resolution**3 != len(logits):
+        raise UserError(f"{path}: expected 'field.logits' of a cube of voxels, got {len(logits)} rows.")
     skeleton = (saved["pivots"], saved["parents"], saved["mirror"])
     model = Model(config, gaussians, field, *skeleton, torch.Generator().manual_seed(0))
     model.load_state_dict(saved)
@@ -151,4 +168,23 @@ def load_reconstruction(folder: Path, device: torch.device) -> OursReconstructio
         None if item is None else Camera(item["world_to_camera"], item["intrinsics"], *item["size"])
         for item in state["cameras"]
     )
+    for item in filter(None, state["cameras"]):
+        require_tensors(path, item, {"world_to_camera": (4, 4), "intrinsics": (3, 3)}, {})
+    if len(cameras) != sizes["T"] or not all(isinstance(c.width + c.height, int) for c in cameras if c is not None):
+        raise UserError(f"{path}: expected a camera of {sizes['T']} frames each, got {len(cameras)} or other sizes.")
     return OursReconstruction(model.to(device), config, state["times"], state["object_to_world"], cameras)
+
+
+def _shapes(config: Config) -> dict[str, Shape]:
+    """Return the shapes that decide all others: the settings are held against them before a network is built."""
+    pose, deform = config.pose, config.deform
+    code = 2 + 2 * pose.frequencies + pose.explicit_group
+    last = f"network.blocks.{pose.blocks - 1}.down.bias"
+    return {
+        "gaussians.means": ("n", 3), "gaussians.quats": ("n", 4), "gaussians.log_scales": ("n", 3),
+        "gaussians.logit_opacities": ("n",), "gaussians.colors": ("n", "C", 3), "field.logits": ("V", "J"),
+        "field.origin": (3,), "field.pitch": (3,), "field.mirror": ("J",), "pivots": ("J", 3), "parents": ("J",),
+        "mirror": ("J",), "network.anchors": ("J", pose.anchor_size),
+        "network.embed.weight": (pose.width, pose.anchor_size + code), last: (pose.width,),
+        "deform.project.weight": (deform.width, deform.width),
+    }  # fmt: skip

@@ -32,8 +32,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rewild4d.errors import UserError, reason, shown
+from rewild4d.errors import UserError, shown
 from rewild4d.files import atomic, digest
+from rewild4d.reading import read_arrays
 from rewild4d.texts import parse_json
 from rewild4d.transforms import mirror_camera, mirror_transforms
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Prior
@@ -119,7 +120,7 @@ def load_prior(path: Path) -> Prior:
     Raises:
         UserError: no such file, not an npz, an array is missing, or has another shape, kind or values than documented.
     """
-    raw = _read(path)
+    raw = read_arrays(path, "a prior file (npz)")
     arrays, flipped = _validated(path, raw)
     cameras = _cameras(arrays["world_to_camera"], arrays["intrinsics"], arrays["sizes"])
     mirrored = tuple(mirror_camera(camera) for camera in cameras)
@@ -151,21 +152,6 @@ def _validated(path: Path, raw: Mapping[str, np.ndarray]) -> tuple[dict[str, Ten
     flipped = {key: _checked(path, raw, key, shape, sizes) for key, shape in FLIPPED.items() if key in raw}
     _check_values(path, arrays, flipped)
     return arrays, flipped
-
-
-def _read(path: Path) -> Mapping[str, np.ndarray]:
-    try:
-        archive = np.load(path, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise ValueError("it holds a single array")
-        with archive:
-            return {key: archive[key] for key in archive.files}
-    except FileNotFoundError as error:
-        raise UserError(f"{path}: expected a prior file, but there is no such file.") from error
-    except Exception as error:  # a damaged archive fails in any way
-        raise UserError(
-            f"{path}: expected a prior file (npz), but it cannot be read as one: {reason(error)}."
-        ) from error
 
 
 def _text(raw: Mapping[str, np.ndarray], key: str, default: str) -> str:
