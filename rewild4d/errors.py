@@ -66,6 +66,8 @@ def reason(error: BaseException) -> str:
 
     The system's words where it is one of files ("No such file or directory"), and never the bytes of a file.
     """
+    if isinstance(error, UnicodeDecodeError):
+        return f"byte {error.object[error.start]:#04x} at position {error.start} is no {error.encoding.upper()} text"
     if isinstance(error, RecursionError):
         return "it cannot be parsed (nested too deeply)"
     if isinstance(error, ValueError) and "integer string conversion" in str(error):

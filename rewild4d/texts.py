@@ -33,8 +33,10 @@ def read_bytes(file: Path | Traversable, expected: str) -> bytes:
     """
     try:
         return file.read_bytes()
+    except FileNotFoundError as error:
+        raise UserError(f"{file}: expected {expected}, but there is no such file.") from error
     except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
-        raise UserError(f"{file}: expected {expected}, but: {reason(error)}.") from error
+        raise UserError(f"{file}: expected {expected}, but it cannot be read: {reason(error)}.") from error
 
 
 def read_text(file: Path | Traversable, expected: str) -> str:

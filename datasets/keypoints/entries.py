@@ -1,6 +1,7 @@
 """Read entries of annotation files (COCO-like, BADJA); count and report those that cannot be used."""
 
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -87,15 +88,18 @@ def listed(table: Any, key: str) -> list[Any]:
 
 
 def by_id(items: Sequence[Any], key: str, kind: type) -> dict[Any, Entry]:
-    """Return the items that have an id and a value of a kind, by the id; others count as not listed."""
+    """Return the items that have an id and a value of a kind, by the id and its text; others count as not listed."""
     fit = (item for item in items if isinstance(item, Mapping) and isinstance(item.get(key), kind))
-    return {item["id"]: item for item in fit if isinstance(item.get("id"), _ID)}
+    known = [item for item in fit if isinstance(item.get("id"), _ID)]
+    return {str(item["id"]): item for item in known} | {item["id"]: item for item in known}
 
 
 def look_up(table: Mapping[Any, Entry], entry: Entry, key: str) -> Entry | None:
-    """Return what an entry's id stands for; None where nothing is listed under it."""
+    """Return what an entry's id stands for, a number in quotes too; None where nothing is listed under it."""
     number = entry.get(key)
-    return table.get(number) if isinstance(number, _ID) else None
+    if not isinstance(number, _ID):
+        return None
+    return table.get(number, table.get(str(number)))
 
 
 def image_of(images: Mapping[Any, Entry], entry: Entry) -> Entry:
@@ -123,8 +127,9 @@ def box_of(entry: Entry) -> tuple[float, float, float, float]:
 
 
 def triples_of(entry: Entry, count: int) -> list[float]:
-    """Return x, y and v of every keypoint, [3 count], or raise `Unusable`."""
-    values = numbers(entry.get("keypoints"))
+    """Return x, y and v of every keypoint, [3 count], NaN where one is null; or raise `Unusable`."""
+    given = entry.get("keypoints")
+    values = numbers([math.nan if value is None else value for value in given] if isinstance(given, list) else given)
     if len(values) != 3 * count:
         raise Unusable(f"have other keypoints than {3 * count} numbers", shown(entry, "keypoints"))
     return values

@@ -5,9 +5,7 @@ template is said by a mapping file (`priors.landmarks.load_mapping`), never here
 """
 
 import csv
-import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -16,25 +14,26 @@ from typing import Any
 import torch
 
 from rewild4d.datasets.keypoints import entries
-from rewild4d.datasets.keypoints.entries import Entry, LeftOut, Unusable, shown
+from rewild4d.datasets.keypoints.entries import Entry, LeftOut, Unusable
+from rewild4d.datasets.keypoints.individuals import Instance, Looks, choose
 from rewild4d.datasets.keypoints.keypoints import BADJA_SIZE, OfFrames, badja_joints, bounded, not_used
-from rewild4d.errors import UserError
+from rewild4d.datasets.keypoints.tables import Animals, read_table, stem_of
+from rewild4d.errors import UserError, reason, shown
+from rewild4d.texts import decoded, parse_json, read_bytes
 from rewild4d.types import Keypoints
 
-LIKELY = 0.6
-"""Confidence from which a detected point counts as seen (DeepLabCut's own default cut-off)."""
-
-Points = list[tuple[str, float, float, bool]]
-"""(name, x, y, visible), pixel centres at +0.5."""
+HDF5 = b"\x89HDF\r\n\x1a\n"
+FORMS = "keypoints as BADJA, COCO, DeepLabCut or SLEAP write them"
 
 
-def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int]) -> OfFrames:
+def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int], looks: Looks | None = None) -> OfFrames:
     """Return keypoints of the frames of a folder.
 
     Args:
         path: .json of BADJA or COCO form, .csv of DeepLabCut or SLEAP.
         stems: file names of the frames without their ending, in order; numbers in a CSV count these from 0.
         size: width and height of the frames in pixels.
+        looks: masks of the animal, by which it is known among several.
 
     Returns:
         One entry per frame, in which points outside the frame are not visible, and what of the file is not used.
@@ -43,133 +42,123 @@ def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int]) -> O
         UserError: the file is none of these, is broken, holds no usable keypoints, or names no frame of the folder.
     """
     left = LeftOut()
-    try:
-        if path.suffix.lower() == ".csv":
-            rows = [row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines()) if row]
-            found = _sleap(rows, stems) if "frame_idx" in rows[0] else _deeplabcut(rows, stems)
-        else:
-            content = json.loads(path.read_text(encoding="utf-8"))
-            is_badja = isinstance(content, list)
-            found = dict(left.usable(content, partial(_badja, size=size))) if is_badja else _coco(content, left)
-    except OSError as error:
-        raise UserError(f"{path}: expected a keypoint file, but: {error.strerror}.") from error
-    except (
-        LookupError, TypeError, ValueError, ArithmeticError, AttributeError, StopIteration, RecursionError, csv.Error
-    ) as error:  # fmt: skip
-        raise UserError(
-            f"{path}: expected keypoints as BADJA, COCO, DeepLabCut or SLEAP write them, got others ({error!r})."
-        ) from error
+    found, limit = _read(path, stems, size, left)
     wanted = f"expected keypoints of the frames {stems[0]} to {stems[-1]}"
     faults = "; ".join(left.told())
-    if not any(found.values()):
+    if not any(animal.points for animals in found.values() for animal in animals):
         raise UserError(f"{path}: {wanted}, got none{f': {faults}' if faults else ''}.")
-    result = [_checked(found[stem], size) if found.get(stem) else None for stem in stems]
-    if not any(result):
+    frames = [found.get(stem, []) for stem in stems]
+    if not any(frames):
+        named = ", ".join(shown(stem) for stem in list(found)[:3])
+        raise UserError(f"{path}: {wanted}, got those of {named}{f' ({faults})' if faults else ''}.")
+    try:
+        chosen, note = choose(frames, limit, size, looks)
+    except ValueError as error:
+        raise UserError(f"{path}: {wanted}, got {error}.") from error
+    names = [name for name, *_ in next(animal for animals in frames for animal in animals).points]
+    result = [
+        _checked(animal, names, limit, size) if animals else None
+        for animal, animals in zip(chosen, frames, strict=True)
+    ]
+    told = [sentence for sentence in (note, _kept(path, chosen, result, limit, size)) if sentence]
+    return result, "; ".join([*told, *filter(None, [not_used(path, result, size, left)])])
+
+
+def _read(path: Path, stems: Sequence[str], size: tuple[int, int], left: LeftOut) -> tuple[Animals, float]:
+    """Return the animals of each frame, and the confidence from which a point counts."""
+    data = read_bytes(path, "a keypoint file")
+    if data.startswith(HDF5):
         raise UserError(
-            f"{path}: {wanted}, got those of {', '.join(list(found)[:3])}{f' ({faults})' if faults else ''}."
+            f"{path}: expected {FORMS}, in .json or .csv, got HDF5: DeepLabCut writes a .csv beside it with "
+            "save_as_csv=True, SLEAP one with `sleap-convert --format analysis.csv`."
         )
-    return result, not_used(path, result, size, left)
+    try:
+        text = decoded(data)
+        if path.suffix.lower() == ".csv":
+            return read_table(text, stems)
+        content = parse_json(text, path, FORMS)
+        if not isinstance(content, list):
+            return _coco(content, left), 0.0
+        if content and all(isinstance(entry, dict) and {"image_id", "keypoints"} <= {*entry} for entry in content):
+            raise ValueError(
+                "a list of COCO results, which names neither images nor points: a file with images, annotations and "
+                "categories has these"
+            )
+        return {stem: [animal] for stem, animal in left.usable(content, partial(_badja, size=size))}, 0.0
+    except (ValueError, csv.Error) as error:
+        raise UserError(f"{path}: expected {FORMS}, got others ({reason(error)}).") from error
 
 
-def _checked(points: Points, size: tuple[int, int]) -> Keypoints:
-    places = torch.tensor([(x, y) if seen else (0.0, 0.0) for _, x, y, seen in points])
-    return bounded([name for name, *_ in points], places, torch.tensor([seen for *_, seen in points]), size)
+def _kept(
+    path: Path,
+    chosen: Sequence[Instance | None],
+    result: Sequence[Keypoints | None],
+    limit: float,
+    size: tuple[int, int],
+) -> str:
+    """Return how many points of how many are used, where some are unlikely; a `UserError` where none is left."""
+    points = [point for animal in chosen if animal for point in animal.found(-math.inf)]
+    unlikely = sum(point[3] < limit for point in points)
+    kept = sum(int(keypoints.visible.sum()) for keypoints in result if keypoints is not None)
+    best = max((point[3] for point in points), default=0.0)
+    if not points:
+        raise UserError(f"{path}: expected visible keypoints, got none.")
+    if unlikely == len(points):
+        raise UserError(f"{path}: expected keypoints with a score of {limit:g} or more, got {best:.3g} at most.")
+    if not kept:
+        raise UserError(f"{path}: expected keypoints inside frames of {size[0]}x{size[1]} pixels, got them outside.")
+    return f"{kept} of {len(points)} keypoints kept, {unlikely} have a score below {limit:g}" if unlikely else ""
 
 
-def _badja(entry: Entry, size: tuple[int, int]) -> tuple[str, Points]:
+def _checked(animal: Instance | None, names: Sequence[str], limit: float, size: tuple[int, int]) -> Keypoints:
+    """Return the points of an animal, those of None and unlikely ones not visible."""
+    if animal is None:
+        return Keypoints(tuple(names), torch.zeros(len(names), 2), torch.zeros(len(names), dtype=torch.bool))
+    sure = {*animal.found(limit)}
+    seen = [point in sure for point in animal.points]
+    places = [(x, y) if known else (0.0, 0.0) for (_, x, y, _), known in zip(animal.points, seen, strict=True)]
+    return bounded([name for name, *_ in animal.points], torch.tensor(places).reshape(-1, 2), torch.tensor(seen), size)
+
+
+def _badja(entry: Entry, size: tuple[int, int]) -> tuple[str, Instance]:
     across, down = size[0] / BADJA_SIZE[0], size[1] / BADJA_SIZE[1]
     stem, places, visible = badja_joints(entry)
-    return stem, [
-        (str(joint), column * across, row * down, seen)
-        for joint, ((column, row), seen) in enumerate(zip(places, visible, strict=True))
-    ]
+    joints = enumerate(zip(places, visible, strict=True))
+    points = ((str(joint), x * across, y * down, 1.0 if seen else math.nan) for joint, ((x, y), seen) in joints)
+    return stem, Instance("", 0.0, tuple(points))
 
 
-def _coco(content: Any, left: LeftOut) -> dict[str, Points]:
-    """Return the annotation with the largest box of each image."""
+def _coco(content: Any, left: LeftOut) -> Animals:
+    """Return all annotations of each image."""
     images = entries.by_id(entries.listed(content, "images"), "file_name", str)
     kinds = entries.by_id(entries.listed(content, "categories"), "keypoints", list)
-    largest: dict[str, float] = {}
-    found: dict[str, Points] = {}
+    found: Animals = {}
     annotations = entries.listed(content, "annotations")
-    for stem, area, points in left.usable(annotations, partial(_annotated, images, kinds)):
-        if area > largest.get(stem, 0.0):
-            largest[stem], found[stem] = area, points
+    for stem, animal in left.usable(annotations, partial(_annotated, images, kinds)):
+        found.setdefault(stem, []).append(animal)
     return found
 
 
-def _annotated(images: Mapping[Any, Entry], kinds: Mapping[Any, Entry], entry: Entry) -> tuple[str, float, Points]:
-    """Return the stem of an annotation's image, the area of its box, and its points, or raise `Unusable`."""
+def _annotated(images: Mapping[Any, Entry], kinds: Mapping[Any, Entry], entry: Entry) -> tuple[str, Instance]:
+    """Return the stem of an annotation's image and its animal, whose score is the area of its box; or `Unusable`."""
     image, kind = entries.image_of(images, entry), entries.look_up(kinds, entry, "category_id")
     if kind is None or not kind["keypoints"]:
-        raise Unusable("name a category without names of keypoints", shown(entry, "category_id"))
-    _, _, width, height = entries.box_of(entry)
-    if not (width > 0 and height > 0):
-        raise Unusable("have an empty bbox", shown(entry, "bbox"))
+        raise Unusable("name a category without names of keypoints", entries.shown(entry, "category_id"))
     names = [str(name) for name in kind["keypoints"]]
     values = entries.triples_of(entry, len(names))
     triples = zip(names, values[0::3], values[1::3], values[2::3], strict=True)
-    return _stem(image["file_name"]), width * height, [(name, x + 0.5, y + 0.5, v > 0) for name, x, y, v in triples]
+    points = tuple((name, x + 0.5, y + 0.5, 1.0 if seen > 0 else math.nan) for name, x, y, seen in triples)
+    track = entry.get("track_id")
+    return stem_of(image["file_name"]), Instance("" if track is None else shown(track), _area(entry, points), points)
 
 
-def _sleap(rows: list[list[str]], stems: Sequence[str]) -> dict[str, Points]:
-    """Read columns frame_idx, instance.score, <node>.x, .y and .score; of each frame the instance of highest score."""
-    nodes = [name[:-2] for name in rows[0] if name.endswith(".x")]
-    best: dict[str, float] = {}
-    found: dict[str, Points] = {}
-    for cells in rows[1:]:
-        row = dict(zip(rows[0], cells, strict=False))
-        stem, total = _counted(row["frame_idx"], stems), _number(row["instance.score"], -math.inf)
-        if stem not in found or total > best[stem]:
-            best[stem] = total
-            found[stem] = [  # a node without a score, as in labels by hand, is certain
-                _detected(name, row[f"{name}.x"], row[f"{name}.y"], _number(row.get(f"{name}.score", ""), 1.0))
-                for name in nodes
-            ]
-    return found
-
-
-def _deeplabcut(rows: list[list[str]], stems: Sequence[str]) -> dict[str, Points]:
-    """Read rows below the headers scorer, (individuals,) bodyparts and coords; of several individuals the first."""
-    heads = {row[0].strip(): row for row in rows[:4]}
-    parts, coords = heads["bodyparts"], heads["coords"]
-    people = heads.get("individuals", [""] * len(parts))
-    start = next((column for column, value in enumerate(coords) if value.strip() == "x"), None)
-    if start is None:
-        raise ValueError("no column called x")
-    columns: dict[str, dict[str, int]] = {}
-    for column in range(start, len(coords)):
-        if people[column] == people[start]:
-            columns.setdefault(parts[column], {})[coords[column].strip()] = column
-    found = {}
-    for row in rows[rows.index(coords) + 1 :]:
-        # labels by hand spread the path of an image over the first columns
-        label = "/".join(cell for cell in row[:start] if cell.strip())
-        found[_counted(label, stems)] = [
-            _detected(name, row[at["x"]], row[at["y"]], _number(row[at["likelihood"]]) if "likelihood" in at else 1.0)
-            for name, at in columns.items()
-        ]
-    return found
-
-
-def _detected(name: str, x: str, y: str, score: float) -> tuple[str, float, float, bool]:
-    across, down = _number(x), _number(y)
-    return name, across + 0.5, down + 0.5, math.isfinite(across) and math.isfinite(down) and score >= LIKELY
-
-
-def _number(text: str, missing: float = math.nan) -> float:
-    number = float(text) if text.strip() else math.nan
-    return missing if math.isnan(number) else number
-
-
-def _counted(label: str, stems: Sequence[str]) -> str:
-    """Return the frame that a row is about: a bare number counts from 0, all else is the name or path of an image."""
-    number = re.fullmatch(r"([0-9]+)(\.0)?", label.strip())
-    if number is None:
-        return _stem(label)
-    index = int(number[1])
-    return stems[index] if index < len(stems) else f"number {index}"
-
-
-def _stem(path: str) -> str:
-    return Path(path.replace("\\", "/")).stem
+def _area(entry: Entry, points: Sequence[tuple[str, float, float, float]]) -> float:
+    """Return the area of an annotation's box, or of its points where it has no box."""
+    if "bbox" not in entry:
+        found = [point for point in points if all(map(math.isfinite, point[1:]))]
+        sides = ([point[axis] for point in found] or [0.0] for axis in (1, 2))
+        return math.prod(max(side) - min(side) for side in sides)
+    _, _, width, height = entries.box_of(entry)
+    if not (width > 0 and height > 0):
+        raise Unusable("have an empty bbox", entries.shown(entry, "bbox"))
+    return width * height

@@ -55,7 +55,9 @@ def badja_joints(entry: Entry) -> tuple[str, list[tuple[float, float]], list[boo
 
 def bounded(names: Sequence[str], points: Tensor, seen: Tensor, size: tuple[int, int]) -> Keypoints:
     """Return keypoints [n, 2] (column, row), of which those outside their frame (width, height) are not visible."""
-    return Keypoints(tuple(names), points, seen & inside(points, size))
+    seen = seen & inside(points, size)
+    # what is not finite would spread through arithmetic that weighs it with zero
+    return Keypoints(tuple(names), torch.where(torch.isfinite(points), points, -1.0), seen)
 
 
 def inside(points: Tensor, size: tuple[int, int]) -> Tensor:

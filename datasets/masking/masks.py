@@ -14,13 +14,12 @@ import cv2
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
+from rewild4d.datasets.masking.meaning import Census, Meaning
 from rewild4d.errors import UserError
 from rewild4d.files import natural
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-VOID = 255
-MOST_OBJECTS = 32
-"""Grey images whose values all lie below this, but for `VOID`, are ids, not shades."""
+LOSSY = (".jpg", ".jpeg", ".webp")
 BLACK = 31
 """Colours without a channel above this are background: a JPEG's black is not quite black."""
 NOISE = 0.04
@@ -69,13 +68,18 @@ class MaskFiles:
 
     Attributes:
         files: of each frame; None where it has no mask.
-        ids: the objects that indexed files name, ascending; empty where a file holds a foreground or a soft matte.
         is_indexed: whether files with a palette hold numbers of objects; otherwise the palette's greys count.
+        meaning: of the values of all files.
     """
 
     files: tuple[Path | None, ...]
-    ids: tuple[int, ...]
     is_indexed: bool = False
+    meaning: Meaning = Meaning()
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """The objects that the files name, ascending; empty where they hold a foreground or a soft matte."""
+        return self.meaning.ids
 
     def read(self, index: int, object_id: int | None, size: tuple[int, int]) -> np.ndarray | None:
         """Return the mask of a frame, uint8 [h, w], 255 inside; None where it has none.
@@ -91,11 +95,7 @@ class MaskFiles:
         file = self.files[index]
         if file is None:
             return None
-        values = read_values(file, self.is_indexed)
-        if self.ids:
-            wanted = values == object_id if object_id is not None else np.isin(values, self.ids)
-            values = np.where(wanted, 255, 0).astype(np.uint8)
-        return fit_size(values, size, str(file))
+        return fit_size(self.meaning.mask(stored_values(file, self.is_indexed), object_id), size, str(file))
 
 
 def open_masks(files: Sequence[Path | None]) -> MaskFiles:
@@ -106,19 +106,25 @@ def open_masks(files: Sequence[Path | None]) -> MaskFiles:
     """
     there = [file for file in files if file is not None]
     indexed = any(map(_has_colored_palette, there))
-    seen: set[int] = set()
+    census = Census(any(file.suffix.lower() in LOSSY for file in there))
     for file in there:
-        seen |= set(np.flatnonzero(np.bincount(read_values(file, indexed).ravel(), minlength=256)).tolist())
-    named = tuple(sorted(seen - {0, VOID}))
-    is_named = indexed or (bool(named) and named[-1] < MOST_OBJECTS)
-    return MaskFiles(tuple(files), named if is_named else (), indexed)
+        census.add(stored_values(file, indexed))
+    return MaskFiles(tuple(files), indexed, census.indexed() if indexed else census.meaning())
 
 
-def read_values(file: Path, indexed: bool = False) -> np.ndarray:
-    """Return the values of a mask file, uint8 [h, w]: as they are stored, of a palette its greys or its indices.
+def read_values(file: Path) -> np.ndarray:
+    """Return the shades of one mask file, uint8 [h, w]; arguments and errors as of `stored_values`."""
+    values = stored_values(file)
+    most = values.max(initial=0)
+    whole = 65535 if most > 255 else 1 if values.dtype.kind == "f" and most <= 1 else 255
+    return Meaning(white=whole).mask(values, None)
+
+
+def stored_values(file: Path, indexed: bool = False) -> np.ndarray:
+    """Return the values of a mask file, [h, w]: as they are stored, of a palette its greys or its indices.
 
     An alpha channel that varies, or is zero everywhere, is the mask; colours are taken as foreground unless nearly
-    black; 16 bits become 8 where they are shades, and so do fractions up to 1.
+    black. Values are uint8, uint16 or float32.
 
     Args:
         file: an image.
@@ -138,13 +144,13 @@ def read_values(file: Path, indexed: bool = False) -> np.ndarray:
         return values.astype(np.uint8) * 255
     if values.ndim == 3:
         return _from_channels(values, mode)
-    if values.dtype != np.uint8:
-        if not np.isfinite(values).all():
-            raise UserError(f"{file}: expected a mask of finite numbers, got some that are not.")
-        most = values.max(initial=0)
-        whole = 65535 if most > 255 else 1 if values.dtype.kind == "f" and most <= 1 else 255
-        return np.rint((values / whole * 255).clip(0, 255)).astype(np.uint8)
-    return values
+    if values.dtype in (np.uint8, np.uint16):
+        return values
+    if not np.isfinite(values).all():
+        raise UserError(f"{file}: expected a mask of finite numbers, got some that are not.")
+    if values.dtype.kind in "iu" and values.min(initial=0) >= 0 and values.max(initial=0) <= 65535:
+        return values.astype(np.uint16)
+    return values.astype(np.float32)
 
 
 def read_transparency(file: Path) -> np.ndarray | None:

@@ -91,6 +91,7 @@ class AptV2(VideoDataset):
             "its category is not listed: taken for a quadruped" if subject.species == UNLISTED else "",
             *faults.get(str(subject.sightings[0].file.parent), ()),
             *faults.get("", ()),
+            masks.meaning.note,
             f"masks hold objects {', '.join(map(str, masks.ids))}, none of them track {subject.track}: taken together"
             if track is None and len(masks.ids) > 1
             else "",

@@ -21,7 +21,7 @@ from rewild4d.datasets.masking.masks import MaskFiles, list_images, match_masks,
 from rewild4d.datasets.video.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
 from rewild4d.datasets.video.parts import with_parts
 from rewild4d.datasets.video.reader import VideoDataset
-from rewild4d.datasets.video.wild import Moment, Video, files_identity
+from rewild4d.datasets.video.wild import Masks, Moment, Video, files_identity
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.texts import read_toml
 from rewild4d.types import Keypoints
@@ -97,19 +97,20 @@ class Davis(VideoDataset):
         own = self._own_masks(sequence, files)
         given, note = self._given_masks(sequence, files, object_id)
         used, every = given or own, range(len(files))
-        joints, outside = self._joints(sequence, files, size)
+        masks = partial(read_masks, used, object_id, every, size)
+        joints, outside = self._joints(sequence, files, size, masks)
         facts = known_sequences().get(sequence, {})
         species, strangers = str(facts.get("species", sequence)), self._strangers(case)
         told = f"no {species}: object {', '.join(map(str, strangers))} of its masks" if strangers else ""
         is_odd = not facts.get("quadruped", True)
         odd = f"a {species} is no quadruped: no four-legged template fits" if is_odd else ""
-        notes = (note, outside, str(facts.get("note", "")), odd, told)
+        notes = (note, used.meaning.note, outside, str(facts.get("note", "")), odd, told)
         video = Video(
             title=str(files[0].parent), name=case, species=case if object_id in strangers else species, fps=FPS,
             licence=LICENCE, identity=files_identity(*files, *own.files, *used.files) + f" {object_id}", size=size,
             moments=tuple(Moment(file.name, i / FPS, joints.get(file.stem)) for i, file in enumerate(files)),
             images=partial(read_images, files, size),
-            masks=partial(read_masks, used, object_id, every, size),
+            masks=masks,
             true_masks=partial(read_masks, own, object_id, every, size) if given or self.parts == "main" else None,
             notes=tuple(text for text in notes if text),
         )  # fmt: skip
@@ -151,7 +152,7 @@ class Davis(VideoDataset):
             folder = self.root / name / str(self.resolution) / sequence
             if folder.is_dir() and (found := list_images(folder)):
                 return open_masks(match_masks(found, [file.stem for file in files], folder)[0])
-        return MaskFiles((None,) * len(files), ())
+        return MaskFiles((None,) * len(files))
 
     def _given_masks(self, sequence: str, files: list[Path], object_id: int | None) -> tuple[MaskFiles | None, str]:
         """Return masks of --masks and a note on them; those without object ids are of the one animal of the case."""
@@ -169,13 +170,15 @@ class Davis(VideoDataset):
             )
         return masks, f"{note}; they hold no object ids: all of them is taken as object {object_id}"
 
-    def _joints(self, sequence: str, files: list[Path], size: tuple[int, int]) -> tuple[dict[str, Keypoints], str]:
+    def _joints(
+        self, sequence: str, files: list[Path], size: tuple[int, int], masks: Masks
+    ) -> tuple[dict[str, Keypoints], str]:
         """Return keypoints by the frame's stem, and a sentence on what their file holds but is not used."""
         stems = [file.stem for file in files]
         files_of_joints = [self.root / folder / f"{sequence}.json" for folder in _JOINTS]
         own = next((file for file in files_of_joints if file.is_file()), None)
         if self.keypoints is not None:
-            found, told = read_keypoints(self.keypoints, stems, size)
+            found, told = read_keypoints(self.keypoints, stems, size, lambda: enumerate(masks()))
         elif own is not None:
             found, told = read_badja(own, stems, size)
         else:

@@ -7,7 +7,7 @@ header says; frames keep their own time stamps, so any frame rate will do, a var
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from rewild4d.datasets.keypoints.files import read_keypoints
 from rewild4d.datasets.masking import masks as mask_files
 from rewild4d.datasets.masking.makers import Unmasked
 from rewild4d.datasets.masking.masks import MaskFiles, fit_size, match_masks, open_masks, read_transparency
+from rewild4d.datasets.masking.meaning import Census, Meaning
 from rewild4d.datasets.video.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
 from rewild4d.datasets.video.parts import with_parts
 from rewild4d.datasets.video.reader import VideoDataset
@@ -110,7 +111,7 @@ class Online(VideoDataset):
         times = [material.times[i] for i in indices]
         span = times[-1] - times[0]
         masks, note = self._masks(self._table[case])
-        points, outside = self._keypoints
+        points, outside = self._keypoints(masks)
         settings = f"{indices} {self._table[case]} {self.fps}"
         sources, labels = self._mask_sources, [file.name for file in material.files]
         video = Video(
@@ -133,12 +134,16 @@ class Online(VideoDataset):
         """Names of all frames; of a video their numbers."""
         return [f.stem for f in self._material.files] or [f"{i:05d}" for i in range(len(self._material.times))]
 
-    @cached_property
-    def _keypoints(self) -> tuple[list[Keypoints | None], str]:
-        """The keypoints of every frame, and a note on what of their file is not used."""
+    def _keypoints(self, masks: Masks) -> tuple[list[Keypoints | None], str]:
+        """Return the keypoints of every frame, and a note on what of their file is not used.
+
+        Args:
+            masks: of the chosen frames, by which the animal is known among several.
+        """
         if self.keypoints is None:
             return [None] * len(self._material.times), ""
-        return read_keypoints(self.keypoints, self._stems, self._material.size)
+        indices, size = self._chosen[0], self._material.size
+        return read_keypoints(self.keypoints, self._stems, size, lambda: zip(indices, masks(), strict=False))
 
     @property
     def name(self) -> str:
@@ -220,7 +225,8 @@ class Online(VideoDataset):
         else:
             every, note = match_masks(found, stems, self._mask_place)
             matched = [every[i] for i in indices]
-        return open_masks(matched), note
+        masks = open_masks(matched)
+        return masks, "; ".join(filter(None, (note, masks.meaning.note)))
 
     @property
     def _mask_sources(self) -> Sequence[Path | None]:
@@ -249,7 +255,9 @@ class Online(VideoDataset):
             raise UserError(
                 f"{path}: expected a mask for each of the {total} frames of {self.root.name}, got {len(facts.times)}."
             )
-        return partial(_mask_stream, path, chosen, self._material.size, facts.has_alpha), note
+        meaning = _film_meaning(path, files_identity(path), tuple(chosen), facts.has_alpha)
+        masks = partial(_mask_stream, path, chosen, self._material.size, facts.has_alpha, meaning)
+        return masks, "; ".join(filter(None, (note, meaning.note)))
 
     def _images(self) -> Iterator[np.ndarray]:
         indices = self._chosen[0]
@@ -286,7 +294,23 @@ def _picked(frames: Iterator[np.ndarray], indices: Sequence[int]) -> Iterator[np
             return
 
 
-def _mask_stream(path: Path, indices: Sequence[int], size: tuple[int, int], alpha: bool) -> Iterator[np.ndarray | None]:
+@lru_cache(maxsize=4)
+def _film_meaning(path: Path, identity: str, indices: tuple[int, ...], alpha: bool) -> Meaning:
+    """Return what the shades of a film of masks mean, of a file that is known by its ``identity``."""
+    census = Census(is_lossy=True)
+    for shades in _film_shades(path, indices, alpha):
+        census.add(shades)
+    return census.meaning()
+
+
+def _film_shades(path: Path, indices: Sequence[int], alpha: bool) -> Iterator[np.ndarray]:
     for frame in _picked(read_video(path), indices):
         shades = frame[..., 3] if alpha else mask_files.shades(frame[..., :3], mask_files.FILM_TINT)
-        yield fit_size(np.ascontiguousarray(shades), size, str(path))
+        yield np.ascontiguousarray(shades)
+
+
+def _mask_stream(
+    path: Path, indices: Sequence[int], size: tuple[int, int], alpha: bool, meaning: Meaning
+) -> Iterator[np.ndarray | None]:
+    for shades in _film_shades(path, indices, alpha):
+        yield fit_size(meaning.mask(shades, None), size, str(path))
