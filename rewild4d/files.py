@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import platformdirs
 
 from rewild4d.errors import UserError
-from rewild4d.reading import opened_zip, require_room, require_there
+from rewild4d.reading import require_room, require_there, unpacked_size
 
 if TYPE_CHECKING:
     import numpy as np
@@ -207,11 +207,7 @@ def load_tensors(path: Path, kind: str = "saved reconstruction") -> Any:
     import torch
 
     require_there(path, f"a {kind}")
-    with path.open("rb") as stream:
-        packed = stream.read(4) == b"PK\x03\x04"
-    if packed:  # files of torch's first years are no archives
-        with path.open("rb") as stream, opened_zip(path, stream, f"a {kind}, but"):
-            pass
+    require_room(path, unpacked_size(path), f"a {kind}")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of torch, about pickles of its first years

@@ -31,6 +31,10 @@ FILM = 8
 PIXEL = 16
 """Bytes that one pixel of a picture takes while it is read: four channels in single precision."""
 MOST_AXES = 32
+ZIP_FAULTS = (
+    zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, OverflowError, LookupError,
+    NotImplementedError, RuntimeError,  # another compression, a password
+)  # fmt: skip
 READABLE = "bifucSU"
 """Kinds of NumPy types that are plain values; others are objects and records."""
 
@@ -174,6 +178,13 @@ def arrays_of(path: Path, data: bytes, kind: str) -> dict[str, np.ndarray]:
         return found
 
 
+def unpacked_size(path: Path) -> int:
+    """Return the bytes of all entries of a zip archive together; 0 of a file that is none or a damaged one."""
+    with contextlib.suppress(*ZIP_FAULTS), zipfile.ZipFile(path) as archive:
+        return sum(info.file_size for info in archive.infolist())
+    return 0
+
+
 @contextlib.contextmanager
 def opened_zip(path: Path, stream: IO[bytes], fault: str) -> Iterator[zipfile.ZipFile]:
     """Open a zip archive whose entries together take no more memory than `largest` says.
@@ -190,10 +201,7 @@ def opened_zip(path: Path, stream: IO[bytes], fault: str) -> Iterator[zipfile.Zi
         with zipfile.ZipFile(stream) as archive:
             require_room(path, sum(info.file_size for info in archive.infolist()), "arrays")
             yield archive
-    except (
-        zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, OverflowError, LookupError,
-        NotImplementedError, RuntimeError,  # another compression, a password
-    ) as error:  # fmt: skip
+    except ZIP_FAULTS as error:
         raise UserError(f"{path}: expected {fault}: it is cut off, damaged or another file.") from error
 
 
