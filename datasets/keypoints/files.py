@@ -26,7 +26,13 @@ HDF5 = b"\x89HDF\r\n\x1a\n"
 FORMS = "keypoints as BADJA, COCO, DeepLabCut or SLEAP write them"
 
 
-def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int], looks: Looks | None = None) -> OfFrames:
+def read_keypoints(
+    path: Path,
+    stems: Sequence[str],
+    size: tuple[int, int],
+    looks: Looks | None = None,
+    stored: tuple[int, int] | None = None,
+) -> OfFrames:
     """Return keypoints of the frames of a folder.
 
     Args:
@@ -34,6 +40,8 @@ def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int], look
         stems: file names of the frames without their ending, in order; numbers in a CSV count these from 0.
         size: width and height of the frames in pixels.
         looks: masks of the animal, by which it is known among several.
+        stored: width and height before the pixels of the frames were made square, in which programs count; None: as
+            ``size``.
 
     Returns:
         One entry per frame, in which points outside the frame are not visible, and what of the file is not used.
@@ -43,6 +51,8 @@ def read_keypoints(path: Path, stems: Sequence[str], size: tuple[int, int], look
     """
     left = LeftOut()
     found, limit = _read(path, stems, size, left)
+    if stored is not None:
+        found = {stem: [animal.stretched(size, stored) for animal in animals] for stem, animals in found.items()}
     wanted = f"expected keypoints of the frames {stems[0]} to {stems[-1]}"
     faults = "; ".join(left.told())
     if not any(animal.points for animals in found.values() for animal in animals):

@@ -6,7 +6,7 @@ several tracks and let two change their numbers. Without masks it is the track w
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -37,6 +37,11 @@ class Instance:
     track: str
     score: float
     points: tuple[Point, ...]
+
+    def stretched(self, size: tuple[int, int], stored: tuple[int, int]) -> "Instance":
+        """Return the same animal in frames that were stretched from ``stored`` to ``size`` (width, height)."""
+        across, down = size[0] / stored[0], size[1] / stored[1]
+        return replace(self, points=tuple((name, x * across, y * down, sure) for name, x, y, sure in self.points))
 
     def found(self, limit: float) -> list[Point]:
         """Return the points that are somewhere and of at least this confidence."""

@@ -70,11 +70,13 @@ class MaskFiles:
         files: of each frame; None where it has no mask.
         is_indexed: whether files with a palette hold numbers of objects; otherwise the palette's greys count.
         meaning: of the values of all files.
+        stored: width and height of the video's frames before their pixels were made square; masks may have that shape.
     """
 
     files: tuple[Path | None, ...]
     is_indexed: bool = False
     meaning: Meaning = Meaning()
+    stored: tuple[int, int] | None = None
 
     @property
     def ids(self) -> tuple[int, ...]:
@@ -95,7 +97,8 @@ class MaskFiles:
         file = self.files[index]
         if file is None:
             return None
-        return fit_size(self.meaning.mask(stored_values(file, self.is_indexed), object_id), size, str(file))
+        mask = self.meaning.mask(stored_values(file, self.is_indexed), object_id)
+        return fit_size(mask, size, str(file), self.stored)
 
 
 def open_masks(files: Sequence[Path | None]) -> MaskFiles:
@@ -219,8 +222,14 @@ def _palette(image: Image.Image) -> np.ndarray:
     return np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3)
 
 
-def fit_size(mask: np.ndarray, size: tuple[int, int], title: str) -> np.ndarray:
+def fit_size(mask: np.ndarray, size: tuple[int, int], title: str, stored: tuple[int, int] | None = None) -> np.ndarray:
     """Return the mask at the size of its frame; one of the same shape in another size is scaled.
+
+    Args:
+        mask: uint8 [h, w].
+        size: width and height of the frame.
+        title: of the mask, for the error.
+        stored: width and height of the frame before its pixels were made square; a mask of that shape is stretched.
 
     Raises:
         UserError: another shape.
@@ -228,7 +237,9 @@ def fit_size(mask: np.ndarray, size: tuple[int, int], title: str) -> np.ndarray:
     height, width = mask.shape
     if (width, height) == size:
         return mask
-    if abs(width * size[1] - height * size[0]) > max(size) + max(width, height):  # beyond rounding of either
+    shapes = (size, stored) if stored else (size,)
+    # beyond rounding of either
+    if all(abs(width * down - height * across) > across + down + max(width, height) for across, down in shapes):
         raise UserError(
             f"{title}: expected a mask of {size[0]}x{size[1]} pixels like its frame (or of that shape), "
             f"got {width}x{height}."

@@ -6,7 +6,7 @@ header says; frames keep their own time stamps, so any frame rate will do, a var
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 
@@ -43,6 +43,7 @@ class Material:
         size: width and height.
         has_alpha: whether the frames carry a mask of their own: any is transparent anywhere.
         notes: what was found wrong, a sentence each.
+        stored: width and height before the pixels of a video were made square; None: they were.
     """
 
     files: tuple[Path, ...]
@@ -50,6 +51,7 @@ class Material:
     size: tuple[int, int]
     has_alpha: bool
     notes: tuple[str, ...]
+    stored: tuple[int, int] | None = None
 
 
 class Online(VideoDataset):
@@ -142,8 +144,10 @@ class Online(VideoDataset):
         """
         if self.keypoints is None:
             return [None] * len(self._material.times), ""
-        indices, size = self._chosen[0], self._material.size
-        return read_keypoints(self.keypoints, self._stems, size, lambda: zip(indices, masks(), strict=False))
+        indices, size, stored = self._chosen[0], self._material.size, self._material.stored
+        looks = partial(_numbered, indices, masks)
+        found, told = read_keypoints(self.keypoints, self._stems, size, looks, stored)
+        return found, "; ".join(filter(None, ("keypoints stretched like the frames" if stored else "", told)))
 
     @property
     def name(self) -> str:
@@ -158,8 +162,9 @@ class Online(VideoDataset):
             facts = video_facts(self.root)
             fault = f"ffmpeg complains of the video, {len(facts.times)} frames were read: {facts.faults}"
             order = f"time stamps are missing or out of order: {ASSUMED_FPS:g} frames a second assumed"
-            notes = (*((fault,) if facts.faults else ()), *(() if facts.is_stamped else (order,)))
-            return Material((), facts.times, (facts.width, facts.height), facts.has_alpha, notes)
+            notes = (fault if facts.faults else "", "" if facts.is_stamped else order, facts.squared)
+            told, size = tuple(note for note in notes if note), (facts.width, facts.height)
+            return Material((), facts.times, size, facts.has_alpha, told, facts.stored if facts.squared else None)
         inner = (self.root / name for name in ("frames", "images"))
         folder = next((path for path in inner if path.is_dir()), self.root)
         files = tuple(mask_files.list_images(folder, FRAME_SUFFIXES))
@@ -225,7 +230,7 @@ class Online(VideoDataset):
         else:
             every, note = match_masks(found, stems, self._mask_place)
             matched = [every[i] for i in indices]
-        masks = open_masks(matched)
+        masks = replace(open_masks(matched), stored=self._material.stored)
         return masks, "; ".join(filter(None, (note, masks.meaning.note)))
 
     @property
@@ -256,7 +261,7 @@ class Online(VideoDataset):
                 f"{path}: expected a mask for each of the {total} frames of {self.root.name}, got {len(facts.times)}."
             )
         meaning = _film_meaning(path, files_identity(path), tuple(chosen), facts.has_alpha)
-        masks = partial(_mask_stream, path, chosen, self._material.size, facts.has_alpha, meaning)
+        masks = partial(_mask_stream, path, chosen, self._material, facts.has_alpha, meaning)
         return masks, "; ".join(filter(None, (note, meaning.note)))
 
     def _images(self) -> Iterator[np.ndarray]:
@@ -272,6 +277,10 @@ class Online(VideoDataset):
             found, size = zip(chosen, map(read_transparency, chosen), strict=True), self._material.size
             return (None if alpha is None else fit_size(alpha, size, str(file)) for file, alpha in found)
         return (frame[..., 3] for frame in _picked(read_video(self.root), indices))
+
+
+def _numbered(indices: Sequence[int], masks: Masks) -> Iterator[tuple[int, np.ndarray | None]]:
+    return zip(indices, masks(), strict=False)
 
 
 def _thinned(times: list[float], indices: list[int], fps: float) -> list[int]:
@@ -310,7 +319,7 @@ def _film_shades(path: Path, indices: Sequence[int], alpha: bool) -> Iterator[np
 
 
 def _mask_stream(
-    path: Path, indices: Sequence[int], size: tuple[int, int], alpha: bool, meaning: Meaning
+    path: Path, indices: Sequence[int], material: Material, alpha: bool, meaning: Meaning
 ) -> Iterator[np.ndarray | None]:
     for shades in _film_shades(path, indices, alpha):
-        yield fit_size(meaning.mask(shades, None), size, str(path))
+        yield fit_size(meaning.mask(shades, None), material.size, str(path), material.stored)

@@ -56,7 +56,7 @@ def with_parts(video: Video, parts: str, is_named: bool) -> Video:
 
 def _counted(video: Video) -> tuple[int, int]:
     """Return `standing_apart` of a video's masks; kept on disk, because masks may be a long film."""
-    file = cache_folder() / "wild" / f"parts-{digest(video.identity, repr((NOISE, APART, 2)))[:32]}.json"
+    file = cache_folder() / "wild" / f"parts-{digest(video.identity, repr((NOISE, APART, 3)))[:32]}.json"
     if not file.is_file():
         found = standing_apart(video.masks)
         with atomic(file) as path:

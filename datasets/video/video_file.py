@@ -1,5 +1,7 @@
 """Video files, frame by frame with their own time stamps: any codec that ffmpeg knows, turned upright, with alpha.
 
+Pixels are made square: where the header says that they are wider than high, or less, frames are stretched across.
+
 Frames come through a pipe as PAM images, which say their own size; the time stamps come from ffmpeg's `showinfo`, so a
 variable frame rate keeps its times.
 """
@@ -21,6 +23,10 @@ from rewild4d.errors import UserError
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".gif", ".mpg", ".mpeg", ".wmv", ".ts", ".3gp")
 _TIME = re.compile(r"showinfo.*\bn: *\d+ .*\bpts_time:(\S+)")
 _FAULT = re.compile(r"\[(?:error|fatal)\] (.+)")
+_SHAPE = re.compile(r"showinfo.*\bn: *\d+ .*\bs:(\d+)x(\d+)")
+_ASPECT = re.compile(r"Stream #.*Video:.*\bSAR (\d+):(\d+)")
+MOST_ASPECT = 10.0
+"""Width over height of a pixel, or height over width, beyond which a header is wrong."""
 ASSUMED_FPS = 25.0
 """Of a video without time stamps that ascend."""
 
@@ -37,6 +43,7 @@ class VideoFacts:
         faults: what ffmpeg complained of ("" where of nothing).
         is_stamped: whether the times are the file's own; where its stamps are missing or out of order, they are those
             of `ASSUMED_FPS` frames a second.
+        stored: width and height of the upright frames before their pixels were made square.
     """
 
     times: tuple[float, ...]
@@ -45,6 +52,14 @@ class VideoFacts:
     has_alpha: bool
     faults: str
     is_stamped: bool = True
+    stored: tuple[int, int] = (0, 0)
+
+    @property
+    def squared(self) -> str:
+        """A sentence where the pixels were made square; "" where they were."""
+        if self.stored == (self.width, self.height):
+            return ""
+        return f"pixels made square: {self.stored[0]}x{self.stored[1]} stretched to {self.width}x{self.height}"
 
 
 def read_video(path: Path) -> Iterator[np.ndarray]:
@@ -83,7 +98,9 @@ def _facts(path: Path, size: int, changed: int) -> VideoFacts:
         raise UserError(f"{path}: expected a video that ffmpeg can read, got {_complaint(said) or 'no frame'}.")
     times = ascending(re.findall(_TIME, said), count)
     assumed = tuple(i / ASSUMED_FPS for i in range(count))
-    return VideoFacts(times or assumed, width, height, has_alpha, _complaint(said), times is not None)
+    shape = re.search(_SHAPE, said)
+    stored = (int(shape[1]), int(shape[2])) if shape else (width, height)
+    return VideoFacts(times or assumed, width, height, has_alpha, _complaint(said), times is not None, stored)
 
 
 def ascending(stamps: list[str], count: int) -> tuple[float, ...] | None:
@@ -104,10 +121,11 @@ def _complaint(said: str) -> str:
 
 def _frames(path: Path, log: IO[str]) -> Iterator[np.ndarray]:
     """Decode; ffmpeg's words go to ``log``."""
+    decoder, square = _header(path)
     command = [
         imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-nostats", "-loglevel", "level+info",
-        *_decoder(path), "-i", f"file:{path}", "-map", "0:v:0", "-fps_mode", "passthrough",
-        "-vf", "showinfo=checksum=0", "-pix_fmt", "rgba", "-c:v", "pam", "-f", "image2pipe", "-",
+        *decoder, "-i", f"file:{path}", "-map", "0:v:0", "-fps_mode", "passthrough",
+        "-vf", f"showinfo=checksum=0{square}", "-pix_fmt", "rgba", "-c:v", "pam", "-f", "image2pipe", "-",
     ]  # fmt: skip
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log) as process:
         assert process.stdout is not None
@@ -131,10 +149,23 @@ def _pam(pipe: IO[bytes]) -> np.ndarray | None:
 
 
 @lru_cache(maxsize=8)
-def _decoder(path: Path) -> tuple[str, ...]:
-    """ffmpeg's own VP8 and VP9 decoders drop the alpha channel; libvpx keeps it."""
+def _header(path: Path) -> tuple[tuple[str, ...], str]:
+    """Return the decoder that the header asks for, and the filter that makes pixels square ("" where they are).
+
+    ffmpeg's own VP8 and VP9 decoders drop the alpha channel; libvpx keeps it.
+
+    Raises:
+        UserError: pixels of a shape that no camera has.
+    """
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-i", f"file:{path}"]
     said = subprocess.run(command, capture_output=True, text=True, errors="replace").stderr
+    decoder: tuple[str, ...] = ()
     if re.search(r"alpha_mode\s*: 1", said, re.IGNORECASE):
-        return "-c:v", "libvpx-vp9" if "Video: vp9" in said else "libvpx"
-    return ()
+        decoder = ("-c:v", "libvpx-vp9" if "Video: vp9" in said else "libvpx")
+    aspect = re.search(_ASPECT, said)
+    across, down = (int(aspect[1]), int(aspect[2])) if aspect else (1, 1)
+    if across == down or not across or not down:
+        return decoder, ""
+    if not 1 / MOST_ASPECT <= across / down <= MOST_ASPECT:
+        raise UserError(f"{path}: expected pixels that are about square, got some of {across}:{down}.")
+    return decoder, ",scale=w='max(1,round(iw*sar))':h=ih,setsar=1"  # turned frames have their own ratio

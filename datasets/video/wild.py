@@ -31,7 +31,7 @@ TWIN = 0.5
 """A second part above this share of the largest may be a second animal."""
 LOST = 0.02
 """Share of the animal outside the crop of a held-out frame above which it is told."""
-_CACHE_VERSION = "3"
+_CACHE_VERSION = "4"
 
 Masks = Callable[[], Iterator[np.ndarray | None]]
 

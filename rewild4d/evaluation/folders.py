@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from rewild4d.datasets.video.footage import open_footage
+from rewild4d.datasets.video.video_file import video_facts
 from rewild4d.evaluation.image_scores import (
     measure,
     needs,
@@ -75,6 +76,8 @@ def score_pictures(
         notes += seen
         sides[0] = tuple(match.prediction for match in matches)
     rates = {reel.fps for side in sides for reel in side if reel.fps} or ({fps} if fps else set())
+    reels = (reel for side in sides for reel in side if not reel.files)
+    notes += [f"{reel.path}: {told}" for reel in reels if (told := video_facts(reel.path).squared)]
     if len(rates) > 1:
         notes.append(f"frame rates differ: {', '.join(f'{rate:g}' for rate in sorted(rates))}")
     conditions = Conditions(f"{background:g} behind alpha", fps=min(rates) if len(rates) == 1 else None)

@@ -35,8 +35,8 @@ def read(masks: MaskFiles, object_id: int | None = None, index: int = 0) -> np.n
 
 @pytest.mark.parametrize(
     ("value", "dtype"),
-    [(128, np.uint8), (38, np.uint8), (100, np.uint8), (40, np.uint8), (200, np.uint8), (254, np.uint8), (100, np.uint16),
-     (2001, np.uint16), (24001, np.uint16), (40000, np.uint16)],
+    [(128, np.uint8), (38, np.uint8), (100, np.uint8), (40, np.uint8), (200, np.uint8), (254, np.uint8),
+     (100, np.uint16), (2001, np.uint16), (24001, np.uint16), (40000, np.uint16)],
 )  # fmt: skip
 def test_the_one_value_of_a_folder_is_the_animal(value: int, dtype: type, tmp_path: Path) -> None:
     masks = opened(tmp_path, values(value, dtype=dtype), values(0, dtype=dtype))
