@@ -4,13 +4,14 @@ A command's module is imported when the command is called, and each imports what
 and misspelt words wait for neither torch nor numba.
 """
 
+import errno
 import io
 import os
 import signal
 import sys
 
 from rewild4d import __version__
-from rewild4d.errors import UserError, unknown_name
+from rewild4d.errors import UserError, shown, unknown_name
 from rewild4d.running.interrupts import STATUS, answer_interrupts
 
 COMMANDS = {
@@ -55,6 +56,14 @@ def main(arguments: list[str] | None = None) -> None:
         status = 0
     except UserError as error:
         print(f"rewild4d-bench: {error}", file=sys.stderr)
+        status = 2
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        refused = UserError(
+            f"{shown(error.filename, 200)}: expected a shorter name: the file system takes none of this length."
+        )
+        print(f"rewild4d-bench: {refused}", file=sys.stderr)
         status = 2
     except KeyboardInterrupt:
         status = STATUS

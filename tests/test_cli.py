@@ -120,3 +120,8 @@ def test_a_setting_out_of_its_range_is_a_sentence(
         cli.main(["run", "--method", "ours", "--dataset", "artemis", *words])
     said = capsys.readouterr().err
     assert (stop.value.code, sentence in said, len(said.strip().splitlines())) == (2, True, 1)
+
+
+def test_a_name_that_no_file_can_have_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    said = refused(capsys, "run", "--dataset", "online", "--video", 300 * "x", "--masks", "m")
+    assert "expected a shorter name: the file system takes none of this length" in said and len(said) <= 400 + 20

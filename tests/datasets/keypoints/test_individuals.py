@@ -172,7 +172,7 @@ def test_coco_that_other_programs_write(change: dict[str, object], tmp_path: Pat
         ("a.csv", b"frame_idx,nose.x,nose.y\n0,1,x\n", r"got others \('x' for a number in row 2, nose\.y\)"),
         ("a.csv", b"frame_idx,nose.x,nose.y\n0.5,1,2\n", r"got others \('0\.5' for the number of a frame in row 2\)"),
         ("a.csv", HEAD.replace("y,", "z,").encode(), "got others .no columns x and y of 'a1 nose'"),
-        ("a.csv", b"\xff\xfea", "got others .byte 0x61 at position 0 is no UTF-16.* text"),
+        ("a.csv", b"\xff\xfea", "got others .byte 0x61 at position 2 is no UTF-16.* text"),
         ("a.csv", b"time,speed\n1,2\n", r"got others \(a table that begins with 'time,speed'\)"),
         ("a.json", b'{"a": "' + 9999 * b"\xe9" + b'"}', "got others .byte 0xe9 at position 7 is no UTF-8 text"),
         ("a.json", 9999 * b"[", r"it cannot be parsed \(nested too deeply\)"),

@@ -1,4 +1,4 @@
-"""Videos whose pixels are not square are stretched to what people see, masks and keypoints with them, and it is told."""
+"""Videos whose pixels are not square are stretched to what people see, masks and keypoints too, and it is told."""
 
 from pathlib import Path
 
