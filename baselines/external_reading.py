@@ -12,7 +12,8 @@ from torch.nn.functional import grid_sample, normalize
 from rewild4d.baselines.external_gltf import read_animation
 from rewild4d.errors import UserError
 from rewild4d.io.meshes import Discs, Mesh, discs, read_mesh
-from rewild4d.io.ply import read_splats
+from rewild4d.io.ply import holds_gaussians, read_splats
+from rewild4d.reading import require_file
 from rewild4d.transforms import split_similarity
 from rewild4d.types import Camera, Frame, Splats
 
@@ -125,12 +126,17 @@ def _area(mesh: Mesh) -> float:
 
 
 def _holds_splats(path: Path) -> bool:
-    """Tell whether a PLY file's header names the properties of Gaussians."""
+    """Tell whether a PLY file's header names properties of Gaussians, of whatever kind."""
+    require_file(path, "a PLY file that can be read")
     try:
         with path.open("rb") as file:
-            return b"f_dc_0" in file.read(1 << 14).split(b"end_header")[0]
+            header = file.read(1 << 14).split(b"end_header")[0]
     except OSError as error:
         raise UserError(f"{path}: expected a PLY file that can be read, but: {error.strerror}.") from error
+    names = (
+        line.split()[-1] for line in header.decode("ascii", "replace").splitlines() if line.startswith("property ")
+    )
+    return holds_gaussians(names)
 
 
 def _some(path: Path, splats: Splats) -> Splats:

@@ -30,6 +30,8 @@ FILM = 8
 """A film whose frames are held together may take this many times as much."""
 PIXEL = 16
 """Bytes that one pixel of a picture takes while it is read: four channels in single precision."""
+TEXT = 8
+"""Numbers written as text take this many times their size while they are parsed."""
 MOST_AXES = 32
 ZIP_FAULTS = (
     zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, OverflowError, LookupError,
@@ -92,6 +94,13 @@ def require_file(path: Path, kind: str) -> None:
         came = "Is a directory" if stat.S_ISDIR(state.st_mode) else "it is a device or a pipe"
         raise UserError(f"{path}: expected {kind}, but: {came}.")
     require_room(path, state.st_size, kind)
+
+
+def read_numbers(path: Path, kind: str) -> bytes:
+    """Return the content of a file of numbers written as text; errors as of `read_bytes`, after they are parsed."""
+    data = read_bytes(path, kind)
+    require_room(path, TEXT * len(data), kind)
+    return data
 
 
 def require_there(path: Path, kind: str) -> None:

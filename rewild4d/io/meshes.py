@@ -13,10 +13,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from rewild4d.errors import UserError
-from rewild4d.io.ply import LARGEST, require_at_most
-from rewild4d.io.ply import read_mesh as read_ply_mesh
-from rewild4d.io.ply_elements import read_elements
+from rewild4d.io.ply import LARGEST, ROUNDING, read_colored_mesh, require_at_most
 from rewild4d.priors.motion import quats_from_normals
+from rewild4d.reading import beside, picture_size, read_bytes, read_numbers
 from rewild4d.types import Splats
 
 THICKNESS = 0.3
@@ -74,13 +73,7 @@ def read_mesh(path: Path) -> Mesh:
     if path.suffix.lower() == ".obj":
         mesh = _read_obj(path)
     elif path.suffix.lower() == ".ply":
-        vertices, faces = read_ply_mesh(path)
-        columns = read_elements(path)["vertex"].columns
-        named = [columns.get(name) for name in ("red", "green", "blue")]
-        colors = None
-        if all(column is not None for column in named):
-            whole = np.stack([np.asarray(column) for column in named], axis=1)
-            colors = torch.from_numpy(whole / 255.0 if whole.dtype == np.uint8 else whole).float().clamp(0, 1)
+        vertices, faces, colors = read_colored_mesh(path)
         mesh = Mesh(vertices.float(), faces, colors)
     else:
         raise UserError(f"{path}: expected a mesh as .obj or .ply, got '{path.suffix}'.")
@@ -140,10 +133,7 @@ def _colors(mesh: Mesh, face: Tensor, shares: Tensor) -> Tensor | None:
 
 def _read_obj(path: Path) -> Mesh:
     """Return vertices (with colours behind the position where a program writes them), faces, one texture."""
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise UserError(f"{path}: expected an OBJ file that can be read, but: {error.strerror}.") from error
+    lines = read_numbers(path, "an OBJ file that can be read").decode("utf-8", errors="replace").splitlines()
     rows: dict[str, list[list[float]]] = {"v": [], "vt": []}
     faces: list[tuple[int, int, int]] = []
     places: list[tuple[int, int, int]] = []
@@ -184,7 +174,7 @@ def _mesh(
     values = torch.tensor([row[:3] for row in rows["v"]])
     _require_finite(path, "coordinates", values, "vertex")
     indices = _corners(path, faces, len(values), "vertices")
-    colors = torch.tensor([row[3:6] for row in rows["v"]]).clamp(0, 1) if widths == {6} else None
+    colors = _vertex_colors(path, rows["v"]) if widths == {6} else None
     texture = _texture(path, library) if places and len(places) == len(faces) else None
     if texture is None:
         return Mesh(values, indices, colors)
@@ -197,6 +187,17 @@ def _mesh(
     uv = torch.tensor([row[:2] for row in rows["vt"]])
     _require_finite(path, "texture coordinates", uv, "vt")
     return Mesh(values, indices, None, uv[corners], texture)  # programs that write both say one thing twice
+
+
+def _vertex_colors(path: Path, rows: list[list[float]]) -> Tensor:
+    """Return the RGB that stands behind each vertex, [n, 3]."""
+    colors = torch.tensor([row[3:6] for row in rows])
+    _require_finite(path, "colours", colors, "vertex")
+    off = (((colors < -ROUNDING) | (colors > 1 + ROUNDING)).any(1)).nonzero()
+    if len(off):
+        row = int(off[0])
+        raise UserError(f"{path}: expected colours in [0, 1], got {float(colors[row].max()):g} in vertex {row}.")
+    return colors.clamp(0, 1)
 
 
 def _corners(path: Path, triples: list[tuple[int, int, int]], count: int, what: str) -> Tensor:
@@ -214,15 +215,17 @@ def _require_finite(path: Path, what: str, values: Tensor, row: str) -> None:
 
 def _texture(path: Path, library: str) -> Tensor | None:
     """Read the first picture of the material library; a missing library counts as none (3D-Fauna)."""
-    materials = path.parent / library
-    if not library or not materials.is_file():
+    if not library or not (materials := beside(path, library)).is_file():
         return None
-    for line in materials.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in read_numbers(materials, "materials").decode("utf-8", errors="replace").splitlines():
         found = re.match(r"\s*map_Kd\s+(?:-\S+\s+\S+\s+)*(.+?)\s*$", line)
         if found:
-            picture = path.parent / found[1]
-            pixels = cv2.imread(str(picture), cv2.IMREAD_COLOR)
+            picture = beside(path, found[1])
+            wanted = f"the texture of {path.name}"
+            data = read_bytes(picture, wanted)
+            picture_size(picture, data)
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
             if pixels is None:
-                raise UserError(f"{picture}: expected the texture of {path.name}, but it cannot be read as a picture.")
+                raise UserError(f"{picture}: expected {wanted}, but it cannot be read as a picture.")
             return torch.from_numpy(np.ascontiguousarray(pixels[..., ::-1])).float() / 255
     return None

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rewild4d.errors import UserError
-from rewild4d.reading import read_bytes
+from rewild4d.reading import TEXT, read_bytes, require_room
 
 TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -28,7 +28,7 @@ class Element:
 
     Attributes:
         count: rows.
-        columns: scalar properties, each [count].
+        columns: scalar properties, each [count]; integers have the type that the header declares, in ASCII files too.
         lists: list properties: length of each row, int64, [count], and all entries one after another.
     """
 
@@ -122,7 +122,7 @@ class _Body(ABC):
                 parts[item.name].append(self._take(item.type, entries))
         element = Element(count)
         for item in properties:
-            joined = np.concatenate(parts[item.name])
+            joined = self._typed(item, np.concatenate(parts[item.name]))
             if item.length:
                 element.lists[item.name] = (np.array(lengths[item.name], dtype=np.int64), joined)
             else:
@@ -134,6 +134,10 @@ class _Body(ABC):
         if not length.is_integer() or length < 0:
             raise UserError(f"{self.path}: expected lists of zero or more entries, got one of {length:g}.")
         return int(length)
+
+    def _typed(self, item: _Property, values: np.ndarray) -> np.ndarray:
+        """Return values in the type that the header declares."""
+        return values
 
     @abstractmethod
     def _table(self, count: int, properties: list[_Property]) -> dict[str, np.ndarray]:
@@ -168,6 +172,7 @@ class _Binary(_Body):
 class _Ascii(_Body):
     def __init__(self, path: Path, body: bytes) -> None:
         super().__init__(path)
+        require_room(path, TEXT * len(body), "an ASCII PLY file")
         try:
             self._values = np.array(body.split(), dtype=np.float64)
         except ValueError as error:
@@ -176,7 +181,18 @@ class _Ascii(_Body):
 
     def _table(self, count: int, properties: list[_Property]) -> dict[str, np.ndarray]:
         table = self._take("f8", count * len(properties)).reshape(count, len(properties))
-        return {item.name: table[:, index] for index, item in enumerate(properties)}
+        return {item.name: self._typed(item, table[:, index]) for index, item in enumerate(properties)}
+
+    def _typed(self, item: _Property, values: np.ndarray) -> np.ndarray:
+        """Integers become what the header declares: their range says what they mean."""
+        if item.type.startswith("f"):
+            return values
+        limits = np.iinfo(item.type)
+        fits = (values >= limits.min) & (values <= limits.max) & (values == np.floor(values))
+        if not fits.all():
+            wanted = f"whole numbers from {limits.min} to {limits.max} in '{item.name[:40]}', as its type says"
+            raise UserError(f"{self.path}: expected {wanted}, got {values[~fits][0]:g}.")
+        return values.astype(item.type)
 
     def _take(self, kind: str, count: int) -> np.ndarray:
         end = self._place + count
