@@ -6,6 +6,7 @@ import msgspec
 
 from rewild4d.contracts import MethodInfo
 from rewild4d.ours.config import Count, Positive
+from rewild4d.programs import TIMEOUT
 
 INFO = MethodInfo(title="anybody's program, by files", paper="that of the program", licence="that of the program")
 
@@ -28,5 +29,5 @@ class ExternalConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     """Axis of its results that points up, where they are rotated; "any" tries all three."""
     points: Count = 20_000
     """Gaussians on a mesh."""
-    timeout: Positive = 6 * 3600.0
-    """Seconds that the program may take."""
+    timeout: Positive = TIMEOUT
+    """Seconds that the program may take; then it is killed with all that it started."""

@@ -5,9 +5,7 @@ import math
 import os
 import re
 import shutil
-import signal
 import string
-import subprocess
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +20,7 @@ from rewild4d.baselines.external_profiles import Profile
 from rewild4d.errors import UserError
 from rewild4d.files import command_words, digest, write_text
 from rewild4d.priors.io import save_prior
+from rewild4d.programs import run_foreign
 from rewild4d.types import Clip, Frame, Prior
 
 CROP = 256
@@ -127,42 +126,18 @@ def run_program(command: str, *, clip: Path, out: Path, case: str, seed: int, ti
         case: name of the case.
         seed: of the run.
         timeout: seconds.
-        log: file for what it prints.
+        log: file for what it prints; of more than `programs.HEAD` + 2 `programs.TAIL` bytes the middle is left out.
 
     Raises:
         UserError: it cannot be started, does not end in time, or ends with another status than 0.
     """
     words = _words(command, {"clip": str(clip), "out": str(out), "case": case, "seed": str(seed)})
     out.mkdir(parents=True, exist_ok=True)
-    with log.open("wb") as file:
-        try:
-            process = subprocess.Popen(
-                words, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, start_new_session=True
-            )
-        except OSError as error:
-            raise UserError(
-                f"--command: expected a program that can be started, but '{words[0]}': {error.strerror}."
-            ) from error
-        try:
-            status = process.wait(timeout)
-        except subprocess.TimeoutExpired as error:
-            raise UserError(
-                f"{words[0]}: expected an end within {timeout:g} s, but it was still running (log: {log})."
-            ) from error
-        finally:
-            if process.poll() is None:
-                _kill_with_children(process)
-    if status != 0:
-        raise UserError(f"{words[0]}: ended with status {status}; its last words: '{_last_words(log)}' (log: {log}).")
-
-
-def _kill_with_children(process: subprocess.Popen[bytes]) -> None:
-    """Kill a program that was started in a session of its own; Windows has none, and its children go on."""
-    if hasattr(os, "killpg"):
-        os.killpg(process.pid, signal.SIGKILL)
-    else:
-        process.kill()
-    process.wait()
+    ended = run_foreign(words, timeout=timeout, log=log)
+    if ended.status != 0:
+        raise UserError(
+            f"{words[0]}: ended with status {ended.status}; its last words: '{ended.said or 'none'}' (log: {log})."
+        )
 
 
 def _words(command: str, given: Mapping[str, str]) -> list[str]:
@@ -237,11 +212,6 @@ def number(path: Path) -> int:
     """Return the last number in a file's name, -1 where there is none."""
     digits = re.findall(r"\d+", path.stem)
     return int(digits[-1]) if digits else -1
-
-
-def _last_words(log: Path) -> str:
-    lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
-    return lines[-1][:200] if lines else "none"
 
 
 def _write_crop(folder: Path, name: str, frame: Frame) -> None:

@@ -5,7 +5,6 @@ frames/00000.png, ..., it writes masks/00000.png, ..., and a command line joins 
 """
 
 import math
-import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import numpy as np
 from rewild4d.datasets.masking.masks import list_images, match_masks, open_masks
 from rewild4d.errors import UserError
 from rewild4d.files import atomic, command_words
+from rewild4d.programs import TIMEOUT, run_foreign
 
 Box = tuple[float, float, float, float]
 """Left, top, width, height in pixels."""
@@ -66,12 +66,13 @@ def write_masks(source: Unmasked, maker: MaskMaker, folder: Path) -> tuple[list[
     return paths, empty
 
 
-def run_program(command: str) -> MaskMaker:
+def run_program(command: str, timeout: float = TIMEOUT) -> MaskMaker:
     """Return any program as a maker of masks.
 
     Args:
         command: with {frames} and {masks} in it, for the folders that it reads and writes; {boxes}, if it is there,
             stands for a text file with lines "frame left top width height".
+        timeout: seconds that the program may take.
 
     Raises:
         UserError: a command without {frames} or {masks}, or with another name in braces.
@@ -95,7 +96,7 @@ def run_program(command: str) -> MaskMaker:
                 _write(places["frames"] / f"{stem}.png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
             lines = [f"{index} {' '.join(f'{x:g}' for x in box)}\n" for index, box in sorted(source.boxes.items())]
             places["boxes"].write_text("".join(lines), encoding="utf-8")
-            _call([word.format(**places) for word in words])
+            _call([word.format(**places) for word in words], timeout)
             written = list_images(places["masks"])
             if not written:
                 raise UserError(f"{words[0]}: expected a mask for each of {len(stems)} frames, but it wrote none.")
@@ -115,14 +116,11 @@ def run_program(command: str) -> MaskMaker:
     return maker
 
 
-def _call(words: list[str]) -> None:
-    try:
-        done = subprocess.run(words, capture_output=True, text=True, errors="replace", stdin=subprocess.DEVNULL)
-    except OSError as error:
-        raise UserError(f"{words[0]}: expected a program that can be run, but: {error.strerror}.") from error
-    if done.returncode:
-        said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1].rstrip(".")
-        raise UserError(f"{words[0]}: the program ended with status {done.returncode} and said: {said}.")
+def _call(words: list[str], timeout: float) -> None:
+    ended = run_foreign(words, timeout=timeout)
+    if ended.status:
+        said = (ended.said or "nothing").rstrip(".")
+        raise UserError(f"{words[0]}: the program ended with status {ended.status} and said: {said}.")
 
 
 def parse_boxes(texts: tuple[str, ...], count: int) -> dict[int, Box]:

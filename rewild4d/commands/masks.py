@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rewild4d.commands.shared import open_dataset, require_writable
+from rewild4d.commands.shared import check_timeout, open_dataset, require_writable
 from rewild4d.config import parse_flags
 from rewild4d.datasets.masking import DETECTOR, SEGMENTER
 from rewild4d.errors import UserError, unknown_name
+from rewild4d.programs import TIMEOUT
 
 if TYPE_CHECKING:
     import torch
@@ -39,6 +40,7 @@ class Options:
         fps: how many of them a second.
         box: around the animal, in pixels: left,top,width,height in the first frame; more of them as frame:left,...
         command: for program: a command line with {frames} and {masks} (and {boxes}) in it.
+        timeout: for program: seconds that it may take; then it is killed with all that it started.
         text: for grounded-sam2: what the animal is called.
         detector: for grounded-sam2: name or folder of a Grounding DINO model.
         segmenter: for grounded-sam2: name or folder of a SAM 2 model.
@@ -56,6 +58,7 @@ class Options:
     fps: float | None = None
     box: tuple[str, ...] = ()
     command: str | None = None
+    timeout: float = TIMEOUT
     text: str = "animal"
     detector: str = DETECTOR
     segmenter: str = SEGMENTER
@@ -64,6 +67,7 @@ class Options:
 
 def main(arguments: list[str]) -> int:
     options = parse_flags(Options, arguments, prog="rewild4d-bench masks", description=DESCRIPTION)
+    check_timeout(options.timeout)
     from rewild4d.datasets.masking.makers import parse_boxes, write_masks
     from rewild4d.datasets.masking.masks import list_images
     from rewild4d.datasets.video.mask_check import SPLIT
@@ -106,7 +110,7 @@ def make_maker(options: Options, device: torch.device) -> MaskMaker:
     if options.tool == "program":
         if not options.command:
             raise UserError("--command: expected a command line with {frames} and {masks} in it, got none.")
-        return run_program(options.command)
+        return run_program(options.command, options.timeout)
     if options.tool == "grounded-sam2":
         return grounded_masks(options.text, options.detector, options.segmenter, device)
     return rough_masks

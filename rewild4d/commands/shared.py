@@ -114,6 +114,12 @@ def check_numbers(jobs: int, threads: int) -> None:
             raise UserError(f"{flag}: expected a number of at least {least}, got {value}.")
 
 
+def check_timeout(seconds: float) -> None:
+    """Fail on a time in which nothing can end."""
+    if seconds <= 0:
+        raise UserError(f"--timeout: expected more than 0 seconds, got {seconds:g}.")
+
+
 def check_seeds(seeds: Sequence[int]) -> None:
     """Fail on a seed that a random generator does not take."""
     for seed in seeds:

@@ -77,7 +77,10 @@ def test_any_program_through_folders(tmp_path: Path) -> None:
         ("mytool {frames} {masks} {frames.y}", "expected a command line with {frames}, {masks}, {boxes} in it"),
         ("mytool {frames} {masks} {boxes[0]}", "expected a command line with {frames}, {masks}, {boxes} in it"),
         ("mytool {frames} {out}", "expected a command line with {frames}, {masks}, {boxes} in it"),
-        ("/no/such/tool {frames} {masks}", "/no/such/tool: expected a program that can be run, but: No such file"),
+        (
+            "/no/such/tool {frames} {masks}",
+            "--command: expected a program that can be started, but '/no/such/tool': No such file",
+        ),
         ("sh -c 'echo no GPU >&2; exit 3' {frames} {masks}", "ended with status 3 and said: no GPU"),
         ("sh -c 'true' {frames} {masks}", "sh: expected a mask for each of 12 frames, but it wrote none"),
         ("sh -c 'cp $0/00000.png $1/' {frames} {masks}", "expected a mask for each of 12 frames, but 11 are missing"),
@@ -87,6 +90,16 @@ def test_programs_that_do_not_work(command: str, sentence: str) -> None:
     with pytest.raises(UserError) as error:
         list(run_program(command)(source()))
     assert sentence in str(error.value)
+
+
+def test_a_program_that_does_not_end_is_ended(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(UserError, match="^sh: expected an end within 0.2 s, but it was still running; --timeout"):
+        list(run_program("sh -c 'sleep 60' {frames} {masks}", timeout=0.2)(source()))
+    words = ["masks", "--video", str(tmp_path), "--out", str(tmp_path / "m"), "--tool", "program", "--command"]
+    with pytest.raises(SystemExit) as stop:
+        cli.main([*words, "x {frames} {masks}", "--timeout", "0"])
+    assert stop.value.code == 2
+    assert "--timeout: expected more than 0 seconds, got 0." in capsys.readouterr().err
 
 
 def test_boxes_of_the_command_line() -> None:
