@@ -1,21 +1,20 @@
 """Records as data for a repository: small, without paths, with the few pictures that a page needs."""
 
 import json
+import os
 import re
-import shutil
-import subprocess
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import imageio_ffmpeg
 import msgspec
 from PIL import Image
 
 from rewild4d.errors import UserError
-from rewild4d.files import replaced_folder
+from rewild4d.files import regular_inside, replaced_folder
 from rewild4d.leaderboard.curves import MOMENT, moments
+from rewild4d.leaderboard.media import TIMEOUT, open_picture, publish, recode
 from rewild4d.leaderboard.privacy import without_paths
 from rewild4d.leaderboard.records import FILE, RunRecord
 from rewild4d.leaderboard.variants import by_protocol, grouped, latest, variants
@@ -27,6 +26,9 @@ MARKER = "collection.json"
 RUN_BYTES = 150_000
 """Most that the files of one run may take."""
 PICTURE_WIDTH, VIDEO_WIDTH = 960, 320
+SMALLER = ("-vf", f"scale='min({VIDEO_WIDTH},iw)':-2", "-c:v", "libx264", "-crf", "30", "-preset", "slow", "-pix_fmt",
+           "yuv420p", "-threads", "1")  # fmt: skip
+"""ffmpeg's options for a film of a few tens of kilobytes."""
 DIGITS = 4
 """Significant digits of the value of a single image; means are kept whole."""
 NOTE = (
@@ -62,7 +64,9 @@ class Collection:
     remarks: list[str] = field(default_factory=list)
 
 
-def collect(found: Sequence[Found], out: Path, *, title: str, pictures: str = "open", limit: float) -> Collection:
+def collect(
+    found: Sequence[Found], out: Path, *, title: str, pictures: str = "open", limit: float, timeout: float = TIMEOUT
+) -> Collection:
     """Write the records and the pictures of the first seed of every row; an earlier collection there is replaced.
 
     Args:
@@ -71,13 +75,15 @@ def collect(found: Sequence[Found], out: Path, *, title: str, pictures: str = "o
         title: heading of the page's part.
         pictures: "open" (of data that may be passed on), "all" or "none".
         limit: most bytes in all.
+        timeout: seconds that reading and coding one film may take.
 
     Raises:
-        UserError: the folder holds something else or cannot be written, or the files are too large in all.
+        UserError: the folder holds something else or cannot be written, the files are too large in all, or a picture or
+            film is damaged or no regular file of its run's folder.
     """
     made = Collection(out)
     with replaced_folder(out, MARKER, "an earlier collection") as building:
-        _write(found, building, pictures, made)
+        _write(found, building, pictures, made, timeout)
         about = {"title": title, "runs": made.runs, "with_pictures": made.pictured, "note": NOTE}
         (building / MARKER).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
         made.size = sum(path.stat().st_size for path in building.rglob("*") if path.is_file())
@@ -96,12 +102,13 @@ def title_of(folder: Path) -> str:
         UserError: the file that should hold the title does not.
     """
     path = folder / MARKER
-    if not path.is_file():
+    if not os.path.lexists(path):
         return folder.resolve().name
+    regular_inside(path, folder)
     return read_json(path, "the title of a collection", _Titled).title
 
 
-def _write(found: Sequence[Found], folder: Path, pictures: str, made: Collection) -> None:
+def _write(found: Sequence[Found], folder: Path, pictures: str, made: Collection, timeout: float) -> None:
     folders = {record.run_id: source for source, record in found}
     for group in by_protocol([record for _, record in found]):
         kept, remarks = latest(list({record.run_id: record for record in group}.values()))
@@ -111,16 +118,18 @@ def _write(found: Sequence[Found], folder: Path, pictures: str, made: Collection
             source = folders[record.run_id]
             place = folder / _place(record)
             shown = record.run_id in first and _may_show(record, pictures, made)
-            _write_run(source, record, place, record.run_id in first, shown, made)
+            _write_run(source, record, place, record.run_id in first, shown, made, timeout)
 
 
-def _write_run(source: Path, record: RunRecord, place: Path, whole: bool, shown: bool, made: Collection) -> None:
+def _write_run(
+    source: Path, record: RunRecord, place: Path, whole: bool, shown: bool, made: Collection, timeout: float
+) -> None:
     if place.exists():
         raise UserError(f"{source}: expected a run of its own, but there is another one called {place.name}.")
     place.mkdir(parents=True)
     names = []
     if shown:
-        names = [name for name in (_picture(source, place), _video(source, place)) if name]
+        names = [name for name in (_picture(source, place), _video(source, place, timeout)) if name]
     small = rounded(without_paths(record) if whole else per_moment(without_paths(record)))
     text = compact(msgspec.structs.replace(small, pictures=names))
     while names and len(text.encode()) + sum((place / name).stat().st_size for name in names) > RUN_BYTES:
@@ -157,36 +166,31 @@ def _may_show(record: RunRecord, pictures: str, made: Collection) -> bool:
 
 def _picture(source: Path, place: Path) -> str:
     """Save the comparison as a small WebP."""
-    target = place / "comparison.webp"
-    if (source / target.name).is_file():
-        shutil.copyfile(source / target.name, target)
-    elif (source / "comparison.png").is_file():
-        try:
-            with Image.open(source / "comparison.png") as image:
-                scale = min(1.0, PICTURE_WIDTH / image.width)
-                size = round(image.width * scale), round(image.height * scale)
-                small = image.convert("RGB").resize(size, Image.Resampling.LANCZOS)
-        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-            raise UserError(f"{source / 'comparison.png'}: expected a picture, got a damaged one ({error}).") from error
-        small.save(target, quality=75, method=6)
+    target, large = place / "comparison.webp", source / "comparison.png"
+    if os.path.lexists(source / target.name):
+        publish(source / target.name, source, target)
+    elif os.path.lexists(large):
+        regular_inside(large, source)
+        image = open_picture(large, "PNG", large)
+        scale = min(1.0, PICTURE_WIDTH / image.width)
+        size = max(1, round(image.width * scale)), max(1, round(image.height * scale))
+        image.convert("RGB").resize(size, Image.Resampling.LANCZOS).save(target, quality=75, method=6)
     return target.name if target.is_file() else ""
 
 
-def _video(source: Path, place: Path) -> str:
-    """Save the orbit as a small H.264 film; one that is small already is copied."""
+def _video(source: Path, place: Path, timeout: float) -> str:
+    """Save the orbit as a small H.264 film; the images of one that is small already are copied."""
     film, target = source / "orbit.mp4", place / "orbit.mp4"
-    if not film.is_file():
+    if not os.path.lexists(film):
         return ""
+    regular_inside(film, source)
     if film.stat().st_size <= RUN_BYTES // 3:
-        shutil.copyfile(film, target)
-        return target.name
-    words = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(film), "-threads", "1", "-an",
-             "-vf", f"scale='min({VIDEO_WIDTH},iw)':-2", "-c:v", "libx264", "-crf", "30", "-preset", "slow",
-             "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-map_metadata", "-1", "-fflags", "+bitexact",
-             str(target)]  # fmt: skip
-    done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
-    if done.returncode:
-        raise UserError(f"{film}: the film could not be made smaller: {(done.stderr.splitlines() or ['?'])[-1]}.")
+        publish(film, source, target, timeout)
+    else:
+        coded = place / "coded.mp4"
+        recode(film, coded, SMALLER, timeout)
+        publish(coded, place, target, timeout)  # so that a collection of a collection has the same bytes
+        coded.unlink()
     return target.name
 
 

@@ -15,6 +15,10 @@ from rewild4d.leaderboard.layout import Cell, Row, Table
 if TYPE_CHECKING:
     import pandas as pd
 
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
+"""Ends of lines, which end a table, and what a terminal takes for commands."""
+_UNNAMED = re.compile(r"[^A-Za-z0-9:._-]+")
+"""What no label of LaTeX has."""
 EDGE = ' class="edge"'
 ARROWS = {"higher": "↑", "lower": "↓", "": ""}
 TEX_SIGNS = str.maketrans({
@@ -27,10 +31,11 @@ TEX_SIGNS = str.maketrans({
 def markdown(table: Table) -> str:
     """Write GitHub's Markdown; it has no underline, so the second best is in italics."""
     heads = [*table.stubs, *(" ".join(filter(None, (c.group, c.title, ARROWS[c.better]))) for c in table.columns)]
+    heads = [plain(head) for head in heads]
     ruler = ["---"] * len(table.stubs) + ["---:"] * len(table.columns)
     rows = [heads, ruler, *([*stubs, *cells] for _, stubs, cells in _MARKDOWN.rows(table))]
-    lines = ["| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in row) + " |" for row in rows]
-    caption = f"**{table.title}**" + (f" ({table.caption})" if table.caption else "")
+    lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
+    caption = f"**{plain(table.title)}**" + (f" ({plain(table.caption)})" if table.caption else "")
     return "\n".join([caption, "", *lines, *(f"\n{line}" for line in _MARKDOWN.notes(table))])
 
 
@@ -40,7 +45,8 @@ def latex(table: Table) -> str:
     lines = [
         r"\begin{table}", r"\centering\small\setlength{\tabcolsep}{4pt}",
         rf"\caption{{{_tex(table.title)}. {_tex(table.caption)}}}",
-        rf"\label{{tab:{table.name}}}", rf"\begin{{tabular}}{{{'l' * len(table.stubs)}{'r' * len(table.columns)}}}",
+        rf"\label{{tab:{_UNNAMED.sub('-', table.name)}}}",
+        rf"\begin{{tabular}}{{{'l' * len(table.stubs)}{'r' * len(table.columns)}}}",
         r"\toprule", *_latex_groups(table), " & ".join(map(_tex, heads)) + r" \\",
     ]  # fmt: skip
     for _, rows in groupby(_LATEX.rows(table), key=lambda found: found[0].kind):
@@ -142,8 +148,20 @@ def _latex_groups(table: Table) -> list[str]:
     return [" & ".join(cells) + r" \\", " ".join(rules)]
 
 
+def plain(text: str) -> str:
+    """Escape what Markdown would take for markup: HTML, entities, links, a code span without end. Code spans stay."""
+    text = _CONTROL.sub(" ", text)
+    links = re.search(r"\][(\[:]", text) is not None
+    parts = [text] if "``" in text else re.split("(`[^`]+`)", text)
+    for place, part in enumerate(parts[::2]):
+        part = re.sub(r"\\(?=[!-/:-@\[-`{-~]|$)", r"\\\\", part)
+        part = re.sub(r"&(?=#?\w+;)", "&amp;", part).replace("<", "&lt;").replace("`", "\\`")
+        parts[2 * place] = part.replace("[", "\\[") if links else part
+    return "".join(parts)
+
+
 def _tex(text: str) -> str:
-    coded = re.sub("`([^`]*)`", r"\\texttt{\1}", text.translate(TEX_SIGNS))
+    coded = re.sub("`([^`]*)`", r"\\texttt{\1}", _CONTROL.sub(" ", text).translate(TEX_SIGNS))
     return re.sub('"([^"]*)"', r"``\1''", coded)
 
 
@@ -151,7 +169,7 @@ def _text(text: str) -> str:
     return re.sub("`([^`]*)`", r"<code>\1</code>", escaping.escape(text))
 
 
-_MARKDOWN = _Style("**%s**", "_%s_", " ± %s", "[%s]", " ", "**%s**", str)
+_MARKDOWN = _Style("**%s**", "_%s_", " ± %s", "[%s]", " ", "**%s**", plain)
 _LATEX = _Style(
     r"\textbf{%s}", r"\underline{%s}", r" {\scriptsize $\pm$ %s}", r"\textsuperscript{%s}", "", r"\textbf{%s}", _tex
 )

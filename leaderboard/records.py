@@ -1,5 +1,6 @@
 """Run records: one JSON file a run, strict to read, written atomically, traceable from any table cell."""
 
+import contextlib
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,12 +9,14 @@ from typing import Any
 import msgspec
 
 from rewild4d.errors import UserError, reason
-from rewild4d.files import digest, write_text
+from rewild4d.files import digest, regular_inside, write_text
 from rewild4d.metrics.score import Distance, Score
 from rewild4d.texts import read_json
 
 SCHEMA = 1
 FILE = "record.json"
+MOST_BYTES = 64 << 20
+"""Of a record's file."""
 
 
 class Timing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -135,9 +138,17 @@ def read_record(path: Path) -> RunRecord:
     Raises:
         UserError: missing, cannot be read, not JSON, or not of this schema.
     """
+    with contextlib.suppress(OSError):
+        if (size := path.stat().st_size) > MOST_BYTES:
+            raise UserError(f"{path}: expected a run record of at most {MOST_BYTES >> 20} MiB, got {size >> 20} MiB.")
     record = read_json(path, f"a run record of schema {SCHEMA}", RunRecord)
     if record.schema != SCHEMA:
         raise UserError(f"{path}: expected a run record of schema {SCHEMA}, got schema {record.schema}.")
+    for name, score in record.scores.items():
+        if score.better not in ("higher", "lower", ""):
+            raise UserError(
+                f"{path}: expected 'higher', 'lower' or nothing in `scores`, got '{score.better[:50]}' of {name[:50]}."
+            )
     for place, shape in (("protocol", _Protocol), ("prior", _Prior), ("data", _Data)):
         try:
             msgspec.convert(getattr(record, place), shape)
@@ -162,8 +173,11 @@ def find_records(folder: Path) -> list[tuple[Path, RunRecord]]:
     """Read all records below a folder, sorted by path, each with the folder that holds it.
 
     Raises:
-        UserError: no such folder, or a record that cannot be read.
+        UserError: no such folder, or a record that cannot be read or is a link out of the folder.
     """
     if not folder.is_dir():
         raise UserError(f"{folder}: expected a folder of runs, but there is no such folder.")
-    return [(path.parent, read_record(path)) for path in sorted(folder.rglob(FILE))]
+    paths = sorted(folder.rglob(FILE))
+    for path in paths:
+        regular_inside(path, folder)
+    return [(path.parent, read_record(path)) for path in paths]

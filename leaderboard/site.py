@@ -1,8 +1,13 @@
 """The leaderboard as a static page: records in, a folder of HTML out that needs no server and no network."""
 
+import base64
+import hashlib
+import os
 import re
 import shutil
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
@@ -12,11 +17,12 @@ import jinja2
 from markupsafe import Markup
 
 from rewild4d.errors import UserError
-from rewild4d.files import replaced_folder
+from rewild4d.files import regular_inside, replaced_folder
 from rewild4d.leaderboard.cells import cell
 from rewild4d.leaderboard.curves import curve, moments
 from rewild4d.leaderboard.formats import ARROWS, html
 from rewild4d.leaderboard.layout import Table
+from rewild4d.leaderboard.media import FILMS, TIMEOUT, link, publish
 from rewild4d.leaderboard.records import FILE, RunRecord
 from rewild4d.leaderboard.tables import columns_of, standings
 from rewild4d.leaderboard.variants import by_protocol, flat, variants
@@ -33,7 +39,17 @@ CAPTIONS = {
     "original film": "The filmed frame beside the render in its place.",
     "original": "The filmed frame beside the render in its place, at six moments.",
 }
+POLICY = (
+    "default-src 'none'; img-src 'self'; media-src 'self'; style-src {style}; script-src {script}; base-uri 'none'; "
+    "form-action 'none'"
+)
+"""Content-Security-Policy of every page: its own style and script, known by their digests, and files of its folder."""
 Found = tuple[Path, RunRecord]
+
+
+def tell(text: str) -> None:
+    """Print a line on standard error."""
+    print(text, file=sys.stderr)
 
 
 @dataclass(frozen=True)
@@ -51,12 +67,14 @@ class Part:
     tables: Sequence[Sequence[Table]] = ()
 
 
-def build_site(parts: Sequence[Part], out: Path) -> Path:
+def build_site(parts: Sequence[Part], out: Path, say: Callable[[str], None] = tell, timeout: float = TIMEOUT) -> Path:
     """Write the page of all records; an older one in the same place is replaced once the new one is complete.
 
     Args:
         parts: of the first page, each with tables of its own.
         out: a folder that is not there, is empty, or was built before.
+        say: called with a line for every picture that is left out, because it is none, is damaged or lies elsewhere.
+        timeout: seconds that reading one film may take.
 
     Returns:
         The path of its first page.
@@ -65,31 +83,46 @@ def build_site(parts: Sequence[Part], out: Path) -> Path:
         UserError: the folder holds something else, or cannot be written.
     """
     with replaced_folder(out, MARKER, "an earlier leaderboard") as building:
-        _write([replace(part, found=_unique(part.found)) for part in parts], building)
+        _write([replace(part, found=_unique(part.found)) for part in parts], building, say, timeout)
     return out / "index.html"
 
 
-def _write(parts: Sequence[Part], folder: Path) -> None:
+def _write(parts: Sequence[Part], folder: Path, say: Callable[[str], None], timeout: float) -> None:
     (folder / MARKER).touch()
     loader = jinja2.FunctionLoader(_template)
     pages = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    assets = {"style": Markup(_template("style.css")), "script": Markup(_template("script.js"))}
+    assets = _assets()
     found = _unique([pair for part in parts for pair in part.found])
-    for source, record in found:
+
+    def fill(pair: Found) -> list[dict[str, Any]]:
+        source, record = pair
         page = folder / _place(record)
         page.mkdir(parents=True)
-        pictures = list(_copy_pictures(source, record, page))
+        regular_inside(source / FILE, source)
         shutil.copyfile(source / FILE, page / FILE)
+        return list(_copy_pictures(source, record, page, say, timeout))
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        drawn = list(pool.map(fill, found))
+    for (_, record), pictures in zip(found, drawn, strict=True):
         text = pages.get_template("run.html").render(
             title=f"{record.method} on {record.case}", record=record, scores=list(_scores(record)),
             pictures=pictures, provenance=_provenance(record), **assets,
         )  # fmt: skip
-        (page / "index.html").write_text(text, encoding="utf-8")
+        (folder / _place(record) / "index.html").write_text(text, encoding="utf-8")
     shown = [_part(part, f"{index}-" if len(parts) > 1 else "") for index, part in enumerate(parts, 1)]
     text = pages.get_template("index.html").render(
         title=TITLE, counts=_counts(found), parts=shown, arrows=ARROWS, **assets
     )
     (folder / "index.html").write_text(text, encoding="utf-8")
+
+
+def _assets() -> dict[str, Any]:
+    """Return what stands in the head of every page."""
+    texts = {name: _template(f"{name}{suffix}") for name, suffix in (("style", ".css"), ("script", ".js"))}
+    digests = {name: base64.b64encode(hashlib.sha256(text.encode()).digest()) for name, text in texts.items()}
+    policy = POLICY.format(**{name: f"'sha256-{value.decode()}'" for name, value in digests.items()})
+    return {"policy": policy, **{name: Markup(text) for name, text in texts.items()}}
 
 
 def _part(part: Part, key: str) -> dict[str, Any]:
@@ -160,15 +193,23 @@ def _scores(record: RunRecord) -> Iterator[dict[str, Any]]:
         }  # fmt: skip
 
 
-def _copy_pictures(source: Path, record: RunRecord, page: Path) -> Iterator[dict[str, Any]]:
+def _copy_pictures(
+    source: Path, record: RunRecord, page: Path, say: Callable[[str], None], timeout: float
+) -> Iterator[dict[str, Any]]:
     """Copy the pictures that lie beside the record, the held-out comparison first."""
     order = list(CAPTIONS)
     stems = {Path(name).name: Path(name).stem + " film" * (Path(name).suffix == ".mp4") for name in record.pictures}
     names = sorted(stems, key=lambda name: order.index(stems[name]) if stems[name] in order else len(order))
-    for name in names:
-        if (source / name).is_file():
-            shutil.copyfile(source / name, page / name)
-            yield {"name": name, "caption": CAPTIONS.get(stems[name], name), "video": name.endswith(".mp4")}
+    for name in filter(None, names):
+        if not os.path.lexists(source / name):
+            continue
+        try:
+            publish(source / name, source, page / name, timeout)
+        except UserError as error:
+            say(f"left out: {error}")
+            continue
+        is_film = name.lower().endswith(FILMS)
+        yield {"href": link(name), "caption": CAPTIONS.get(stems[name], name), "video": is_film}
 
 
 def _provenance(record: RunRecord) -> list[tuple[str, list[tuple[str, str]]]]:

@@ -128,6 +128,24 @@ def held(folder: Path, waiting: str) -> Iterator[None]:
         os.close(handle)
 
 
+def regular_inside(path: Path, folder: Path) -> None:
+    """Fail unless a path is a regular file that lies inside a folder when all links are followed.
+
+    Raises:
+        UserError: it is not there, a folder, a pipe or a device, or a link that leads out of the folder.
+    """
+    try:
+        real = path.resolve(strict=True)
+        is_file = real.is_file()
+    except (OSError, RuntimeError, ValueError) as error:  # links in a circle; a name that no file can have
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"{str(path)[:200]}: expected a file, but: {reason}.") from error
+    if not is_file:
+        raise UserError(f"{path}: expected a regular file, got something else.")
+    if not real.is_relative_to(folder.resolve()):
+        raise UserError(f"{path}: expected a file inside {folder}, got a link that leads out of it.")
+
+
 def write_text(path: Path, text: str) -> None:
     """Write text atomically, the same bytes on every system."""
     with atomic(path) as temporary:

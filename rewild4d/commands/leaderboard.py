@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rewild4d.commands.shared import require_writable
+from rewild4d.commands.shared import check_timeout, require_writable
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.leaderboard.specs import load_specs
@@ -36,11 +36,13 @@ class BuildOptions:
         runs: folders of runs (what `run --out` or `leaderboard collect --out` named), pictures beside the records.
         out: the page's folder: new, empty, or an earlier page, which is replaced.
         preset: of the runs in the named tables; each table's own where it is left out.
+        timeout: seconds that ffmpeg may take to read one film.
     """
 
     runs: tuple[Path, ...] = (Path("runs"),)
     out: Path = Path("leaderboard-page")
     preset: str = ""
+    timeout: float = 120.0
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class CollectOptions:
         title: heading of this part of the page; the name of the folder where it is left out.
         pictures: of which data: open (a licence that lets them be passed on), all or none.
         limit_mb: most that all files may take.
+        timeout: seconds that ffmpeg may take to read one film and to make it smaller.
     """
 
     out: Path
@@ -60,6 +63,7 @@ class CollectOptions:
     title: str = ""
     pictures: Literal["open", "all", "none"] = "open"
     limit_mb: float = 15.0
+    timeout: float = 120.0
 
 
 def main(arguments: list[str]) -> int:
@@ -74,6 +78,7 @@ def main(arguments: list[str]) -> int:
 
 def build(arguments: list[str]) -> int:
     options = parse_flags(BuildOptions, arguments, prog="rewild4d-bench leaderboard build", description=BUILD)
+    check_timeout(options.timeout)
     from rewild4d.leaderboard.collect import title_of
     from rewild4d.leaderboard.records import find_records
     from rewild4d.leaderboard.site import Part, build_site
@@ -83,12 +88,13 @@ def build(arguments: list[str]) -> int:
         found = find_records(folder)
         parts.append(Part(title_of(folder), found, _named([record for _, record in found], options.preset)))
     _require_records(options.runs, [part for part in parts if part.found])
-    print(build_site([part for part in parts if part.found], options.out.absolute()))
+    print(build_site([part for part in parts if part.found], options.out.absolute(), timeout=options.timeout))
     return 0
 
 
 def collect_runs(arguments: list[str]) -> int:
     options = parse_flags(CollectOptions, arguments, prog="rewild4d-bench leaderboard collect", description=COLLECT)
+    check_timeout(options.timeout)
     from rewild4d.leaderboard.collect import collect
     from rewild4d.leaderboard.records import find_records
 
@@ -96,7 +102,10 @@ def collect_runs(arguments: list[str]) -> int:
     _require_records(options.runs, found)
     out = options.out.absolute()
     require_writable(out.parent)
-    made = collect(found, out, title=options.title or out.name, pictures=options.pictures, limit=options.limit_mb * 1e6)
+    made = collect(
+        found, out, title=options.title or out.name, pictures=options.pictures, limit=options.limit_mb * 1e6,
+        timeout=options.timeout,
+    )  # fmt: skip
     for remark in made.remarks:
         print(remark, file=sys.stderr)
     print(f"{made.runs} runs, {made.pictured} of them with pictures, {made.size / 1e6:.1f} MB: {options.out}")

@@ -7,6 +7,7 @@ from typing import Literal
 
 import msgspec
 
+from rewild4d.leaderboard.formats import plain
 from rewild4d.metrics.score import Distance, Score
 
 SCHEMA = 1
@@ -59,7 +60,7 @@ def markdown(report: Report) -> str:
     """Write the report as Markdown: tables of all values, then every note and every reason for a missing value."""
     parts = [_region_table(report.scores), _single_table(report.scores), _distance_table(report.distances)]
     settings = ", ".join(f"{name} {value}" for name, value in report.settings.items())
-    lines = [f"- {note}" for note in [settings, *report.notes, *_notes(report)] if note]
+    lines = [f"- {plain(note)}" for note in [settings, *report.notes, *_notes(report)] if note]
     return "\n\n".join([part for part in parts if part] + (["\n".join(lines)] if lines else []))
 
 

@@ -71,7 +71,7 @@ def test_prior_and_selection_are_what_tables_take_them_for(tmp_path: Path, chang
 
 def test_a_folder_is_no_record(tmp_path: Path) -> None:
     (tmp_path / "run" / "record.json").mkdir(parents=True)
-    with pytest.raises(UserError, match="expected a run record of schema 1, but it cannot be read: Is a directory"):
+    with pytest.raises(UserError, match="record.json: expected a regular file, got something else"):
         find_records(tmp_path)
 
 
