@@ -1,4 +1,4 @@
-"""The one entry point: checks the input and hands it to a backend."""
+"""Entry point: check the input and call a backend."""
 
 import math
 
@@ -32,7 +32,7 @@ def rasterize(
 
     Args:
         means: centres in the world, [N, 3].
-        quats: orientations, wxyz, of any length (normalised here; zero turns nothing), [N, 4].
+        quats: orientations, wxyz, of any length (normalised here; zero is the identity), [N, 4].
         scales: standard deviations along the Gaussian's own axes, [N, 3].
         opacities: in [0, 1], [N].
         features: any number of channels (colour, normal, depth, part), magnitudes up to `checks.MOST_FEATURE`, [N, C].
@@ -49,11 +49,10 @@ def rasterize(
             takes these tensors, else the fastest that does, else the reference.
 
     Returns:
-        features [V, C, height, width], alpha [V, 1, height, width], and the info densification needs.
+        Features [V, C, height, width], alpha [V, 1, height, width], and the info that densification needs.
 
     Raises:
-        ValueError: a shape, type, device or option is wrong, or a value is not finite or too large; names the tensor
-            and the index.
+        ValueError: a shape, type, device or option is wrong, or a value is not finite or too large.
     """
     named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features}
     check_gaussians(named)

@@ -1,4 +1,4 @@
-"""Which implementation renders: what each needs, what `auto` picks, and the choice of this process."""
+"""Choose the backend: what each needs, what `auto` picks, and the default of this process."""
 
 import importlib
 import logging
@@ -15,17 +15,17 @@ from rewild4d.rasterizer.conventions import RasterInput, Rendered
 logger = logging.getLogger(__name__)
 
 MODULES = {"numba": "cpu", "triton": "cuda", "gsplat": "gsplat_backend", "reference": "reference"}
-"""Files of this folder; imported on first use, as not every machine has Triton or gsplat."""
+"""Modules of this folder, imported on first use, since Triton and gsplat are optional."""
 BACKENDS = ("auto", *MODULES)
 CHECK_VALUES = ("triton",)
-"""Those that look at the values themselves: a look of its own would wait for the GPU once more."""
+"""Backends whose kernels check the values: a separate check would wait for the GPU."""
 _default = "auto"
 
 
 def set_default(name: str) -> None:
-    """Let ``backend="auto"`` mean this one, in this process, for all tensors that it takes.
+    """Set what ``backend="auto"`` means in this process, for tensors that the backend takes.
 
-    Others (the prior is fitted on the CPU, whatever renders the animal) get what `auto` would pick without it.
+    For others, such as those of the prior's fit on the CPU, `auto` picks the fastest as before.
 
     Raises:
         UserError: no backend of that name.
@@ -40,7 +40,7 @@ def pick_rasterizer(name: str, device: torch.device) -> str:
     """Return the backend that renders float32 on a device: the named one, or the one that "auto" picks.
 
     Raises:
-        UserError: unknown, or it cannot be used here; says why.
+        UserError: unknown, or it cannot be used here.
     """
     if name not in BACKENDS:
         raise unknown_name("rasterizer", name, BACKENDS)
@@ -73,9 +73,9 @@ def load(name: str) -> Callable[[RasterInput], Rendered]:
     return importlib.import_module(f"rewild4d.rasterizer.{MODULES[name]}").rasterize
 
 
-@cache  # which also makes it say what it picked only once
+@cache  # also logs the choice only once
 def _automatic(kind: str, dtype: torch.dtype) -> str:
-    """Return the fastest that takes tensors of a device type; the reference takes all."""
+    """Return the fastest backend that takes tensors of a device type; the reference takes all."""
     fast = {"cpu": ("numba",), "cuda": ("triton", "gsplat")}.get(kind, ())
     reasons = {name: _unfit(name, torch.device(kind), dtype) for name in fast}
     name = next((name for name, reason in reasons.items() if not reason), "reference")
@@ -87,7 +87,7 @@ def _automatic(kind: str, dtype: torch.dtype) -> str:
 
 
 def _unfit(name: str, device: torch.device, dtype: torch.dtype) -> str:
-    """Say why a backend cannot render such tensors here; empty where it can."""
+    """Return the reason why a backend cannot render such tensors here; empty where it can."""
     single, got = dtype == torch.float32, f"got {dtype} on {device}"
     if name == "reference" or (name == "numba" and single and device.type == "cpu"):
         return ""
@@ -105,14 +105,12 @@ def _unfit(name: str, device: torch.device, dtype: torch.dtype) -> str:
 
 
 def _missing(package: str) -> str:
-    """Say why a package cannot be imported; empty where it can."""
+    """Return the reason why a package cannot be imported; empty where it can."""
     try:
         importlib.import_module(package)
-    except ModuleNotFoundError as error:
-        if error.name == package:
-            return f"{package} is not installed here (pip install -e '.[{package}]')"
-        return f"{package} cannot be imported: {error}"
     except (ImportError, OSError, RuntimeError) as error:
+        if isinstance(error, ModuleNotFoundError) and error.name == package:
+            return f"{package} is not installed here (pip install -e '.[{package}]')"
         return f"{package} cannot be imported: {error}"
     return ""
 

@@ -1,8 +1,8 @@
-"""Which Gaussian touches which tile, front to back.
+"""List the Gaussians of each tile, front to back.
 
 Three steps: sort the visible Gaussians of each view by depth; mark, for every (Gaussian, tile) pair of the bounding
-rectangles, which of the tile's sixteen 4 x 4 blocks the ellipse reaches; counting-sort the pairs into tiles. A pair's
-place before all sorting (Gaussian by Gaussian) is its `slot`: the backward pass leaves its sums there.
+rectangles, the tile's 4 x 4 blocks that the ellipse touches; counting-sort the pairs into tiles. A pair's index before
+sorting (Gaussian by Gaussian) is its `slot`, where the backward pass writes its sums.
 """
 
 from typing import Any
@@ -29,7 +29,7 @@ BLOCK_LEFT = np.array([BLOCK * (block % 4) for block in range(BLOCKS)], np.float
 BLOCK_TOP = np.array([BLOCK * (block // 4) for block in range(BLOCKS)], np.float32)
 
 SLACK = np.float32(1e-3)
-"""Added to the reach in exponent units, so that rounding never drops a block that the blend would draw into."""
+"""Added to the extent in exponent units, so that rounding never drops a block that the blend would draw into."""
 
 RADIX_BITS = 11
 RADIX = 1 << RADIX_BITS
@@ -46,12 +46,10 @@ def _sort_run(run: np.ndarray, depths: np.ndarray) -> None:
 
 @kernel
 def sort_by_depth(view: int, depths: np.ndarray, order: np.ndarray, keys: np.ndarray, spare: np.ndarray) -> int:
-    """Write the visible Gaussians of one view, nearest first (ties by index), to order[view]; give their number.
+    """Write the visible Gaussians of one view (depth above 0) to order[view], nearest first; return their number.
 
-    They are those of a positive depth: a radius may round to zero where a Gaussian has a tile.
-
-    ``keys`` and ``spare`` are int64 scratch of length N: bits of the depth in single precision above, index below. What
-    is equal so is put right afterwards.
+    ``keys`` and ``spare`` are int64 scratch of length N: bits of the depth in single precision above, index below. Runs
+    of equal keys are sorted afterwards.
     """
     bits = depths[view].astype(np.float32).view(np.int32)
     count, lowest, highest = 0, np.int64(1) << 31, np.int64(0)
@@ -61,7 +59,7 @@ def sort_by_depth(view: int, depths: np.ndarray, order: np.ndarray, keys: np.nda
             keys[count] = (key << 32) | n
             lowest, highest = min(lowest, key), max(highest, key)
             count += 1
-    # What all depths have in common needs no sorting: an animal's differ in the lower two digits.
+    # leading digits that all depths share need no sorting
     shift = 32
     while (highest - lowest) >> (shift - 32) > 0:
         histogram = np.zeros(RADIX, np.int64)
@@ -91,27 +89,27 @@ def sort_by_depth(view: int, depths: np.ndarray, order: np.ndarray, keys: np.nda
 
 @inlined
 def _squares(a: float, b: float, c: float, x: Any, y: Any) -> Any:
-    """By how much the exponent falls from the centre to (x, y)."""
+    """Return the decrease of the exponent from the centre to (x, y)."""
     t, u = fma(splat(a), x, splat(b) * y), splat(c) * y
     return fma(t, t, u * u)
 
 
 @inlined
 def _shape(records: np.ndarray, view: int, n: int) -> tuple:
-    """Of one Gaussian: ALONG_X, ALONG_Y, DOWN, where along one side of a block the exponent is largest, its reach."""
+    """Return ALONG_X, ALONG_Y, DOWN, slopes to the largest exponent on a vertical and a horizontal line, the extent."""
     a, b, c = records[view, n, ALONG_X], records[view, n, ALONG_Y], records[view, n, DOWN]
-    reach = records[view, n, LOG_OPACITY] - np.float32(LOG2_MIN_ALPHA)
-    return a, b, c, -a * b / (b * b + c * c), -b / a, reach * np.float32(1.0001) + SLACK
+    extent = records[view, n, LOG_OPACITY] - np.float32(LOG2_MIN_ALPHA)
+    return a, b, c, -a * b / (b * b + c * c), -b / a, extent * np.float32(1.0001) + SLACK
 
 
 @inlined
-def _reached_blocks(shape: tuple, left: float, top: float, block_left: np.ndarray, block_top: np.ndarray) -> int:
+def _touched_blocks(shape: tuple, left: float, top: float, block_left: np.ndarray, block_top: np.ndarray) -> int:
     """Return bits of the blocks in which the exponent at some point between pixel centres exceeds log2(1/255).
 
     The maximum over a rectangle lies on one of the two sides that face the centre, at the clamped one-dimensional
     optimum; all sixteen blocks are tested at once. ``left`` and ``top`` are the tile's first pixel less the centre.
     """
-    a, b, c, slope_y, slope_x, reach = shape
+    a, b, c, slope_y, slope_x, extent = shape
     zero, span = splat(np.float32(0)), splat(np.float32(BLOCK - 1))
     low_x, low_y = load(block_left, 0) + splat(np.float32(left)), load(block_top, 0) + splat(np.float32(top))
     high_x, high_y = low_x + span, low_y + span
@@ -119,12 +117,12 @@ def _reached_blocks(shape: tuple, left: float, top: float, block_left: np.ndarra
     best_y = minimum(maximum(near_x * splat(slope_y), low_y), high_y)
     best_x = minimum(maximum(near_y * splat(slope_x), low_x), high_x)
     least = minimum(_squares(a, b, c, near_x, best_y), _squares(a, b, c, best_x, near_y))
-    return bits_gt(splat(reach), least)
+    return bits_gt(splat(extent), least)
 
 
 @inlined
 def _is_before(depths: np.ndarray, view: int, first: int, second: int) -> bool:
-    """Tell whether one Gaussian comes before another front to back."""
+    """Tell whether one Gaussian is in front of another."""
     here, there = depths[view, first], depths[view, second]
     return here < there or (here == there and first < second)
 
@@ -135,27 +133,16 @@ def mark_pairs(
     slots: np.ndarray, tiles_x: int, tiles_y: int, block_left: np.ndarray, block_top: np.ndarray, pair_tile: np.ndarray,
     pair_bits: np.ndarray, histograms: np.ndarray,
 ) -> None:  # fmt: skip
-    """Fill tile and block bits of the pairs of Gaussians begin..end, and count them by piece and tile.
+    """Set tile and block bits of the pairs of Gaussians begin..end by slot, and count the pairs by piece and tile.
 
-    They are taken as they are numbered, not front to back: so their slots are neighbours, and hardly any two
-    threads write to one cache line.
+    Gaussians are taken by number, not by depth, so that threads hardly ever write to one cache line.
 
     Args:
-        view: theirs.
-        begin: the first of them.
-        end: one past the last.
-        firsts: the foremost Gaussian of each piece that `scatter_pairs` takes, front to back, [P].
-        depths: [V, N].
-        records: [V, N, 8].
+        firsts: the foremost Gaussian of each piece of `scatter_pairs`, front to back, [P].
         tiles: first and one past the last, x then y, [V, N, 4].
         slots: [V, N + 1].
-        tiles_x: tiles of a row.
-        tiles_y: rows.
-        block_left: `BLOCK_LEFT`.
-        block_top: `BLOCK_TOP`.
-        pair_tile: set, by slot.
-        pair_bits: set, by slot.
         histograms: added to, [P, tiles of all views].
+        depths, records: [V, N] and [V, N, 8]; block_left and block_top are `BLOCK_LEFT` and `BLOCK_TOP`.
     """
     for n in range(begin, end):
         slot, piece = slots[view, n], 0
@@ -167,7 +154,7 @@ def mark_pairs(
         for tile_y in range(np.int64(tiles[view, n, 2]), np.int64(tiles[view, n, 3])):
             for tile_x in range(np.int64(tiles[view, n, 0]), np.int64(tiles[view, n, 1])):
                 left, top = tile_x * TILE + 0.5 - x, tile_y * TILE + 0.5 - y
-                bits = _reached_blocks(shape, left, top, block_left, block_top)
+                bits = _touched_blocks(shape, left, top, block_left, block_top)
                 tile = (view * tiles_y + tile_y) * tiles_x + tile_x
                 pair_tile[slot], pair_bits[slot] = tile, bits
                 histograms[piece, tile] += bits != 0
@@ -176,9 +163,9 @@ def mark_pairs(
 
 @kernel
 def start_tiles(histograms: np.ndarray, starts: np.ndarray) -> None:
-    """Turn counts by who marked, piece and tile, [M, P, tiles], into where each piece writes, [0, P, tiles].
+    """Convert counts by marker, piece and tile, [M, P, tiles], to the piece's first index in each tile, [0, P, tiles].
 
-    ``starts`` [tiles + 1] is set to where the tiles' lists begin.
+    ``starts`` [tiles + 1] is set to the first index of each tile's list.
     """
     markers, pieces, tiles = histograms.shape
     total = 0
@@ -198,25 +185,14 @@ def scatter_pairs(
     view: int, begin: int, end: int, order: np.ndarray, slots: np.ndarray, pair_tile: np.ndarray, pair_bits: np.ndarray,
     cursor: np.ndarray, entry_gaussian: np.ndarray, entry_slot: np.ndarray, entry_bits: np.ndarray,
 ) -> None:  # fmt: skip
-    """Write the pairs of sorted Gaussians begin..end into their tiles' lists, in depth order.
+    """Write the pairs of sorted Gaussians begin..end to their tiles' lists, the entry arrays, in depth order.
 
-    Args:
-        view: theirs.
-        begin: the first of them.
-        end: one past the last.
-        order: front to back, [V, N].
-        slots: [V, N + 1].
-        pair_tile: by slot.
-        pair_bits: by slot.
-        cursor: where the next entry of each tile goes, counted up, [tiles of all views].
-        entry_gaussian: set.
-        entry_slot: set.
-        entry_bits: set.
+    ``order`` [V, N] is front to back; ``cursor`` [tiles of all views] has the index of each tile's next entry.
     """
     for k in range(begin, end):
         n = order[view, k]
         for slot in range(slots[view, n], slots[view, n + 1]):
             if pair_bits[slot] != 0:
-                place = cursor[pair_tile[slot]]
-                cursor[pair_tile[slot]] = place + 1
-                entry_gaussian[place], entry_slot[place], entry_bits[place] = n, slot, pair_bits[slot]
+                entry = cursor[pair_tile[slot]]
+                cursor[pair_tile[slot]] = entry + 1
+                entry_gaussian[entry], entry_slot[entry], entry_bits[entry] = n, slot, pair_bits[slot]

@@ -1,8 +1,8 @@
 """Front-to-back blending of one tile at a time; blending_backward.py has its gradient.
 
-A vector holds the sixteen pixels of a 4 x 4 block. Gaussians are the outer loop and the blocks that they reach the
-inner one, so neighbouring steps work on different pixels and need not wait for each other; a tile's state stays in the
-first cache. A closed pixel keeps its last transmittance, with a minus sign, and takes nothing more.
+A vector holds the sixteen pixels of a 4 x 4 block. Gaussians are the outer loop and the blocks that they touch the
+inner one, so that consecutive steps are independent; a tile's state stays in the first cache. A closed pixel keeps its
+last transmittance, with a minus sign.
 """
 
 from typing import Any
@@ -48,14 +48,14 @@ from rewild4d.rasterizer.projection import (
 )
 
 CONSTANTS = np.array([LOG2_MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, *POWER_TERMS], np.float32)
-"""An argument of the kernels, so that the loop over blocks finds them in registers."""
+"""An argument of the kernels, so that the loop over blocks holds them in registers."""
 WEAKEST, STRONGEST_ALPHA, LEAST_LEFT, TERMS = range(4)
 
 AHEAD = 16
-"""Gaussians whose places in a tile are computed together, so that nothing waits for one of them."""
+"""Gaussians whose position in a tile is computed together, to hide its latency."""
 
 PLACED = 4 * LANES
-"""Numbers of a place."""
+"""Numbers of a position in a tile."""
 
 
 @inlined
@@ -85,7 +85,7 @@ def alpha_at(log_opacity: Any, t: Any, u: Any, strongest: Any, terms: tuple) -> 
 
 @inlined
 def open_tile(tile_left: int, tile_top: int, width: int, height: int, transmittance: np.ndarray) -> int:
-    """Set transmittance to 1 inside the image and 0 outside; give the bits of the blocks that hold a pixel."""
+    """Set transmittance to 1 inside the image and 0 outside; return the bits of the blocks with a pixel in it."""
     if tile_left + TILE <= width and tile_top + TILE <= height:
         transmittance[:] = 1
         return (1 << BLOCKS) - 1
@@ -109,13 +109,11 @@ def blend(
 ) -> None:  # fmt: skip
     """Blend tiles until no ticket is left: fill image [V, C, h, w], alpha [V, 1, h, w] and ``through``, 1 - alpha.
 
-    ``lists`` are starts, entry_gaussian, entry_slot and entry_bits of `start_tiles` and `scatter_pairs`;
-    ``records`` and ``features`` are flat. ``entry_bits`` shrinks to the blocks where an entry really contributed or
-    closed a pixel; ``pair_bits`` becomes 0 where it did so nowhere, and only there: slots of a Gaussian share a cache
-    line, its tiles have different threads.
-    ``through`` is flat and keeps the digits that alpha has lost near 1; empty where nobody needs them.
-    Blocks without an open pixel are passed over from the next `AHEAD` Gaussians on: who looked for them after each one
-    would wait for its whole arithmetic.
+    ``lists`` are starts, entry_gaussian, entry_slot and entry_bits of `start_tiles` and `scatter_pairs`; ``records``
+    and ``features`` are flat. ``entry_bits`` shrinks to the blocks where an entry contributed or closed a pixel;
+    ``pair_bits`` is written only where it becomes 0, since threads share its cache lines. ``through`` is flat and keeps
+    the digits that alpha loses near 1; it may be empty. Closed blocks are skipped from the next `AHEAD` Gaussians on:
+    a test after each Gaussian would stall.
     """
     views, channels, height, width = image.shape
     count = len(records) // (RECORD * views)
@@ -168,7 +166,7 @@ def _blend_entry(
     bits: int, constants: np.ndarray, log_opacity: Any, features: np.ndarray, feature: int, channels: int,
     placed: np.ndarray, place: int, left: np.ndarray, colors: np.ndarray,
 ) -> tuple:  # fmt: skip
-    """Blend one Gaussian into the blocks of ``bits``; give the blocks that it touched and those that are now closed."""
+    """Blend one Gaussian into the blocks of ``bits``; return the blocks it touched and those that are now closed."""
     zero, least, weakest = splat(np.float32(0)), broadcast(constants, LEAST_LEFT), broadcast(constants, WEAKEST)
     strongest, terms = broadcast(constants, STRONGEST_ALPHA), load_terms(constants, TERMS)
     first_t, first_u = load(placed, place), load(placed, place + LANES)
@@ -181,13 +179,13 @@ def _blend_entry(
         alpha, exponent = alpha_at(log_opacity, t, u, strongest, terms)
         before = load(left, block * LANES)
         weight = keep_where_ge(alpha, exponent, weakest) * before
-        touched |= (bits_gt(weight, zero) != 0) << block  # what closes a pixel too: the backward pass must see it close
+        touched |= (bits_gt(weight, zero) != 0) << block  # also what closes a pixel, for the backward pass
         after = before - weight
         store(left, block * LANES, select_gt(after, least, after, negated_absolute(before)))
         weight = select_gt(after, least, weight, zero)
         closed |= (bits_gt(after, least) == 0) << block
         color = block * channels * LANES
-        if channels == 3:  # the usual case without a loop
+        if channels == 3:  # without a loop
             _add_channel(weight, features, feature, colors, color)
             _add_channel(weight, features, feature + 1, colors, color + LANES)
             _add_channel(weight, features, feature + 2, colors, color + 2 * LANES)

@@ -1,7 +1,7 @@
 """The gradient of blending, tile by tile.
 
-It walks front to back as the blend does: what lies behind Gaussian i is the pixel's total minus the prefix, so nothing
-is divided back and one number per pixel is enough, however many channels there are.
+It goes front to back like the blend: the sum behind a Gaussian is the pixel's total minus the prefix, so that nothing
+is divided back, and one number per pixel suffices for any number of channels.
 """
 
 import math
@@ -51,13 +51,13 @@ _STRONGEST_ALPHA, _STRONGEST = np.float32(MAX_ALPHA), np.float32(math.log2(MAX_A
 
 
 def slot_width(channels: int) -> int:
-    """Return numbers in a slot: a vector of moments and of up to three channels' sums; more have their own vectors."""
+    """Return the numbers in a slot: a vector of moments and up to three channel sums; more have further vectors."""
     return LANES + (0 if channels <= FEW else -(-channels // LANES) * LANES)
 
 
 @inlined
 def _first_channel(channels: int) -> int:
-    """Return the index in a slot where the channel sums begin."""
+    """Return the index of the first channel sum in a slot."""
     return MOMENTS if channels <= FEW else LANES
 
 
@@ -72,8 +72,7 @@ def blend_backward(
 ) -> None:  # fmt: skip
     """Fill the slots' rows of ``sums`` (`slot_width` numbers each) for tiles until no ticket is left.
 
-    Without ``geometry`` only the channels' sums are made; the moments are zero. Tiles of more than ``crowd`` Gaussians
-    are walked in double precision.
+    Without ``geometry`` the moments are zero. Tiles with more than ``crowd`` Gaussians use double precision.
     """
     views, channels, height, width = image.shape
     count = len(records) // (RECORD * views)
@@ -121,7 +120,7 @@ def _read_tile(
     view: int, tile_left: int, tile_top: int, image: np.ndarray, alpha: np.ndarray, g_image: np.ndarray,
     g_alpha: np.ndarray, behind: np.ndarray, gradients: np.ndarray,
 ) -> None:  # fmt: skip
-    """Load dL/dimage per block, and the loss's linear share of everything blended: sum of g.out minus T dL/dalpha."""
+    """Load dL/dimage per block, and the loss's linear share of all that is blended: sum of g.out minus T dL/dalpha."""
     _, channels, height, width = image.shape
     pixels, mattes, g_pixels, g_mattes = image.reshape(-1), alpha.reshape(-1), g_image.reshape(-1), g_alpha.reshape(-1)
     one, zero, step = splat(np.float32(1)), splat(np.float32(0)), max(channels, FEW) * LANES
@@ -153,7 +152,7 @@ def _entry_backward(
     row: int,
 ) -> None:  # fmt: skip
     """Sum one Gaussian's six moments and channel gradients over the blocks of ``bits`` into sums[row:]."""
-    # Its constants are literals: the sums leave no registers for them.
+    # constants are literals, as the sums occupy the registers
     zero, one, least = splat(np.float32(0)), splat(np.float32(1)), splat(_LEAST_LEFT)
     strongest, weakest = splat(_STRONGEST_ALPHA), splat(_WEAKEST)
     first_t, first_u = load(placed, place), load(placed, place + LANES)
@@ -179,7 +178,7 @@ def _entry_backward(
         weight = select_gt(after, least, weight, zero)
         store(left, block * LANES, select_gt(after, least, after, zero))
         along, place_of_block = zero, block * max(channels, FEW) * LANES
-        if channels <= FEW:  # the usual case keeps its sums in registers
+        if channels <= FEW:  # sums in registers
             first = load(gradients, place_of_block)
             second, third = load(gradients, place_of_block + LANES), load(gradients, place_of_block + 2 * LANES)
             along = fma(first, red, fma(second, green, third * blue))
@@ -190,14 +189,14 @@ def _entry_backward(
             )
         else:
             for channel in range(channels):
-                slope = load(gradients, place_of_block + channel * LANES)
-                along = fma(slope, broadcast(features, feature + channel), along)
-                store(rows, channel * LANES, fma(weight, slope, load(rows, channel * LANES)))
+                gradient = load(gradients, place_of_block + channel * LANES)
+                along = fma(gradient, broadcast(features, feature + channel), along)
+                store(rows, channel * LANES, fma(weight, gradient, load(rows, channel * LANES)))
         if not geometry:
             continue
         rest = load(behind, block * LANES) - weight * along
         store(behind, block * LANES, rest)
-        # alpha dL/dalpha, where the pixel took this Gaussian and the cap did not hold it.
+        # alpha dL/dalpha, where the Gaussian was blended and not capped
         pull = weight * along - divide(rest * alpha, one - alpha)
         pull = select_gt(weight, zero, pull, zero)
         pull = select_gt(exponent, splat(_STRONGEST), zero, pull)

@@ -1,4 +1,4 @@
-"""Blocks of 4 x 4 pixels, a vector each, in the image: four of them side by side are four rows of sixteen pixels."""
+"""Load and store blocks of 4 x 4 pixels, a vector each: four side by side are four rows of sixteen pixels."""
 
 from typing import Any
 
@@ -60,15 +60,13 @@ def _load_row(plane: np.ndarray, place: int, inside: bool, room: int) -> Any:
 
 @inlined
 def store_blocks(plane: np.ndarray, first_row: int, x: int, y: int, width: int, height: int, blocks: tuple) -> None:
-    """Write what lies in the image of four blocks side by side.
+    """Write the part of four blocks side by side that is in the image.
 
     Args:
         plane: flat images, one below the other.
-        first_row: of the image.
-        x: left pixel of the first block, in the image.
-        y: top pixel.
-        width: of the image.
-        height: of the image.
+        first_row: of the image in the plane.
+        x, y: left and top pixel of the first block, in the image.
+        width, height: of the image.
         blocks: four vectors.
     """
     corner, room = (first_row + y) * width + x, width - x
@@ -81,7 +79,7 @@ def store_blocks(plane: np.ndarray, first_row: int, x: int, y: int, width: int, 
 
 @inlined
 def load_blocks(plane: np.ndarray, first_row: int, x: int, y: int, width: int, height: int) -> tuple:
-    """Return four blocks side by side, zero where they leave the image; arguments as in `store_blocks`."""
+    """Return four blocks side by side, zero outside the image; arguments as in `store_blocks`."""
     corner, room = (first_row + y) * width + x, width - x
     return exchange_quarters(
         _load_row(plane, corner, y < height, room),

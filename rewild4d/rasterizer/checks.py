@@ -1,4 +1,4 @@
-"""What the rasterizer takes: shapes, types, and values that no kernel has to expect to be odd."""
+"""Check the rasterizer's input: shapes, types and values."""
 
 import math
 
@@ -9,11 +9,11 @@ from torch import Tensor
 from rewild4d.kernels.arrays import fits
 
 MOST_FEATURE = 2.0**100
-"""Single precision ends at 3e38, and the backward pass multiplies channels by derivatives."""
+"""Single precision ends at 3e38, and the backward pass multiplies features by gradients."""
 
 
 def check_gaussians(named: dict[str, Tensor]) -> None:
-    """Shapes, types and devices of means, quats, scales, opacities and features.
+    """Check shapes, types and devices of means, quats, scales, opacities and features.
 
     Raises:
         ValueError: names the tensor.
@@ -37,7 +37,7 @@ def check_gaussians(named: dict[str, Tensor]) -> None:
 
 
 def check_cameras(world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int) -> None:
-    """Shapes, and the size of the image.
+    """Check shapes, and the size of the image.
 
     Raises:
         ValueError: names the tensor.
@@ -52,17 +52,17 @@ def check_cameras(world_to_camera: Tensor, intrinsics: Tensor, width: int, heigh
 
 
 def check_values(named: dict[str, Tensor]) -> None:
-    """Pinholes, and that all is finite and not too large.
+    """Check that pinholes are valid and that all values are finite and not too large.
 
     Raises:
         ValueError: names the tensor and the index.
     """
     _check_pinholes(named["intrinsics"].tolist())
     if all(map(fits, named.values())):
-        from rewild4d.kernels.magnitudes import all_below  # numba, which a GPU has no need of
+        from rewild4d.kernels.magnitudes import all_below  # imports numba, which a GPU does not need
 
         if all_below(named.values(), MOST_FEATURE):
-            return  # in a tenth of the time; who is odd, if anybody is, the slow look says
+            return  # in a tenth of the time; otherwise the slow checks find the value
     _check_finite(named)
     _check_range(named)
 
@@ -70,9 +70,8 @@ def check_values(named: dict[str, Tensor]) -> None:
 def _check_pinholes(matrices: list[list[list[float]]]) -> None:
     for view, matrix in enumerate(matrices):
         (fx, skew, _), (lower, fy, _), last = matrix
-        if not (fx > 0 and fy > 0 and skew == 0 and lower == 0 and last == [0, 0, 1]) and all(
-            map(math.isfinite, sum(matrix, []))
-        ):
+        valid = fx > 0 and fy > 0 and skew == 0 and lower == 0 and last == [0, 0, 1]
+        if not valid and all(map(math.isfinite, sum(matrix, []))):
             raise ValueError(
                 f"intrinsics[{view}]: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths, "
                 f"got {matrix}."
@@ -80,8 +79,7 @@ def _check_pinholes(matrices: list[list[list[float]]]) -> None:
 
 
 def _check_finite(named: dict[str, Tensor]) -> None:
-    # A sum is one fast pass and is finite unless something in it is not (or it overflows, then the slow look decides).
-    # NumPy's wakes no OpenMP threads, see `cpu._zeros`.
+    # a sum is one fast pass and finite, unless a value is not or it overflows; NumPy's wakes no OpenMP threads
     with np.errstate(all="ignore"):
         for name, tensor in named.items():
             values = tensor.detach()
@@ -92,18 +90,11 @@ def _check_finite(named: dict[str, Tensor]) -> None:
 
 
 def _check_range(named: dict[str, Tensor]) -> None:
-    """Channels whose products with each other's derivatives would overflow, and leave NaN in a gradient."""
+    """Check channels: products of larger ones overflow in the backward pass and leave NaN."""
     for name in ("features", "background"):
         values = named[name].detach() if name in named else torch.empty(0)
-        if values.numel() and _largest(values) > MOST_FEATURE:
-            index = tuple((values.abs() > MOST_FEATURE).nonzero()[0].tolist())
+        large = values.abs() > MOST_FEATURE
+        if large.any():
+            index = tuple(large.nonzero()[0].tolist())
             found = f"{values[index].item():g} at index {list(index)}"
             raise ValueError(f"{name}: expected magnitudes up to {MOST_FEATURE:.2g}, got {found}.")
-
-
-def _largest(values: Tensor) -> float:
-    """Return the largest magnitude, of at least one finite value."""
-    if values.device.type == "cpu":  # see `_check_finite`
-        numbers = values.numpy()
-        return float(max(numbers.max(), -numbers.min()))
-    return float(torch.maximum(values.max(), -values.min()))

@@ -1,4 +1,4 @@
-"""The constants of the blend, shared by every backend (gsplat's values), and what a backend takes and returns.
+"""Constants of blending, shared by all backends (gsplat's values), and a backend's input and output.
 
 See CONVENTIONS.md.
 """
@@ -12,23 +12,23 @@ MIN_ALPHA = 1.0 / 255.0
 """A Gaussian weaker than this at a pixel is skipped there."""
 
 MAX_ALPHA = 0.99
-"""No single Gaussian covers more than this; above it no gradient reaches opacity, position or shape."""
+"""Largest alpha of one Gaussian; above it opacity, position and shape get no gradient."""
 
 MIN_TRANSMITTANCE = 1e-4
-"""A pixel is closed before the Gaussian that would push its transmittance to this value or below."""
+"""A pixel is closed before the Gaussian that would reduce its transmittance to this value or below."""
 
 EPS2D = 0.3
 """Variance in square pixels that is added to every projected Gaussian (3DGS)."""
 FRUSTUM_MARGIN = 0.3
-"""The projection's Jacobian is taken at most this share of the half image outside the frame."""
+"""The projection's Jacobian is taken at most this share of half the image outside the frame."""
 
 MIN_COMPENSATION = 1e-8
-"""Floor of det(Σ) / det(Σ + eps2d I) under ``antialias``: keeps the square root's derivative finite."""
+"""Least det(Σ) / det(Σ + eps2d I) under ``antialias``, so that the square root's derivative is finite."""
 
 
 @dataclass(frozen=True)
 class RasterInfo:
-    """What densification needs.
+    """Info that densification needs.
 
     Attributes:
         radii: largest distance in pixels from its centre at which a Gaussian is drawn (where its alpha falls to 1/255);
@@ -42,7 +42,7 @@ class RasterInfo:
 
 
 Rendered = tuple[Tensor, Tensor, RasterInfo]
-"""Features [V, C, height, width], alpha [V, 1, height, width], and what densification needs."""
+"""Features [V, C, height, width], alpha [V, 1, height, width], and info for densification."""
 
 Options = tuple[int, int, float, bool, float]
 """Width, height, eps2d, antialias, near."""
@@ -67,5 +67,5 @@ class RasterInput(NamedTuple):
 
     @property
     def options(self) -> Options:
-        """What is no tensor."""
+        """All that is no tensor."""
         return self.width, self.height, self.eps2d, self.antialias, self.near

@@ -1,11 +1,10 @@
 """The CPU backend: numba kernels behind two autograd functions, projection and blending.
 
-Between them stand the projected centres, a tensor of their own, so that densification can read its gradient.
+The projected centres between them are a tensor of their own, so that densification can read its gradient.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,34 +28,32 @@ from rewild4d.rasterizer.stages import bin_and_blend, blend_back, project_and_so
 keep_freed_memory()
 
 SERIAL_BELOW = 512
-"""Gaussians for which waking a second thread costs more than it saves."""
+"""Number of Gaussians up to which one thread is fastest."""
 
 MOST_PARTS = 4
-"""A view's Gaussians are marked in at most so many parts: one thread adds up the square of that many counts a tile."""
+"""Most parts in which a view's Gaussians are marked: one thread adds the square of that many counts a tile."""
 
 
 def rasterize(given: RasterInput) -> Rendered:
     """Render like `rewild4d.rasterizer.rasterize`, on float32 CPU input."""
-    means, quats, scales, opacities, features, world_to_camera, intrinsics, width, height, background, *_ = given
-    means2d, records, radii, *binning = _Project.apply(
-        means, quats, scales, opacities, world_to_camera, intrinsics, given.options
-    )
+    features, world_to_camera, intrinsics, width, height, background = given[4:10]
+    means2d, records, radii, *binning = _Project.apply(given.options, *given[:4], world_to_camera, intrinsics)
     if means2d.requires_grad:
         means2d.retain_grad()
     if background is None:
         background = features.new_zeros(world_to_camera.shape[0], features.shape[1])
     crowd = CROWD if world_to_camera.requires_grad or intrinsics.requires_grad else NOWHERE
-    image, alpha = _Blend.apply(means2d, records, features, background, *binning, width, height, crowd)
+    image, alpha = _Blend.apply(means2d, records, features, background, binning, (width, height), crowd)
     return image, alpha, RasterInfo(radii, means2d)
 
 
 def _zeros(*shape: int) -> Tensor:
-    # Not torch's: filled by its OpenMP threads, which then spin and take the cores from the next kernel.
+    # torch's OpenMP threads would keep spinning and take the cores from the next kernel
     return torch.from_numpy(np.zeros(shape, np.float32))
 
 
 def _padded(tensor: Tensor, rows: int, dimension: int = 0) -> Tensor:
-    """Return the tensor with zeros below, where it has fewer rows: kernels take Gaussians by the eight."""
+    """Return the tensor padded with zeros to a number of rows: kernels take eight Gaussians at a time."""
     missing = rows - tensor.shape[dimension]
     if missing == 0:
         return tensor
@@ -70,23 +67,16 @@ def _table(rows: Sequence[tuple[int, ...]], columns: int) -> np.ndarray:
 
 
 class _Project(torch.autograd.Function):
-    """World to image: centres [V, N, 2] and records [V, N, 8].
+    """Project means, quats, scales and opacities by world_to_camera and intrinsics.
 
-    And without gradients radii, depths and order [V, N], tiles [V, N, 4], slots [V, N + 1] and counts [V], see
-    `project_and_sort`.
+    Returns centres [V, N, 2] and records [V, N, 8]; without gradients radii, depths and order [V, N], tiles [V, N, 4],
+    slots [V, N + 1] and counts [V], see `project_and_sort`.
     """
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        world_to_camera: Tensor,
-        intrinsics: Tensor,
-        options: Options,
-    ) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, options: Options, *inputs: Tensor) -> tuple[Tensor, ...]:
+        *gaussian_tensors, world_to_camera, intrinsics = inputs
+        means = inputs[0]
         views, count = world_to_camera.shape[0], means.shape[0]
         room = max(count, WIDTH)
         means2d, records = means.new_empty(views, room, 2), means.new_empty(views, room, RECORD)
@@ -94,7 +84,7 @@ class _Project(torch.autograd.Function):
         depths = torch.empty(views, room, dtype=torch.float64)
         tiles, slots = means.new_empty(views, room, 4), torch.empty(views, room + 1, dtype=torch.int64)
         counts = np.empty(views, np.int64)
-        gaussians = tuple(array(_padded(tensor, room)).ravel() for tensor in (means, quats, scales, opacities))
+        gaussians = tuple(array(_padded(tensor, room)).ravel() for tensor in gaussian_tensors)
         cameras = array(world_to_camera).astype(np.float64), array(intrinsics).astype(np.float64)
         threads = thread_count() if count * views > SERIAL_BELOW else 1
         bounds = _table(spans(room, min(threads, room // WIDTH)), 2)  # `project` takes eight at a time
@@ -108,7 +98,7 @@ class _Project(torch.autograd.Function):
         if room > count:
             outputs = [tensor[:, : count + (tensor is slots)].contiguous() for tensor in outputs]
         outputs.append(torch.from_numpy(counts))
-        ctx.save_for_backward(means, quats, scales, opacities, world_to_camera, intrinsics, outputs[2])
+        ctx.save_for_backward(*inputs, outputs[2])
         ctx.options = options
         ctx.mark_non_differentiable(*outputs[2:])
         ctx.set_materialize_grads(True)
@@ -128,7 +118,7 @@ class _Project(torch.autograd.Function):
         shared = tuple(array(_padded(tensor, room, 1)).ravel() for tensor in (radii, g_means2d, g_records))
         bounds = _table(spans(room, -(-room // CHUNK)), 2)
         v_cameras = np.zeros((len(bounds), views * CAMERA * WIDTH))
-        with_cameras = any(ctx.needs_input_grad[4:6])
+        with_cameras = any(ctx.needs_input_grad[5:7])
         call = (
             np.zeros(1, np.int64), bounds, arrays, cameras, ctx.options, with_cameras, *shared, outputs, v_cameras,
         )  # fmt: skip
@@ -139,11 +129,10 @@ class _Project(torch.autograd.Function):
             v_world_to_camera, v_intrinsics = torch.zeros_like(world_to_camera), torch.zeros_like(intrinsics)
             v_world_to_camera[:, :3] = totals[:, :12].view(views, 3, 4).to(world_to_camera)
             v_intrinsics[:, (0, 1, 0, 1), (0, 1, 2, 2)] = totals[:, 12:].to(intrinsics)
-        return *(gradient[:count] for gradient in gradients), v_world_to_camera, v_intrinsics, None
+        return None, *(gradient[:count] for gradient in gradients), v_world_to_camera, v_intrinsics
 
 
-@dataclass(frozen=True)
-class _Lists:
+class _Lists(NamedTuple):
     """The tiles' Gaussians, front to back, of one call (see binning.py)."""
 
     tiles: tuple[int, int]
@@ -154,40 +143,29 @@ class _Lists:
 
 
 class _Blend(torch.autograd.Function):
-    """Image-space Gaussians to features [V, C, h, w] and alpha [V, 1, h, w]."""
+    """Blend image-space Gaussians to features [V, C, h, w] and alpha [V, 1, h, w]; ``binning`` is from `_Project`."""
 
     @staticmethod
     def forward(
-        ctx: Any,
-        means2d: Tensor,
-        records: Tensor,
-        features: Tensor,
-        background: Tensor,
-        depths: Tensor,
-        order: Tensor,
-        tiles: Tensor,
-        slots: Tensor,
-        counts: Tensor,
-        width: int,
-        height: int,
-        crowd: int,
-    ) -> tuple[Tensor, Tensor]:
-        views, channels = records.shape[0], features.shape[1]
+        ctx: Any, means2d: Tensor, records: Tensor, features: Tensor, background: Tensor, binning: Sequence[Tensor],
+        size: tuple[int, int], crowd: int,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        (views, channels), (width, height) = (records.shape[0], features.shape[1]), size
+        depths, order, tiles, slots, counts = (tensor.numpy() for tensor in binning)
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-        numbers = slots.numpy()
-        threads = thread_count() if sum(counts.tolist()) > SERIAL_BELOW else 1
+        threads = thread_count() if counts.sum() > SERIAL_BELOW else 1
         parts = min(threads, MOST_PARTS)
-        pairs = int(numbers[-1, -1])
+        pairs = int(slots[-1, -1])
         lists = _Lists(
-            (tiles_x, tiles_y), numbers, np.empty(pairs, np.uint16),
+            (tiles_x, tiles_y), slots, np.empty(pairs, np.uint16),
             (np.empty(views * tiles_x * tiles_y + 1, np.int64), np.empty(pairs, np.int32), np.empty(pairs, np.int32),
              np.empty(pairs, np.uint16)),
         )  # fmt: skip
         image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
         through = np.empty(alpha.numel() if ctx.needs_input_grad[3] else 0, np.float32)
         call = (
-            phase_counters(3), np.zeros(1, np.int64), counts.numpy(), depths.numpy(), order.numpy(), tiles.numpy(),
-            numbers, tiles_x, tiles_y, BLOCK_LEFT, BLOCK_TOP, np.empty(pairs, np.int32), lists.pair_bits,
+            phase_counters(3), np.zeros(1, np.int64), counts, depths, order, tiles, slots, tiles_x, tiles_y,
+            BLOCK_LEFT, BLOCK_TOP, np.empty(pairs, np.int32), lists.pair_bits,
             np.zeros((parts, parts, views * tiles_x * tiles_y), np.int32), lists.entries, CONSTANTS, records.numpy(),
             array(features).ravel(), array(background), image.numpy(), alpha.numpy(), through,
         )  # fmt: skip
@@ -201,12 +179,11 @@ class _Blend(torch.autograd.Function):
     def backward(ctx: Any, g_image: Tensor, g_alpha: Tensor) -> tuple[Tensor | None, ...]:
         records, features, background, image, alpha = ctx.saved_tensors
         lists: _Lists = ctx.lists
-        channels = features.shape[1]
-        width = slot_width(channels)
+        width = slot_width(features.shape[1])
         sums = records.new_empty(len(lists.pair_bits) * width).numpy()  # torch's memory begins with a cache line
         v_means2d, v_records = _zeros(*records.shape[:2], 2), _zeros(*records.shape)
         v_features = _zeros(*features.shape)
-        threads = _blend_threads(lists)
+        threads = thread_count() if len(lists.pair_bits) > SERIAL_BELOW else 1
         call = (
             phase_counters(2), np.zeros(1, np.int64), _table(spans(records.shape[1], threads), 2),
             *lists.tiles, lists.entries, lists.pair_bits, records.numpy(), array(features).ravel(), array(background),
@@ -217,8 +194,4 @@ class _Blend(torch.autograd.Function):
         v_background = None
         if ctx.needs_input_grad[3]:
             v_background = (g_image * ctx.through.view_as(alpha)).sum(dim=(2, 3))
-        return v_means2d, v_records, v_features, v_background, *[None] * 8
-
-
-def _blend_threads(lists: _Lists) -> int:
-    return thread_count() if len(lists.pair_bits) > SERIAL_BELOW else 1
+        return v_means2d, v_records, v_features, v_background, None, None, None

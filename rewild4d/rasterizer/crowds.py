@@ -1,7 +1,7 @@
-"""The gradient of one tile in double precision, for tiles where hundreds of Gaussians meet.
+"""The gradient of one tile in double precision, for tiles with hundreds of Gaussians.
 
-A camera's gradient is a sum over all Gaussians. Where thousands share a pixel their shares cancel to a thousandth, and
-an error that they have in common, as single precision makes in the transmittance, is left standing.
+A camera's gradient is a sum over all Gaussians. Where thousands overlap, their shares cancel to a thousandth, but their
+common error from a transmittance in single precision does not.
 """
 
 import math
@@ -25,17 +25,17 @@ from rewild4d.rasterizer.projection import (
 )
 
 CROWD = 256
-"""Gaussians in a tile's list above which it is walked in double precision, if the cameras' gradients are wanted."""
+"""Gaussians in a tile's list above which its gradient is in double precision, if cameras need gradients."""
 
 NOWHERE = np.iinfo(np.int64).max
-"""Stands for `CROWD` where nobody wants them."""
+"""In place of `CROWD` if they need none."""
 
 _PIXELS = BLOCK * BLOCK
 
 
 @inlined
 def _alpha_at(records: np.ndarray, record: int, x: float, y: float) -> tuple:
-    """Alpha of a Gaussian at a point, its log2 before the upper cut, and the point's coordinates t and u in it."""
+    """Return alpha of a Gaussian at a point, its log2 before the upper cut, and the point's coordinates t and u."""
     dx = x - records[record + CENTER_X] - records[record + REST_X]
     dy = y - records[record + CENTER_Y] - records[record + REST_Y]
     t, u = records[record + ALONG_X] * dx + records[record + ALONG_Y] * dy, records[record + DOWN] * dy
@@ -46,7 +46,7 @@ def _alpha_at(records: np.ndarray, record: int, x: float, y: float) -> tuple:
 
 @inlined
 def _take(left: np.ndarray, pixel: int, alpha: float) -> float:
-    """The weight of the next Gaussian at a pixel; what is left of the light is negative once the pixel has closed."""
+    """Return the weight of the next Gaussian at a pixel; ``left``, the transmittance, is negative in a closed pixel."""
     before = left[pixel]
     if before <= 0 or alpha == 0:
         return 0.0
@@ -77,7 +77,7 @@ def _place(pixel: int, tile_left: int, tile_top: int) -> tuple:
 def _open(
     view: int, tile_left: int, tile_top: int, g_image: np.ndarray, left: np.ndarray, gradients: np.ndarray
 ) -> None:
-    """Set the light left to 1 inside the image and 0 outside; read the gradients of the tile's pixels."""
+    """Set the transmittance to 1 inside the image and 0 outside; read the gradients of the tile's pixels."""
     _, channels, height, width = g_image.shape
     for pixel in range(len(left)):
         x, y = _place(pixel, tile_left, tile_top)
@@ -95,26 +95,17 @@ def crowd_backward(
     """Fill the rows of ``sums`` of one tile, as `blend_backward` of blending_backward.py does.
 
     Args:
-        view: the tile's view.
-        tile_left: its first column.
-        tile_top: its first row.
-        slots: of its list, front to back.
-        gaussians: of its list.
-        listed_bits: the blocks of the tile where each contributes or closes a pixel.
-        records: flat.
-        features: flat.
-        background: [V, C].
-        g_image: [V, C, h, w].
-        g_alpha: [V, 1, h, w].
-        first_channel: place in a row where the channels' sums begin.
-        row_length: numbers in a row.
-        sums: flat, set.
+        slots, gaussians: of the tile's list, front to back.
+        listed_bits: the blocks of the tile where each Gaussian contributes or closes a pixel.
+        first_channel: index in a row of the first channel sum.
+        row_length: numbers in a row of ``sums``, which is flat like ``records`` and ``features``.
+        background: [V, C]; g_image is [V, C, h, w], g_alpha [V, 1, h, w].
     """
     views, channels = g_image.shape[:2]
     count = len(records) // (RECORD * views)
     left, gradients = np.empty(BLOCKS * _PIXELS), np.empty((channels, BLOCKS * _PIXELS))
     behind, row = np.zeros(BLOCKS * _PIXELS), np.empty(row_length)
-    for again in range(2):  # the pixels' totals come first
+    for again in range(2):  # first the pixels' totals
         _open(view, tile_left, tile_top, g_image, left, gradients)
         for entry in range(len(slots)):
             bits, n = np.int64(listed_bits[entry]), gaussians[entry]
@@ -136,7 +127,7 @@ def crowd_backward(
                     behind[pixel] -= along
                     for channel in range(channels):
                         row[first_channel + channel] += weight * gradients[channel, pixel]
-                    if exponent <= math.log2(MAX_ALPHA):  # the cap holds the others
+                    if exponent <= math.log2(MAX_ALPHA):  # no gradient above the cap
                         pull = along - behind[pixel] * alpha / (1 - alpha)
                         row[0] += pull
                         row[1] += pull * t
@@ -155,12 +146,12 @@ def _add_background(
     view: int, tile_left: int, tile_top: int, background: np.ndarray, gradients: np.ndarray, g_alpha: np.ndarray,
     left: np.ndarray, behind: np.ndarray,
 ) -> None:  # fmt: skip
-    """Add to the pixels' totals what the loss sees through all Gaussians."""
+    """Add the share of the background and alpha to the pixels' totals."""
     height, width = g_alpha.shape[2:]
     for pixel in range(len(left)):
         x, y = _place(pixel, tile_left, tile_top)
         if x < width and y < height:
-            slope = -np.float64(g_alpha[view, 0, y, x])
+            gradient = -np.float64(g_alpha[view, 0, y, x])
             for channel in range(len(gradients)):
-                slope += gradients[channel, pixel] * background[view, channel]
-            behind[pixel] += abs(left[pixel]) * slope
+                gradient += gradients[channel, pixel] * background[view, channel]
+            behind[pixel] += abs(left[pixel]) * gradient

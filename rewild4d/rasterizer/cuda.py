@@ -1,7 +1,6 @@
-"""The CUDA backend: Triton kernels behind two autograd functions, and one sort of torch's between them."""
+"""The CUDA backend: Triton kernels behind two autograd functions, with a sort by torch between them."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import triton
@@ -26,9 +25,9 @@ LAUNCHES: dict[str, dict[str, Any]] = {
     "gather": {"num_warps": 1},
     "project_backward": {"num_warps": 2},
 }
-"""How each kernel runs; for blending the fastest of groups of 2 to 16 Gaussians on 1 to 8 warps, on an H100."""
+"""Launch settings; for blending the fastest of groups of 2 to 16 Gaussians on 1 to 8 warps, on an H100."""
 MOST_CHANNELS = 16
-"""What one program blends; for more of them the tile is walked again."""
+"""Most channels that one program blends; a tile has a program for each part of more channels."""
 
 
 def rasterize(given: RasterInput) -> Rendered:
@@ -48,42 +47,35 @@ def rasterize(given: RasterInput) -> Rendered:
         "world_to_camera": world_to_camera, "intrinsics": intrinsics, "features": features, "background": background,
     }  # fmt: skip
     if not len(means):
-        check_values(named)  # no kernel looks
+        check_values(named)  # no kernel does
     *inputs, features, background = (tensor.contiguous() for tensor in named.values())
     shades = (features.detach(), background.detach())
     with torch.cuda.device_of(means):
-        means2d, rests, records, radii, keys, wides, tiles = _Project.apply(*inputs, shades, given.options)
+        means2d, rests, records, radii, keys, wides, tiles = _Project.apply(given.options, shades, *inputs)
         if means2d.requires_grad:
             means2d.retain_grad()
         lists = _list_tiles(keys, wides, tiles, views, across, down)
         if lists is None:
             check_values(named)
             raise ValueError(f"expected fewer than {UNUSABLE} pairs of a Gaussian and a tile that it touches.")
-        image, alpha = _Blend.apply(means2d, rests, records, features, background, lists, width, height)
+        image, alpha = _Blend.apply(means2d, rests, records, features, background, lists, (width, height))
     return image, alpha, RasterInfo(radii, means2d)
 
 
 class _Project(torch.autograd.Function):
-    """World to image: centres [V, N, 2] and records [V, N, 4].
+    """Project means, quats, scales and opacities by world_to_camera and intrinsics; ``shades`` are checked.
 
-    And without gradients what the centres have beyond single precision [V, N, 2], radii, keys, wides and tiles [V, N].
+    Returns centres [V, N, 2] and records [V, N, 4]; without gradients the rest of the centres beyond single precision
+    [V, N, 2], radii, keys, wides and tiles [V, N].
     """
 
     @staticmethod
     def forward(
-        ctx: Any,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        world_to_camera: Tensor,
-        intrinsics: Tensor,
-        shades: tuple[Tensor, Tensor],
-        options: Options,
+        ctx: Any, options: Options, shades: tuple[Tensor, Tensor], means: Tensor, *others: Tensor
     ) -> tuple[Tensor, ...]:
-        views, count = len(world_to_camera), len(means)
+        inputs = (means, *others)
+        views, count = len(inputs[4]), len(means)
         width, height, eps2d, antialias, near = options
-        inputs = (means, quats, scales, opacities, world_to_camera, intrinsics)
         means2d, records = means.new_empty(views, count, 2), means.new_empty(views, count, RECORD)
         radii, keys = means.new_empty(views, count), means.new_empty(views, count, dtype=torch.int64)
         wides, tiles = torch.empty_like(radii, dtype=torch.int32), torch.empty_like(radii, dtype=torch.int32)
@@ -105,7 +97,7 @@ class _Project(torch.autograd.Function):
         *inputs, radii = ctx.saved_tensors
         (world_to_camera, intrinsics), g_records = inputs[4:], rest[1]
         (views, count), (width, height, eps2d, antialias, _) = radii.shape, ctx.options
-        blocks, with_cameras = triton.cdiv(count, BLOCK), any(ctx.needs_input_grad[4:6])
+        blocks, with_cameras = triton.cdiv(count, BLOCK), any(ctx.needs_input_grad[6:8])
         gradients = [torch.empty_like(tensor) for tensor in inputs[:4]]
         v_cameras = radii.new_empty(blocks if with_cameras else 0, views, CAMERA, dtype=torch.float64)
         with torch.cuda.device_of(radii):
@@ -120,18 +112,17 @@ class _Project(torch.autograd.Function):
             v_world_to_camera, v_intrinsics = torch.zeros_like(world_to_camera), torch.zeros_like(intrinsics)
             v_world_to_camera[:, :3] = totals[:, :12].view(views, 3, 4)
             v_intrinsics[:, (0, 1, 0, 1), (0, 1, 2, 2)] = totals[:, 12:]
-        return *gradients, v_world_to_camera, v_intrinsics, None, None
+        return None, None, *gradients, v_world_to_camera, v_intrinsics
 
 
-@dataclass(frozen=True)
-class _TileLists:
-    """Which Gaussian touches which tile, front to back. A row is a view and a Gaussian: view * N + Gaussian.
+class _TileLists(NamedTuple):
+    """The Gaussians of each tile, front to back. A row is a view and a Gaussian: view * N + Gaussian.
 
     Attributes:
         tiles: tiles across and down.
-        starts: where the list of each tile of each view begins in ``entries``, and their end, [V * tiles + 1].
+        starts: first index in ``entries`` of the list of each tile of each view, and their end, [V * tiles + 1].
         entries: rows, tile by tile, nearest first, [E].
-        slots: each entry's own place in an order that has the entries of one row side by side, [E].
+        slots: each entry's index in an order by rows, [E].
         counts: entries of each row, [V, N].
         ends: their running sum, [V * N].
     """
@@ -150,11 +141,9 @@ def _list_tiles(keys: Tensor, wides: Tensor, counts: Tensor, views: int, across:
 
     Args:
         keys: of the first tile of each row, see `triton_project.project`, [V, N].
-        wides: tiles across each rectangle, [V, N].
-        counts: tiles of each rectangle, [V, N].
+        wides, counts: tiles across and of each rectangle, [V, N].
         views: V.
-        across: tiles across an image.
-        down: tiles down an image.
+        across, down: tiles across and down an image.
     """
     rows, number = counts.numel(), views * across * down + 1
     ends = counts.flatten().cumsum(0)
@@ -175,21 +164,14 @@ def _list_tiles(keys: Tensor, wides: Tensor, counts: Tensor, views: int, across:
 
 
 class _Blend(torch.autograd.Function):
-    """Image-space Gaussians to features [V, C, h, w] and alpha [V, 1, h, w]."""
+    """Blend image-space Gaussians to features [V, C, h, w] and alpha [V, 1, h, w]."""
 
     @staticmethod
     def forward(
-        ctx: Any,
-        means2d: Tensor,
-        rests: Tensor,
-        records: Tensor,
-        features: Tensor,
-        background: Tensor,
-        lists: _TileLists,
-        width: int,
-        height: int,
-    ) -> tuple[Tensor, Tensor]:
-        views, (count, channels) = len(records), features.shape
+        ctx: Any, means2d: Tensor, rests: Tensor, records: Tensor, features: Tensor, background: Tensor,
+        lists: _TileLists, size: tuple[int, int],
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        views, (count, channels), (width, height) = len(records), features.shape, size
         image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
         part = min(MOST_CHANNELS, triton.next_power_of_2(channels))
         triton_blend.blend[(len(lists.starts) - 1, triton.cdiv(channels, part))](
@@ -221,4 +203,4 @@ class _Blend(torch.autograd.Function):
             )  # fmt: skip
         v_background = (g_image * (1 - alpha)).sum(dim=(2, 3)) if ctx.needs_input_grad[4] else None
         v_means2d, v_records, v_features = gradients
-        return v_means2d, None, v_records, v_features, v_background, None, None, None
+        return v_means2d, None, v_records, v_features, v_background, None, None

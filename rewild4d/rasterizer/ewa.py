@@ -1,4 +1,4 @@
-"""EWA projection in differentiable torch, for one camera or a batch of them: the definition, for the reference."""
+"""EWA projection in differentiable torch, for one camera or a batch of them, for the reference backend."""
 
 import torch
 from torch import Tensor
@@ -36,7 +36,7 @@ def project(
     focal = torch.stack((intrinsics[..., 0, 0], intrinsics[..., 1, 1]), dim=-1)[..., None, :]
     centre = intrinsics[..., None, :2, 2]
     ratio = local[..., :2] / safe[..., None]
-    # Far outside the frame the linearisation is meaningless and huge; the limits are constants, as in gsplat.
+    # the linearisation diverges far outside the frame; the limits are constants, as in gsplat
     size = focal.new_tensor((width, height))
     margin = FRUSTUM_MARGIN * 0.5 * size / focal.detach()
     low, high = -(centre / focal).detach() - margin, ((size - centre) / focal).detach() + margin
@@ -57,15 +57,15 @@ def project(
 
 
 def determinant(matrix: Tensor) -> Tensor:
-    """Of 2 x 2 matrices, [..., 2, 2] -> [...]."""
+    """Return the determinants of 2 x 2 matrices, [..., 2, 2] -> [...]."""
     return matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0]
 
 
 @torch.no_grad()
-def reach(
+def radii(
     centres: Tensor, cov2d: Tensor, depths: Tensor, opacities: Tensor, width: int, height: int, near: float
 ) -> Tensor:
-    """Compute how far from its centre a Gaussian is drawn: where alpha falls to 1/255.
+    """Return the distance from its centre at which a Gaussian's alpha falls to 1/255.
 
     Args:
         centres: in pixels, [..., N, 2].
@@ -74,7 +74,7 @@ def reach(
         opacities: as seen, antialiasing included, [..., N].
         width: image width in pixels.
         height: image height in pixels.
-        near: depth from which on Gaussians are drawn.
+        near: least depth at which Gaussians are drawn.
 
     Returns:
         Radii along the longest axis, 0 where nothing can be drawn, [..., N].

@@ -1,7 +1,7 @@
-"""gsplat (Apache-2.0, an optional package) behind the same function: for parity, and for very many Gaussians.
+"""The gsplat backend (Apache-2.0, an optional package): for parity, and for very many Gaussians.
 
-What differs in gsplat 1.5.3 stands in CONVENTIONS.md: the cap of alpha, the radii, no gradient for the intrinsics, and
-sums that are added atomically, so that the last bits vary between runs.
+CONVENTIONS.md lists what differs in gsplat 1.5.3: the cap of alpha, the radii, no gradient for the intrinsics, and
+atomic sums, whose last bits vary between runs.
 """
 
 import gsplat

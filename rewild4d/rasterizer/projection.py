@@ -1,10 +1,9 @@
-"""EWA projection: eight Gaussians at a time, in double precision, as records that the blend reads.
+"""EWA projection: eight Gaussians at a time, in double precision, to records that the blend reads.
 
-A record holds, per view and Gaussian, what one pixel's alpha takes: alpha = 2 ** (exponent), with d = pixel - centre,
-exponent = LOG_OPACITY - t^2 - u^2, t = ALONG_X dx + ALONG_Y dy, u = DOWN dy. A sum of squares loses nothing to
-cancellation, as the form's expansion does for needles. The centre is CENTER + REST, two single numbers, so that far
-from the image's corner it is as exact as near it. The record of an invisible Gaussian is zero. projection_backward.py
-has the gradient.
+A record, per view and Gaussian, gives alpha = 2 ** (exponent) of a pixel, with d = pixel - centre,
+exponent = LOG_OPACITY - t^2 - u^2, t = ALONG_X dx + ALONG_Y dy, u = DOWN dy. A sum of squares has no cancellation,
+unlike the expanded form of thin Gaussians. The centre is CENTER + REST, two single numbers, equally exact in the whole
+image. The record of an invisible Gaussian is zero. projection_backward.py has the gradient.
 """
 
 import math
@@ -20,7 +19,7 @@ from rewild4d.rasterizer.conventions import FRUSTUM_MARGIN, MIN_ALPHA, MIN_COMPE
 CENTER_X, CENTER_Y, ALONG_X, ALONG_Y, DOWN, LOG_OPACITY, REST_X, REST_Y, RECORD = 0, 1, 2, 3, 4, 5, 6, 7, 8
 
 TILE = 16
-"""A tile has as many pixels each way."""
+"""Side of a tile in pixels."""
 
 HALF_LOG2_E = 0.5 / math.log(2.0)
 LOG2_MIN_ALPHA = math.log2(MIN_ALPHA)
@@ -85,7 +84,7 @@ def rotation_columns(w: Any, x: Any, y: Any, z: Any) -> tuple:
 
 @inlined
 def slope_limits(focal: float, center: float, size: int) -> tuple:
-    """Between which x / z the Jacobian is taken: a little outside the frame."""
+    """Return the limits of x / z for the Jacobian, a little outside the frame."""
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
     return spread(-center / focal - margin), spread((size - center) / focal + margin)
 
@@ -100,7 +99,7 @@ def clamp(value: Any, limits: tuple) -> Any:
 
 @inlined
 def image_axes(linear_x: tuple, linear_y: tuple, axes: tuple, scales: tuple) -> tuple:
-    """Return the Gaussian's half axes in the image, two rows of three: covariance = rows times their transpose."""
+    """Return the Gaussian's half axes in the image, rows of three: covariance = rows times their transpose."""
     a, b, c = scales
     row_x = dot(linear_x, axes[0]) * a, dot(linear_x, axes[1]) * b, dot(linear_x, axes[2]) * c
     row_y = dot(linear_y, axes[0]) * a, dot(linear_y, axes[1]) * b, dot(linear_y, axes[2]) * c
@@ -116,7 +115,7 @@ def factor(xx: Any, xy: Any, yy: Any, det: Any) -> tuple:
 
 @inlined
 def _in_two(value: Any) -> tuple:
-    """Split a value into a number that single precision holds and the rest (Dekker 1971)."""
+    """Split a value into its single precision and the rest (Dekker 1971)."""
     shifted = value * 536870913.0  # 2^29 + 1: 53 digits less 24
     high = shifted - (shifted - value)
     return high, value - high
@@ -136,12 +135,12 @@ def _shown(
 
 @inlined
 def _tile_span(shown: Any, center: Any, extent: Any, size: int) -> tuple:
-    """First and one past the last tile, along one axis, with a pixel centre within the extent; equal where none."""
+    """Return the first and one past the last tile, along one axis, with a pixel centre in the extent; equal if none."""
     zero, last = spread(0.0), spread(float(-(-size // TILE) * TILE - 1))
-    reach = extent * 1.0001
-    first = 0.0 - floor(reach - center + 0.5)
+    half = extent * 1.0001
+    first = 0.0 - floor(half - center + 0.5)
     first = where_gt(zero, first, zero, first)
-    end = floor(center + reach - 0.5)
+    end = floor(center + half - 0.5)
     end = where_gt(end, last, last, end)
     shown = where_gt(first, end, zero, shown)
     first, end = floor(first * (1 / TILE)), floor(end * (1 / TILE)) + 1.0
@@ -150,7 +149,7 @@ def _tile_span(shown: Any, center: Any, extent: Any, size: int) -> tuple:
 
 @inlined
 def _number_slots(view: int, begin: int, end: int, count: int, tiles: np.ndarray, slots: np.ndarray) -> int:
-    """Number the (Gaussian, tile) pairs of begin..end in one view from 0; give how many there are."""
+    """Number the (Gaussian, tile) pairs of begin..end in one view from 0; return their number."""
     number = 0
     for n in range(begin, end):
         slots[view * (count + 1) + n] = number
@@ -170,7 +169,7 @@ def project(
     At least eight of them. ``gaussians`` are means, quats, scales and opacities, ``cameras`` world_to_camera and
     intrinsics, ``options`` width, height, eps2d, antialias and near. A row of tiles holds the first and one past the
     last column and row of a Gaussian's bounding rectangle; slots [V, N + 1] numbers the tiles of these rectangles from
-    0 in each view, and totals [V] says how many there are. All arrays but the cameras' are flat.
+    0 in each view, and totals [V] is their number. All arrays but the cameras' are flat.
     """
     means, quats, scales, opacities = gaussians
     world_to_camera, intrinsics = cameras
@@ -202,15 +201,15 @@ def project(
                 share = (raw_xx * raw_yy - xy * xy) / det
                 drawn = opacity * root(where_gt(share, spread(MIN_COMPENSATION), share, spread(MIN_COMPENSATION)))
             log_opacity = log2(drawn)
-            reach = (log_opacity - LOG2_MIN_ALPHA) * (1 / HALF_LOG2_E)
-            extent_x, extent_y = root(reach * xx), root(reach * yy)
+            support = (log_opacity - LOG2_MIN_ALPHA) * (1 / HALF_LOG2_E)
+            extent_x, extent_y = root(support * xx), root(support * yy)
             shown = _shown(drawn, det, z, near, u, v, extent_x, extent_y, (width, height))
             center_x, center_y = where_gt(z, spread(near), u, zero), where_gt(z, spread(near), v, zero)
             row = view * count + n
             store_columns(means2d, 2 * row, (center_x, center_y))
             if any_gt(shown, zero):
                 spread_xy = 0.5 * (xx - yy)
-                radius = root(reach * (0.5 * (xx + yy) + root(spread_xy * spread_xy + xy * xy)))
+                radius = root(support * (0.5 * (xx + yy) + root(spread_xy * spread_xy + xy * xy)))
                 along_x, along_y, down = factor(xx, xy, yy, det)
                 left, right = _tile_span(shown, u, extent_x, width)
                 top, bottom = _tile_span(shown, v, extent_y, height)

@@ -35,7 +35,7 @@ CAMERA = 16
 """Numbers of a camera's gradient: the upper three rows of world_to_camera, then fx, fy, cx, cy."""
 
 CHUNK = 1024
-"""Gaussians a unit of work holds; the camera's gradient is summed over these, whatever the number of threads."""
+"""Gaussians in a unit of work; the camera's gradient is summed by these for any number of threads."""
 
 
 @inlined
@@ -83,7 +83,7 @@ def _rotation_gradient(quat: tuple, a: tuple, b: tuple, c: tuple) -> tuple:
 def _pinhole_gradient(
     slope: Any, near_by: Any, focal: float, limits: tuple, g_center: Any, g_direct: Any, g_depth: Any
 ) -> tuple:
-    """One image axis: gradients of (slope x / z, z, focal) from those of the centre and the Jacobian's two entries."""
+    """Return gradients of (x / z, z, focal) along one axis from those of the centre and the Jacobian's entries."""
     tangent = clamp(slope, limits)
     inside = where_gt(slope, limits[0], where_gt(limits[1], slope, g_depth, spread(0.0)), spread(0.0))
     g_slope = focal * (g_center - inside * near_by)
@@ -122,8 +122,8 @@ def project_backward(
 ) -> None:  # fmt: skip
     """Fill v_gaussians for Gaussians begin..end, at least eight; add to this chunk's own zeroed v_cameras.
 
-    v_cameras is [V, 16, 8], double precision, to be summed over the last axis; left alone unless with_cameras. All
-    arrays but the cameras are flat; the first arguments are those of `project`.
+    v_cameras is [V, 16, 8], double precision, to be summed over the last axis; it is used only with_cameras. All arrays
+    but the cameras are flat; the first arguments are those of `project`.
     """
     means, quats, scales, opacities = gaussians
     world_to_camera, intrinsics = cameras
@@ -155,7 +155,7 @@ def project_backward(
             half_x, half_y = image_axes(linear_x, linear_y, axes, scale)
             record = load_columns(g_records, RECORD * row, RECORD)
             g_u, g_v = load_columns(g_means2d, 2 * row, 2)
-            # Lanes that nobody sees get a harmless covariance and no gradient.
+            # invisible lanes get a valid covariance and no gradient
             g_u, g_v = where_gt(radius, zero, g_u, zero), where_gt(radius, zero, g_v, zero)
             raw_xx, raw_yy = (
                 where_gt(radius, zero, dot(half_x, half_x), spread(1.0)),
@@ -167,7 +167,7 @@ def project_backward(
             )  # fmt: skip
             v_opacity = v_opacity + record[LOG_OPACITY]
             v_half_x, v_half_y = mix(2 * v_xx, half_x, v_xy, half_y), mix(v_xy, half_x, 2 * v_yy, half_y)
-            # Column k of (rotation x scales) has gradient linear_x v_half_x[k] + linear_y v_half_y[k].
+            # column k of (rotation x scales) has gradient linear_x v_half_x[k] + linear_y v_half_y[k]
             column_a = added(column_a, mix(v_half_x[0], linear_x, v_half_y[0], linear_y))
             column_b = added(column_b, mix(v_half_x[1], linear_x, v_half_y[1], linear_y))
             column_c = added(column_c, mix(v_half_x[2], linear_x, v_half_y[2], linear_y))

@@ -1,6 +1,6 @@
-"""The oracle: dense torch, every Gaussian against every pixel, any float type, gradients by autograd.
+"""The reference backend in dense torch: every Gaussian at every pixel, any float type, gradients by autograd.
 
-It defines what the fast backends must compute. Time and memory grow with N x width x height: small scenes only.
+It defines what the fast backends compute. Time and memory grow with N x width x height: small scenes only.
 """
 
 import torch
@@ -14,8 +14,8 @@ from rewild4d.transforms import quat_to_matrix
 def rasterize(given: RasterInput) -> Rendered:
     """Render like `rewild4d.rasterizer.rasterize`."""
     means, quats, scales, opacities, features, world_to_camera, intrinsics, width, height, background, *_ = given
-    still = quats.new_tensor((1.0, 0.0, 0.0, 0.0))
-    quats = torch.where((quats == 0).all(-1, keepdim=True), still, quats)  # no length: no rotation, as in the kernels
+    identity = quats.new_tensor((1.0, 0.0, 0.0, 0.0))
+    quats = torch.where((quats == 0).all(-1, keepdim=True), identity, quats)
     half = quat_to_matrix(quats) * scales[:, None, :]
     covariances = half @ half.mT
     projected = [
@@ -28,7 +28,7 @@ def rasterize(given: RasterInput) -> Rendered:
     images, alphas, radii = [], [], []
     for view, (_, cov2d, depths, compensation) in enumerate(projected):
         visible_opacities = opacities * compensation if given.antialias else opacities
-        radii.append(ewa.reach(means2d[view], cov2d, depths, visible_opacities, width, height, given.near))
+        radii.append(ewa.radii(means2d[view], cov2d, depths, visible_opacities, width, height, given.near))
         image, alpha = _blend(means2d[view], cov2d, depths, visible_opacities, features, radii[view] > 0, width, height)
         if background is not None:
             image = image + (1 - alpha) * background[view][:, None, None]
@@ -47,7 +47,7 @@ def _blend(
     width: int,
     height: int,
 ) -> tuple[Tensor, Tensor]:
-    """Front-to-back compositing of the visible Gaussians: premultiplied features [C, h, w] and alpha [1, h, w]."""
+    """Composite the visible Gaussians front to back: premultiplied features [C, h, w] and alpha [1, h, w]."""
     chosen = visible.nonzero()[:, 0]
     chosen = chosen[depths.detach()[chosen].argsort(stable=True)]
     xx, xy, yy = cov2d[chosen, 0, 0], cov2d[chosen, 0, 1], cov2d[chosen, 1, 1]
@@ -60,13 +60,9 @@ def _blend(
     power = -0.5 * quadratic + (xy / det)[:, None, None] * dx * dy
     alphas = (opacities[chosen, None, None] * power.exp()).clamp_max(MAX_ALPHA)
     alphas = torch.where(alphas >= MIN_ALPHA, alphas, 0.0)
-    # Transmittance only falls, so "stopped before" is a threshold on its running product.
+    # transmittance only falls, so a closed pixel is a threshold on its running product
     open_ = (1 - alphas.detach()).cumprod(dim=0) > MIN_TRANSMITTANCE
     alphas = torch.where(open_, alphas, 0.0)
-    transmittance = (
-        torch.cat((torch.ones_like(dx[:1]).expand(1, height, width), (1 - alphas).cumprod(dim=0)))
-        if len(chosen)
-        else means2d.new_ones(1, height, width)
-    )
+    transmittance = torch.cat((means2d.new_ones(1, height, width), (1 - alphas).cumprod(dim=0)))
     image = torch.einsum("nc,nhw->chw", features[chosen], alphas * transmittance[:-1])
     return image, 1 - transmittance[-1:]

@@ -1,4 +1,4 @@
-"""The stages of a call in as few rounds of threads as their sizes allow: see kernels/phases.py."""
+"""The stages of a call, in few rounds of threads: see kernels/phases.py."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from rewild4d.rasterizer.projection_backward import project_backward
 
 @kernel
 def _join_numbers(slots: np.ndarray, bounds: np.ndarray, totals: np.ndarray) -> None:
-    """Let the slots of each view and piece, numbered from 0, go on where those before end."""
+    """Offset the slots of each view and piece, numbered from 0, by the number of those before."""
     before = 0
     for view in range(len(slots)):
         for piece in range(len(bounds)):
@@ -30,16 +30,14 @@ def project_and_sort(
     records: np.ndarray, radii: np.ndarray, depths: np.ndarray, tiles: np.ndarray, slots: np.ndarray,
     order: np.ndarray, counts: np.ndarray, totals: np.ndarray, keys: np.ndarray,
 ) -> None:  # fmt: skip
-    """Project Gaussians (`project`), number their tiles, and sort those that are seen.
+    """Project Gaussians (`project`), number their tiles, and sort the visible ones.
 
     Args:
         counters: of two phases.
         bounds: first and one past the last Gaussian of each piece, [P, 2].
-        order: set to the visible Gaussians of a view, nearest first, [V, N].
-        counts: set to their number, [V].
-        totals: scratch, [P, V].
-        keys: scratch, [V, 2, N].
-        slots: as in `project`, but running on from view to view, [V, N + 1].
+        order, counts: set to the visible Gaussians of a view, nearest first, [V, N], and their number, [V].
+        totals, keys: scratch, [P, V] and [V, 2, N].
+        slots: as in `project`, but continued from view to view, [V, N + 1].
         radii: [V, N], like depths; all other arguments as in `project`.
     """
     views = len(slots)
@@ -75,7 +73,6 @@ def bin_and_blend(
 
     Args:
         counters: of three phases.
-        tickets: of `blend`.
         counts: visible Gaussians of each view, [V].
         histograms: zero, [P, P, tiles of all views]: a view's Gaussians are marked, and scattered, in P parts.
         records: [V, N, 8]; all other arguments as in `mark_pairs`, `scatter_pairs` and `blend`.
@@ -127,11 +124,8 @@ def blend_back(
 
     Args:
         counters: of two phases.
-        tickets: of `blend_backward`.
         bounds: first and one past the last Gaussian of each piece, [P, 2].
-        features: flat.
-        v_features: zero, [N, C]; a piece goes through all views. All other arguments as in `blend_backward` and
-            `gather_slots`.
+        v_features: zero, [N, C]; all other arguments as in `blend_backward` and `gather_slots`.
     """
     enter_phase(counters, 0)
     blend_backward(

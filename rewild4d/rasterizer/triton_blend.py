@@ -1,8 +1,8 @@
 """Blending and its gradient as Triton kernels: one program a tile, one lane a pixel, a group of Gaussians at a time.
 
-Shapes inside: P pixels of a tile, G Gaussians of a group. Scans run along G, which one thread holds whole; sums along
-P cross the threads, once a group. Nothing is added atomically, so the bits never differ. The sums over channels keep
-clear of [G, C, P]: summed over C, Triton makes a product in TF32 of it, and three digits are gone.
+Shapes inside: P pixels of a tile, G Gaussians of a group. Scans run along G, within a thread; sums along P cross the
+threads once a group. Nothing is added atomically, so results are the same bits. Sums over C avoid [G, C, P], which
+Triton turns into a product in TF32 with three digits less.
 With TRITON_INTERPRET=1 in the environment before Triton is imported the same code runs on the CPU, slowly.
 """
 
@@ -14,7 +14,7 @@ import triton.language as tl
 from rewild4d.rasterizer import conventions, projection
 
 SIDE = tl.constexpr(8)
-"""A tile is 8 x 8 pixels: one warp's, so that sums over its pixels need no shared memory."""
+"""Side of a tile in pixels: one warp's, so that sums over its pixels need no shared memory."""
 PIXELS = tl.constexpr(SIDE.value**2)
 MOMENTS = tl.constexpr(6)
 """Sums of q, q t, q u, q t^2, q t u, q u^2 that come before the channel sums in a slot, q = dL/dalpha alpha."""
@@ -41,7 +41,7 @@ def _alphas(
     entries: tl.tensor, first: tl.tensor, end: tl.tensor, centres: tl.tensor, rests: tl.tensor, records: tl.tensor,
     x: tl.tensor, y: tl.tensor, GROUP: tl.constexpr,
 ) -> tuple:  # fmt: skip
-    """Return the group's Gaussians and which are any, [G]; t, u, log2 of the uncapped alpha, and alpha, [G, P]."""
+    """Return the group's Gaussians and which are valid, [G]; t, u, log2 of the uncapped alpha, and alpha, [G, P]."""
     place = first + tl.arange(0, GROUP)
     real = place < end
     n = tl.load(entries + place, real, 0)
@@ -58,9 +58,9 @@ def _alphas(
 
 @triton.jit
 def _weights(alpha: tl.tensor, left: tl.tensor) -> tuple:
-    """Return what is left behind each Gaussian were no pixel closed, and the Gaussian's share of the pixel, [G, P].
+    """Return the transmittance behind each Gaussian if no pixel closed, and the Gaussian's weight, [G, P].
 
-    ``left`` [P] only falls, so a pixel is closed exactly where it is not above the least transmittance.
+    The transmittance ``left`` [P] only falls: a pixel is closed where it is not above the least one.
     """
     after = left[None, :] * tl.cumprod(1.0 - alpha, 0)
     return after, tl.where(after > _LEAST_LEFT, after * (alpha / (1.0 - alpha)), 0.0)
@@ -109,7 +109,7 @@ def blend_backward(
 ) -> None:  # fmt: skip
     """Fill the slots' rows of the sums [E, 6 + C]; program (tile).
 
-    Walks front to back as the blend does: what lies behind a Gaussian is the pixel's total minus the prefix.
+    It goes front to back like the blend: the sum behind a Gaussian is the pixel's total minus the prefix.
     """
     tile = tl.program_id(0)
     view, x, y, inside = _pixels(tile, width, height, across, down)
@@ -118,12 +118,12 @@ def blend_backward(
     plane = pixel + view * (CHANNELS - 1) * height.to(tl.int64) * width
     area = height.to(tl.int64) * width
     left = tl.where(inside, 1.0, 0.0)
-    # The loss's linear share of all that is blended: g.out minus T dL/dalpha.
+    # the loss's linear share of all that is blended: g.out minus T dL/dalpha
     through = 1.0 - tl.load(alpha_image + pixel, inside, 1.0)
     behind = -through * tl.load(g_alpha + pixel, inside, 0.0)
     for channel in range(CHANNELS):
-        slope = tl.load(g_image + plane + channel * area, inside, 0.0)
-        behind += slope * tl.load(image + plane + channel * area, inside, 0.0)
+        gradient = tl.load(g_image + plane + channel * area, inside, 0.0)
+        behind += gradient * tl.load(image + plane + channel * area, inside, 0.0)
     while (first < end) & (tl.max(left, 0) > _LEAST_LEFT):
         n, real, t, u, exponent, alpha = _alphas(entries, first, end, centres, rests, records, x, y, GROUP)
         after, weight = _weights(alpha, left)
@@ -131,12 +131,12 @@ def blend_backward(
         shade = features + (n - view * count) * CHANNELS
         drawn = tl.zeros((GROUP, PIXELS), tl.float32)
         for channel in range(CHANNELS):
-            slope = tl.load(g_image + plane + channel * area, inside, 0.0)[None, :]
-            drawn += tl.load(shade + channel, real, 0.0)[:, None] * slope
-            tl.store(row + MOMENTS + channel, tl.sum(weight * slope, 1), real)
+            gradient = tl.load(g_image + plane + channel * area, inside, 0.0)[None, :]
+            drawn += tl.load(shade + channel, real, 0.0)[:, None] * gradient
+            tl.store(row + MOMENTS + channel, tl.sum(weight * gradient, 1), real)
         drawn *= weight
         rest = behind[None, :] - tl.cumsum(drawn, 0)
-        # alpha dL/dalpha, where the pixel took this Gaussian and the cap did not hold it.
+        # alpha dL/dalpha, where the Gaussian was blended and not capped
         pull = tl.where((weight > 0.0) & (exponent <= _STRONGEST), drawn - rest * (alpha / (1.0 - alpha)), 0.0)
         pull_t, pull_u = pull * t, pull * u
         tl.store(row, tl.sum(pull, 1), real)
@@ -148,7 +148,7 @@ def blend_backward(
         behind -= tl.sum(drawn, 0)
         left = tl.min(after, 0)
         first += GROUP
-    while first < end:  # behind the last open pixel
+    while first < end:  # all pixels are closed
         place = first + tl.arange(0, GROUP)
         row = sums + tl.load(slots + place, place < end, 0) * (MOMENTS + CHANNELS)
         for column in range(MOMENTS + CHANNELS):

@@ -1,8 +1,8 @@
 """EWA projection and its gradient as Triton kernels, a lane a Gaussian, in double precision as on the CPU.
 
-The formulas are those of projection.py and projection_backward.py, record for record: t = ALONG_X dx + ALONG_Y dy,
-u = DOWN dy, exponent = LOG_OPACITY - t^2 - u^2. Here a record has four columns, and its gradient holds in their places
-the sums of dL/dexponent times t^2, t u, u^2 and one.
+The formulas are those of projection.py and projection_backward.py: t = ALONG_X dx + ALONG_Y dy, u = DOWN dy,
+exponent = LOG_OPACITY - t^2 - u^2. A record has these four columns; in its gradient they are the sums of dL/dexponent
+times t^2, t u, u^2 and one.
 """
 
 import triton
@@ -17,7 +17,7 @@ RECORD = tl.constexpr(4)
 CAMERA = tl.constexpr(16)
 """Numbers of a camera's gradient: the upper three rows of world_to_camera, then fx, fy, cx, cy."""
 UNUSABLE = tl.constexpr(1 << 30)
-"""Stands for the tiles of a Gaussian whose input nobody can draw."""
+"""Number of tiles that marks a Gaussian with invalid input."""
 DEPTH_BITS = tl.constexpr(40)
 """Of a sorting key, below the tile: exponent and 29 bits of the depth's mantissa."""
 
@@ -79,7 +79,7 @@ def _pinhole(intrinsics: tl.tensor, view: tl.tensor, axis: tl.constexpr) -> tupl
 
 @triton.jit
 def _tangent(slope: tl.tensor, focal: tl.tensor, center: tl.tensor, size: tl.tensor) -> tuple:
-    """The slope at which the Jacobian is taken, a little outside the frame at most; whether that is the slope."""
+    """Return the slope for the Jacobian, at most a little outside the frame, and whether it is the true slope."""
     margin = size * (0.5 * _MARGIN) / focal
     low, high = -center / focal - margin, (size - center) / focal + margin
     return tl.minimum(tl.maximum(slope, low), high), (slope > low) & (slope < high)
@@ -94,16 +94,16 @@ def _factor(xx: tl.tensor, xy: tl.tensor, yy: tl.tensor, det: tl.tensor) -> tupl
 
 @triton.jit
 def _span(center: tl.tensor, extent: tl.tensor, size: tl.tensor) -> tuple:
-    """First and last pixel along an axis whose centre lies within the extent; the blend works in single precision."""
-    reach = extent * 1.0001
-    return tl.maximum(tl.ceil(center - reach - 0.5), 0.0), tl.minimum(tl.floor(center + reach - 0.5), size - 1.0)
+    """Return the first and last pixel along an axis whose centre lies in the extent, with a margin for rounding."""
+    half = extent * 1.0001
+    return tl.maximum(tl.ceil(center - half - 0.5), 0.0), tl.minimum(tl.floor(center + half - 0.5), size - 1.0)
 
 
 @triton.jit
 def _flaw_of_camera(
     world_to_camera: tl.tensor, intrinsics: tl.tensor, background: tl.tensor, view: tl.tensor, channels: tl.tensor
 ) -> tl.tensor:
-    """0 where a view's numbers are finite, its pinhole is one (see checks.py), its background not too bright; NaN."""
+    """Return 0 if a view's numbers, pinhole and background are valid (see checks.py), else NaN."""
     lane = tl.arange(0, 16)
     total = tl.sum(tl.load(world_to_camera + view * 16 + lane).to(tl.float64))
     k = intrinsics + view * 9
@@ -117,7 +117,7 @@ def _flaw_of_camera(
 
 @triton.jit
 def _store_in_two(high: tl.tensor, low: tl.tensor, value: tl.tensor, real: tl.tensor) -> None:
-    """Store a number in single precision, and what it has beyond that; nothing where it is beyond single precision."""
+    """Store a number in single precision, and the rest, 0 above 1e30."""
     rounded = value.to(tl.float32)
     tl.store(high, rounded, real)
     tl.store(low, tl.where(tl.abs(value) < 1e30, value - rounded.to(tl.float64), 0.0).to(tl.float32), real)
@@ -133,11 +133,9 @@ def project(
 ) -> None:  # fmt: skip
     """Fill means2d, rests [V, N, 2], records [V, N, 4], radii [V, N] and what lists the tiles; program (block, view).
 
-    A centre is means2d + rests: the steps of single precision grow with the coordinate.
-
-    Keys sort by tile, then depth: those of the first tile of each bounding rectangle, [V, N]. The rectangle is wides
-    [V, N] tiles across and has tiles [V, N] in all, 0 where nothing is drawn, `UNUSABLE` where its input is not finite
-    or its features [N, C] are too bright; the first Gaussian's also where the view's camera or background is so.
+    A centre is means2d + rests, more exact than single precision. Keys [V, N] sort by tile, then depth, and are those
+    of the first tile of each bounding rectangle. The rectangle is wides [V, N] tiles across and has tiles [V, N] in
+    all, 0 if nothing is drawn, `UNUSABLE` if the Gaussian or, for the first block, the view's input is invalid.
     """
     n, view = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.program_id(1)
     real = n < count
@@ -179,11 +177,11 @@ def project(
         drawn *= tl.sqrt(tl.maximum((raw_xx * raw_yy - xy * xy) / tl.where(sound, det, 1.0), _FLOOR))
     sound &= drawn > _MIN_ALPHA
     top = tl.log2(tl.where(sound, drawn, 1.0))
-    reach = tl.maximum(top - _WEAKEST, 0.0) / _HALF_LOG2_E
-    extent_x, extent_y = tl.sqrt(reach * tl.where(sound, xx, 1.0)), tl.sqrt(reach * tl.where(sound, yy, 1.0))
+    support = tl.maximum(top - _WEAKEST, 0.0) / _HALF_LOG2_E
+    extent_x, extent_y = tl.sqrt(support * tl.where(sound, xx, 1.0)), tl.sqrt(support * tl.where(sound, yy, 1.0))
     sound &= (u + extent_x > 0) & (u - extent_x < width) & (v + extent_y > 0) & (v - extent_y < height)
     half = 0.5 * (xx - yy)
-    radius = tl.sqrt(tl.where(sound, reach * (0.5 * (xx + yy) + tl.sqrt(half * half + xy * xy)), 0.0))
+    radius = tl.sqrt(tl.where(sound, support * (0.5 * (xx + yy) + tl.sqrt(half * half + xy * xy)), 0.0))
     along_x, along_y, fall = _factor(
         tl.where(sound, xx, 1.0), tl.where(sound, xy, 0.0), tl.where(sound, yy, 1.0), tl.where(sound, det, 1.0)
     )
@@ -250,7 +248,7 @@ def project_backward(
         xa, xb = (px * a0 + py * a1 + pz * a2) * sa, (px * b0 + py * b1 + pz * b2) * sb
         ya, yb = (qx * a0 + qy * a1 + qz * a2) * sa, (qx * b0 + qy * b1 + qz * b2) * sb
         xc, yc = (px * c0 + py * c1 + pz * c2) * sc, (qx * c0 + qy * c1 + qz * c2) * sc
-        # What nobody sees gets a harmless covariance and no gradient.
+        # invisible Gaussians get a valid covariance and no gradient
         raw_xx = tl.where(shown, xa * xa + xb * xb + xc * xc, 1.0)
         raw_yy = tl.where(shown, ya * ya + yb * yb + yc * yc, 1.0)
         xy = tl.where(shown, xa * ya + xb * yb + xc * yc, 0.0)
@@ -281,7 +279,7 @@ def project_backward(
         v_p0, v_q0 = v_xa * a0 + v_xb * b0 + v_xc * c0, v_ya * a0 + v_yb * b0 + v_yc * c0
         v_p1, v_q1 = v_xa * a1 + v_xb * b1 + v_xc * c1, v_ya * a1 + v_yb * b1 + v_yc * c1
         v_p2, v_q2 = v_xa * a2 + v_xb * b2 + v_xc * c2, v_ya * a2 + v_yb * b2 + v_yc * c2
-        # The Jacobian's rows are (jx, -jx tangent) along the camera's x and z.
+        # the Jacobian's rows are (jx, -jx tangent) along the camera's x and z
         direct_x, depth_x = v_p0 * r00 + v_p1 * r01 + v_p2 * r02, v_p0 * r20 + v_p1 * r21 + v_p2 * r22
         direct_y, depth_y = v_q0 * r10 + v_q1 * r11 + v_q2 * r12, v_q0 * r20 + v_q1 * r21 + v_q2 * r22
         rest_x, rest_y = direct_x - depth_x * tangent_x, direct_y - depth_y * tangent_y

@@ -1,4 +1,4 @@
-"""What lies between projecting and blending on a GPU: the tiles' entries, and the sums of a Gaussian over its tiles."""
+"""Between projection and blending on a GPU: list the tiles' entries, and sum a Gaussian's gradients over its tiles."""
 
 import math
 
@@ -9,11 +9,11 @@ from rewild4d.rasterizer.triton_blend import MOMENTS
 from rewild4d.rasterizer.triton_project import DEPTH_BITS, RECORD
 
 ENTRIES = tl.constexpr(256)
-"""Entries that a program of `list_entries` or `start_tiles` makes."""
+"""Entries of one program of `list_entries` or `start_tiles`."""
 OWNERS = tl.constexpr(32)
-"""Gaussians whose sums a program of `gather` makes."""
+"""Gaussians of one program of `gather`."""
 ROWS = tl.constexpr(4)
-"""Rows that it reads at once, so that they do not wait for each other."""
+"""Rows that it reads at once, to hide latency."""
 
 _LN2 = tl.constexpr(math.log(2.0))
 
@@ -28,7 +28,7 @@ def list_entries(
     """Fill keys and owners [E] with each row's rectangle of tiles, row after row; program (block).
 
     A row is a view and a Gaussian, view * N + Gaussian. ``ends`` [rows] is the running sum of ``tiles``; each entry
-    finds its row by halving, ``steps`` times.
+    finds its row by binary search in ``steps`` steps.
     """
     entry = tl.program_id(0).to(tl.int64) * ENTRIES + tl.arange(0, ENTRIES)
     real = entry < total
@@ -52,7 +52,7 @@ def start_tiles(
 ) -> None:  # fmt: skip
     """Fill entries [E], the owners in the order of the sorted keys, and starts [tiles + 1]; program (block).
 
-    Each of ``number`` starts is the place of the first key that is not before its tile, found by halving.
+    Each of ``number`` starts is the index of the first key that is not before its tile, found by binary search.
     """
     index = tl.program_id(0).to(tl.int64) * ENTRIES + tl.arange(0, ENTRIES)
     real = index < total
