@@ -1,4 +1,4 @@
-"""Which prior a run starts from: fitted to its clip, made from the truth with noise, or read from a file."""
+"""Choose the prior of a run: fitted to its clip, made from the truth, or read from a file."""
 
 import math
 from dataclasses import dataclass, replace
@@ -18,31 +18,32 @@ from rewild4d.priors.footage import Evidence, fit_footage
 from rewild4d.priors.io import load_prior, save_prior, seal
 from rewild4d.priors.judge import doubts, joint_scores, measured
 from rewild4d.priors.landmarks import Marks, load_mapping, marks
-from rewild4d.priors.placing import in_world, placed
+from rewild4d.priors.placing import has_cameras, in_world, placed
 from rewild4d.priors.rig import rig_prior
 from rewild4d.priors.steady import without_hops
 from rewild4d.priors.template import MIRROR
 from rewild4d.types import Clip, Prior, Truth
 
 PRIOR_SEED = 0
-"""One seed for all: every method and every seed of a case starts from the same prior."""
+"""Of the fit: every method and every seed of a case starts from the same prior."""
 
 ELSEWHERE = "made elsewhere: it may have seen the frames that are held out here"
-OTHER_BONES = "keypoints are not scored: their mapping names bones of the template's skeleton, and this is another"
+OTHER_BONES = (
+    "keypoints are not scored: their mapping names bones of the template, and this prior's skeleton is another"
+)
 
 
 @dataclass(frozen=True)
 class PriorChoice:
-    """What `--prior` said.
+    """The prior that a run asks for.
 
     Attributes:
         name: "template" (fitted to the clip alone, with its cameras where it has any), "coarse" or "coarse:<noise>"
             (from the truth, plus noise; for studies of prior quality only), "rig" (the data set's own shape and
             skeleton: a bound) or the path of an npz file.
         config: settings of the template fit under known cameras.
-        mapping: which of the frames' keypoints is which point of the template (`landmarks.load_mapping`); None: they
-            are not looked at.
-        use: which of them a fit to real footage sees.
+        mapping: names the template's point of each keypoint (`landmarks.load_mapping`); None ignores keypoints.
+        use: frames whose keypoints a fit under unknown cameras sees.
     """
 
     name: str
@@ -65,7 +66,7 @@ class PriorChoice:
         return noise
 
     def require(self) -> None:
-        """Fail on a name that cannot be a prior, before anything else is done.
+        """Check the name.
 
         Raises:
             UserError: a noise that is no number, or a file that is missing or damaged.
@@ -75,11 +76,11 @@ class PriorChoice:
 
     @property
     def is_from_truth(self) -> bool:
-        """Whether the prior has seen what is held out, and a row that starts from it is a bound."""
+        """Whether the prior is made from held-out data, so that results with it are bounds."""
         return self.name == "rig" or self.noise is not None
 
     def identity(self, clip: Clip, truth: Truth) -> str:
-        """Return the digest of all that decides the prior, before it is made: sixteen hex digits.
+        """Return a digest of all that decides the prior, before it is made, sixteen hex digits.
 
         Raises:
             UserError: "rig", and the data set has none.
@@ -97,8 +98,8 @@ class PriorChoice:
         return digest(*parts)[:16]
 
     def settings(self, clip: Clip) -> PriorConfig:
-        """Return settings of the fit that this clip asks for: footage without cameras has its own."""
-        return self.settings_under(_has_cameras(clip))
+        """Return settings of the fit to this clip: footage without cameras has its own."""
+        return self.settings_under(has_cameras(clip))
 
     def settings_under(self, known_cameras: bool) -> PriorConfig:
         """Return settings of the fit where cameras are known or not."""
@@ -115,8 +116,8 @@ class PriorChoice:
 
 def split_marks(found: Marks, use: Use) -> tuple[Marks | None, Marks | None]:
     """Split marks into those for the fit and those to score it by; None for no marks."""
-    moments, step = found.moments.unique(), {"all": 1, "half": 2, "none": 0}[use]
-    seen = torch.isin(found.moments, moments[::step] if step else moments[:0])
+    frames, every = found.frames.unique(), {"all": 1, "half": 2, "none": 0}[use]
+    seen = torch.isin(found.frames, frames[::every] if every else frames[:0])
     given, scored = found.chosen(seen), found.chosen(~seen)
     return given if len(given) else None, scored if len(scored) else None
 
@@ -124,13 +125,13 @@ def split_marks(found: Marks, use: Use) -> tuple[Marks | None, Marks | None]:
 def make_prior(choice: PriorChoice, clip: Clip, truth: Truth, path: Path, log: Log) -> Prior:
     """Make the chosen prior; a fitted one is kept at ``path`` and read from there the next time.
 
-    For a clip without cameras it has a row for each frame whose camera agrees with the others' (`steady`), and `notes`
-    say what was left out and what speaks against it.
+    For a clip without cameras it has only frames whose camera agrees with the others' (`steady`), and its `notes` name
+    those left out and the reasons to doubt it.
 
     Raises:
         UserError: a file that cannot be used or is for another clip, or masks that show nothing.
     """
-    footage = not _has_cameras(clip)
+    footage = not has_cameras(clip)
     if choice.name != "template" and not choice.is_from_truth:
         prior = load_prior(Path(choice.name))
         prior = placed(prior, clip) if footage else in_world(prior, clip, choice.name)
@@ -152,23 +153,18 @@ def make_prior(choice: PriorChoice, clip: Clip, truth: Truth, path: Path, log: L
 def _fitted(choice: PriorChoice, clip: Clip, truth: Truth, log: Log) -> Prior:
     if choice.noise is not None:
         return coarse_prior(clip, truth.held_out, noise=choice.noise, seed=PRIOR_SEED, config=choice.config, log=log)
-    if choice.name == "rig" and truth.rig:
-        return rig_prior(clip, truth.rig(), fit_template(clip, config=choice.config, seed=PRIOR_SEED, log=log))
-    if _has_cameras(clip):
-        return fit_template(clip, config=choice.config, seed=PRIOR_SEED, log=log)
+    if choice.name == "rig" or has_cameras(clip):
+        fitted = fit_template(clip, config=choice.config, seed=PRIOR_SEED, log=log)
+        return rig_prior(clip, truth.rig(), fitted) if choice.name == "rig" and truth.rig else fitted
     given, scored = choice.keypoints(clip)
     said = Evidence(given, clip.travel)
     return _scored(fit_footage(clip, config=FOOTAGE, seed=PRIOR_SEED, log=log, said=said), clip, scored)
 
 
 def _scored(prior: Prior, clip: Clip, found: Marks | None) -> Prior:
-    """With the figures of `joint_scores` on keypoints that the fit did not see; a note on a skeleton without names."""
+    """Add `joint_scores` on keypoints that the fit did not see, or a note where the skeleton is not the template's."""
     if found is None:
         return prior
     if prior.mirror.tolist() != list(MIRROR):
         return replace(prior, notes=(*prior.notes, OTHER_BONES))
     return seal(replace(prior, quality=prior.quality | joint_scores(prior, clip.frames, found)))
-
-
-def _has_cameras(clip: Clip) -> bool:
-    return all(frame.camera is not None for frame in clip.frames)

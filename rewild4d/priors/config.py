@@ -1,4 +1,4 @@
-"""Every choice of the template fit."""
+"""Settings of the template fit."""
 
 from typing import Literal
 
@@ -9,17 +9,17 @@ Use = Literal["all", "half", "none"]
 
 
 class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One round of gradient descent on all hypotheses that are still in the race.
+    """One round of gradient descent on all remaining hypotheses.
 
     Attributes:
-        size: side of the square crops in pixels; early rounds only need the gross outline.
+        size: side of the square crops in pixels.
         steps: of Adam.
-        frames: per step; of longer clips as many are drawn anew each step, so that time does not grow with the clip.
-        blur: of both silhouettes at the first and last step, as a share of the crop: a thin leg must feel a far one.
-        keep: hypotheses that survive; the best of the opposite facing is always among them while two or more do.
-        joints: whether joints bend and the root moves over time, or the animal stands still.
-        rasterized: silhouettes by the benchmark's rasterizer; otherwise by its batched stand-in.
-        relief: whether the cross sections may leave what the proportions make of them.
+        frames: used in each step; of longer clips as many are drawn at random.
+        blur: standard deviation of the blur of both silhouettes at the first and last step, as a share of the crop.
+        keep: hypotheses that survive; if two or more, the best of the opposite heading is among them.
+        joints: fit joint angles and their motion.
+        rasterized: draw silhouettes by the rasterizer; otherwise by its batched approximation.
+        relief: fit the cross sections too, beyond the proportions.
     """
 
     size: int
@@ -33,24 +33,23 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the template is fitted.
+    """Settings of the fit; weights multiply the named term of the cost.
 
     Attributes:
-        yaw_starts: facing is a local minimum, so every start turns the template by an equal share of the circle.
-        elevations: camera elevations (degrees) tried where the cameras alone do not tell which way is up.
         stages: rounds, from all starts to one winner.
-        learning_rate: of Adam at the start of each round, on parameters whitened by their natural spread.
-        shape_weight: of the mean squared deviation of proportions: an average animal unless the masks insist.
-        relief_weight: of the mean squared relief of the cross sections.
-        angle_weight: of the squared whitened joint angles: limbs rest, and move slowly, unless the masks insist.
-        root_weight: of the squared whitened root motion and tilt: a sweeping camera sees each moment once.
-        view_weight: of the squared cosine between heading and a single direction of view: seen from one side only, a
-            turned animal looks like a shorter one, and its outline hardly changes near the broadside.
-        gait_weight: of feet that bear weight and move forwards, when guesses are compared: outlines alone hardly tell
-            the head of a bushy-tailed animal.
-        travel_weight: of heads that point against the way the animal goes, when guesses are compared.
-        carriage_weight: of heads folded into the body and tails carried like necks, under unknown cameras.
-        keypoint_weight: of the robust distance of joints to keypoints.
+        yaw_starts: starts, at even yaws: the heading is a local minimum.
+        elevations: camera elevations in degrees, tried where the cameras leave the up direction open.
+        learning_rate: of Adam at the start of each round, per standard deviation of a parameter.
+        shape_weight: mean squared deviation of the proportions from the average animal, in standard deviations.
+        relief_weight: mean squared relief of the cross sections, in standard deviations.
+        angle_weight: squared joint angles, in standard deviations; fast motion counts more.
+        root_weight: squared motion and tilt of the root, in standard deviations; fast motion counts more.
+        view_weight: squared cosine between heading and viewing direction, where all cameras look one way: an animal at
+            an angle looks like a shorter one.
+        gait_weight: feet on the ground that move towards the head, when hypotheses are compared.
+        travel_weight: heading against the direction of travel, when hypotheses are compared.
+        carriage_weight: heads folded into the body and raised tails, under unknown cameras.
+        keypoint_weight: robust distance of joints to keypoints.
     """
 
     stages: tuple[Stage, ...]

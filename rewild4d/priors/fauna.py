@@ -1,11 +1,12 @@
-"""Read what 3D-Fauna's test run writes (design notes, FORMATS 4.8) as a prior.
+"""Read the output of 3D-Fauna's test run (design notes, FORMATS 4.8) as a prior.
 
-Per image it leaves a posed mesh, a pose and joint angles, but neither the rest mesh nor the skinning weights. Bones and
-weights are functions of the rest vertices (FORMATS 4.4, 4.5), so the rest mesh of an image is found as the fixed point
-of undoing the pose. One image's mesh is kept and all poses are recomputed with its bones (METHOD, section 2).
+For each image it has a posed mesh, a pose and joint angles, but neither the rest mesh nor the skinning weights. Bones
+and weights are functions of the rest vertices (FORMATS 4.4, 4.5), so an image's rest mesh is the fixed point of undoing
+the pose. One image's mesh is kept, and all poses are recomputed with its bones (METHOD, section 2).
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,11 +24,11 @@ from rewild4d.transforms import mirror_camera, mirror_points, mirror_transforms,
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Prior
 
 SWEEPS = 12
-"""Rounds of undoing the pose; the rest mesh moves by less than a thousandth after a few."""
+"""Iterations of undoing the pose; the rest mesh moves by less than a thousandth after a few."""
 TRIED = 4
-"""Least bent poses that are undone; the most symmetric rest mesh is taken."""
+"""Number of least bent poses that are undone; the most symmetric rest mesh is taken."""
 FLAT = 1e-3
-"""Thickness over length of a cloud of vertices below which it is a plane: no animal is that thin."""
+"""Thickness over length of vertices below which they count as a plane."""
 
 
 def read_fauna(folder: Path, *, flip: Path | None, boxes: Path | None, size: int, fps: float) -> Prior:
@@ -41,7 +42,7 @@ def read_fauna(folder: Path, *, flip: Path | None, boxes: Path | None, size: int
         fps: frames per second.
 
     Raises:
-        UserError: files are missing or hold something else, or `load_prior` would refuse what comes of them.
+        UserError: files are missing or damaged, or `load_prior` would refuse the prior.
     """
     stem_of = stems(folder)
     angles, cameras = frames(folder, stem_of, boxes, size, flipped=False)
@@ -72,10 +73,10 @@ def read_fauna(folder: Path, *, flip: Path | None, boxes: Path | None, size: int
         mirror=torch.tensor(MIRROR),
         times=torch.arange(len(stem_of), dtype=torch.float64) / fps,
         object_to_world=torch.eye(4, dtype=torch.float64).repeat(len(stem_of), 1, 1),
-        cameras=tuple(_scaled(camera, scale) for camera in cameras),
-        transforms=_moved(transforms, scale),
-        cameras_flip=tuple(_scaled(camera, scale) for camera in cameras_flip),
-        transforms_flip=_moved(transforms_flip, scale),
+        cameras=_scaled_cameras(cameras, scale),
+        transforms=_scaled(transforms, scale).float(),
+        cameras_flip=_scaled_cameras(cameras_flip, scale),
+        transforms_flip=_scaled(transforms_flip, scale).float(),
         quality=quality,
         digest="",
     )
@@ -84,10 +85,10 @@ def read_fauna(folder: Path, *, flip: Path | None, boxes: Path | None, size: int
 
 
 def _rest(folder: Path, names: list[str], angles: list[Tensor]) -> tuple[Tensor, Tensor, int, dict[str, float]]:
-    """The most symmetric rest mesh among the first image's and those of the least bent poses; Fauna's are symmetric.
+    """Find the most symmetric rest mesh of the first image and the least bent poses; Fauna's are symmetric.
 
     Returns:
-        Vertices, faces, the index of the image they are from, and the figures of the undoing.
+        Vertices, faces, the index of their image, and figures of quality.
 
     Raises:
         UserError: a mesh cannot be read, or has no room for bones.
@@ -109,7 +110,7 @@ def _rest(folder: Path, names: list[str], angles: list[Tensor]) -> tuple[Tensor,
 
 
 def _unposed(posed: Tensor, angles: Tensor) -> tuple[Tensor, float]:
-    """Return the rest mesh whose pose is the given one, and how far posing it again stays from that (mean distance).
+    """Return the rest mesh of a posed one, and the mean distance to that when it is posed again.
 
     Raises:
         ValueError: there is no room for bones.
@@ -128,24 +129,24 @@ def _unposed(posed: Tensor, angles: Tensor) -> tuple[Tensor, float]:
 
 
 def _bones(vertices: Tensor) -> tuple[Tensor, tuple[int, ...]]:
-    """Run `estimate_bones` on vertices that have room for bones.
+    """Run `estimate_bones`.
 
     Raises:
-        ValueError: they lie in a plane, too few of them are low enough to be feet, or a bone has no direction.
+        ValueError: vertices lie in a plane, too few are low enough to be feet, or a bone has no direction.
     """
     box = " x ".join(f"{side:.3g}" for side in (vertices.amax(0) - vertices.amin(0)).tolist())
     came, height = f"{len(vertices)} vertices in a box of {box}", vertices[:, 1]
     if _is_flat(vertices) or not (height < height.quantile(0.4)).any():
         raise ValueError(f"{came}, too few or too flat")
     bones, parents = estimate_bones(vertices)
-    # A bone's frame has an axis normal to the bone and to x, which a bone along x lacks.
+    # the bone's frame needs an axis normal to the bone and to x
     if not ((bones[:, 1] - bones[:, 0])[:, 1:].norm(dim=1) > 0).all():
         raise ValueError(f"{came}, where a bone has no length or lies along x")
     return bones, parents
 
 
 def _is_flat(vertices: Tensor) -> bool:
-    """Tell whether points lie (nearly) in a plane, whichever way it is turned, or are no shape at all, [n, 3]."""
+    """Tell whether points [n, 3] lie nearly in a plane, all in one position, or are not finite."""
     diagonal = (vertices.amax(0) - vertices.amin(0)).norm()
     if not 0 < float(diagonal) < math.inf:
         return True
@@ -154,13 +155,12 @@ def _is_flat(vertices: Tensor) -> bool:
     return bool(spread[0] <= FLAT**2 * spread[2])
 
 
-def _scaled(camera: Camera, scale: float) -> Camera:
-    moved = camera.world_to_camera.clone()
-    moved[:3, 3] *= scale
-    return replace(camera, world_to_camera=moved)
-
-
-def _moved(transforms: Tensor, scale: float) -> Tensor:
+def _scaled(transforms: Tensor, scale: float) -> Tensor:
+    """Scale the translations, [..., 4, 4]."""
     scaled = transforms.clone()
     scaled[..., :3, 3] *= scale
-    return scaled.float()
+    return scaled
+
+
+def _scaled_cameras(cameras: Sequence[Camera], scale: float) -> tuple[Camera, ...]:
+    return tuple(replace(camera, world_to_camera=_scaled(camera.world_to_camera, scale)) for camera in cameras)

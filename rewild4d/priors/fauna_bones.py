@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from rewild4d.priors.kinematics import rotation_about
 from rewild4d.transforms import rigid
 
 TEMPERATURE = 0.05
@@ -12,14 +13,7 @@ QUADRANTS = ((1, 1), (1, -1), (-1, -1), (-1, 1))
 
 
 def estimate_bones(vertices: Tensor) -> tuple[Tensor, tuple[int, ...]]:
-    """Return bones (start, end) and the parent of each.
-
-    Args:
-        vertices: rest shape, [n, 3].
-
-    Returns:
-        [20, 2, 3] and twenty parents, -1 for a root.
-    """
+    """Return bones (start, end), [20, 2, 3], and the parent of each, -1 for a root, from rest vertices [n, 3]."""
     middle = vertices.mean(0)
     upper = vertices[vertices[:, 1] > middle[1] - 0.5]
     front, rear = vertices[vertices[:, 2].argmax()], upper[upper[:, 2].argmin()]
@@ -30,15 +24,15 @@ def estimate_bones(vertices: Tensor) -> tuple[Tensor, tuple[int, ...]]:
     body = [(spine[k + 1], spine[k]) for k in range(4)] + [(spine[k - 1], spine[k]) for k in (8, 7, 6, 5)]
     feet = [_foot(vertices, *QUADRANTS[0]), _foot(vertices, *QUADRANTS[1])]
     ends = torch.stack([end for _, end in body])
-    hung = [int((ends[:, 2] - foot[2]).abs().argmin()) for foot in feet]
+    attached = [int((ends[:, 2] - foot[2]).abs().argmin()) for foot in feet]
     bones, parents = list(body), list(BODY_PARENTS)
     sign = vertices.new_tensor((-1.0, 1.0, 1.0))
     for quadrant, source in enumerate((0, 1, 1, 0)):
         foot = feet[source] if quadrant < 2 else feet[source] * sign
-        joints = foot + torch.arange(4).to(vertices)[:, None] / 3 * (ends[hung[source]] - foot)
+        joints = foot + torch.arange(4).to(vertices)[:, None] / 3 * (ends[attached[source]] - foot)
         first = 8 + 3 * quadrant
         bones += [(joints[1], joints[0]), (joints[2], joints[1]), (joints[3], joints[2])]
-        parents += [first + 1, first + 2, hung[source]]
+        parents += [first + 1, first + 2, attached[source]]
     return torch.stack([torch.stack(bone) for bone in bones]), tuple(parents)
 
 
@@ -64,7 +58,9 @@ def skinning_weights(vertices: Tensor, bones: Tensor) -> Tensor:
 
 
 def joint_transforms(bones: Tensor, parents: tuple[int, ...], angles: Tensor) -> Tensor:
-    """Chain each bone's transform from rest to pose, from root to leaf: M R M^-1, M the bone's frame at rest.
+    """Return each bone's transform from rest to pose, the product of M R M^-1 from root to leaf, [20, 4, 4].
+
+    M is the bone's frame at rest.
 
     Args:
         bones: [20, 2, 3].
@@ -72,28 +68,14 @@ def joint_transforms(bones: Tensor, parents: tuple[int, ...], angles: Tensor) ->
         angles: Euler angles in radians, R = Rx Ry Rz, [20, 3].
     """
     forward = torch.nn.functional.normalize(bones[:, 1] - bones[:, 0], dim=-1)
-    up = torch.nn.functional.normalize(
-        torch.linalg.cross(forward, forward.new_tensor((1.0, 0, 0)).expand(20, 3)), dim=-1
-    )
+    lateral = forward.new_tensor((1.0, 0, 0)).expand(20, 3)
+    up = torch.nn.functional.normalize(torch.linalg.cross(forward, lateral), dim=-1)
     right = torch.nn.functional.normalize(torch.linalg.cross(up, forward), dim=-1)
     frame = rigid(torch.stack((right, up, forward), dim=-1), bones[:, 0])
-    turn = rigid(_euler(angles), torch.zeros_like(bones[:, 0]))
-    local = frame @ turn @ torch.linalg.inv(frame)
-    posed: dict[int, Tensor] = {-1: torch.eye(4, dtype=bones.dtype)}
+    about_x, about_y, about_z = (rotation_about(axis, angles[:, axis]) for axis in range(3))
+    local = frame @ rigid(about_x @ about_y @ about_z, torch.zeros_like(bones[:, 0])) @ torch.linalg.inv(frame)
 
-    def reach(bone: int) -> Tensor:
-        if bone not in posed:
-            posed[bone] = reach(parents[bone]) @ local[bone]
-        return posed[bone]
+    def chained(bone: int) -> Tensor:
+        return local[bone] if parents[bone] < 0 else chained(parents[bone]) @ local[bone]
 
-    return torch.stack([reach(bone) for bone in range(len(parents))])
-
-
-def _euler(angles: Tensor) -> Tensor:
-    """Compute Rx @ Ry @ Rz, [j, 3] -> [j, 3, 3]."""
-    (cx, cy, cz), (sx, sy, sz) = angles.cos().unbind(-1), angles.sin().unbind(-1)
-    zero, one = torch.zeros_like(cx), torch.ones_like(cx)
-    about_x = torch.stack((one, zero, zero, zero, cx, -sx, zero, sx, cx), -1).unflatten(-1, (3, 3))
-    about_y = torch.stack((cy, zero, sy, zero, one, zero, -sy, zero, cy), -1).unflatten(-1, (3, 3))
-    about_z = torch.stack((cz, -sz, zero, sz, cz, zero, zero, zero, one), -1).unflatten(-1, (3, 3))
-    return about_x @ about_y @ about_z
+    return torch.stack([chained(bone) for bone in range(len(parents))])

@@ -1,4 +1,4 @@
-"""The files of 3D-Fauna's test run, read and checked (design notes, FORMATS 4.6 to 4.8)."""
+"""Read and check the files of 3D-Fauna's test run (design notes, FORMATS 4.6 to 4.8)."""
 
 import math
 import re
@@ -16,7 +16,7 @@ from rewild4d.types import Camera
 FIELD_OF_VIEW, OFFSET = math.radians(25.0), 10.0
 NATIVE = 256
 LARGEST = 65536
-"""Pixels along a side: no crop or frame is larger, and a few digits too many would not fit an integer."""
+"""Most pixels along a side of a crop or frame."""
 EXPECTED = {"v": "three finite coordinates", "f": "a triangle of three vertices (numbered from 1)"}
 _NAME = re.compile(r"(?P<step>\d+)_\s*(?P<frame>\S+)_mesh\.obj")
 
@@ -44,7 +44,7 @@ def stems(folder: Path) -> dict[str, str]:
 def frames(
     folder: Path, stem_of: dict[str, str], boxes: Path | None, size: int, *, flipped: bool
 ) -> tuple[list[Tensor], list[Camera]]:
-    """Return the joint angles, float64, [20, 3], and the camera of every frame; see `read_fauna` for the rest.
+    """Return the joint angles, float64, [20, 3], and the camera of every frame; for the arguments see `read_fauna`.
 
     Raises:
         UserError: a file is missing, or its numbers are no angles, no pose or no box.
@@ -58,7 +58,7 @@ def frames(
 
 
 def _camera(path: Path) -> Camera:
-    """Fauna's twelve numbers: rows right, up, forward (the transposed rotation), then a translation; OpenGL axes."""
+    """Read Fauna's twelve numbers: rows right, up, forward (the transposed rotation), a translation; OpenGL axes."""
     pose = _numbers(path, 12)
     open_gl = rigid(pose[:9].reshape(3, 3).T, pose[9:] + pose.new_tensor((0.0, 0.0, -OFFSET)))
     if off_similarity(open_gl, rigid=True) > OFF_ROTATION:
@@ -71,7 +71,7 @@ def _camera(path: Path) -> Camera:
 
 
 def _placed(camera: Camera, box: Path | None, size: int, flipped: bool) -> Camera:
-    """Return the camera of the crop at another size, or of the whole frame that a box file places the crop in."""
+    """Return the camera of the crop at another size, or with a box file that of the whole frame."""
     if box is None:
         return camera.resized(size, size)
     numbers = _numbers(box, 8)[1:7].tolist()
@@ -88,7 +88,7 @@ def _numbers(path: Path, count: int) -> Tensor:
     """Read whitespace-separated numbers, float64, [count].
 
     Raises:
-        UserError: no such file, or other numbers of numbers.
+        UserError: no such file, or other than ``count`` finite numbers.
     """
     try:
         values = np.array(path.read_text(encoding="utf-8").split(), dtype=np.float64)
@@ -107,7 +107,7 @@ def read_obj(path: Path) -> tuple[Tensor, Tensor]:
     """Read vertices, float64, [n, 3], and triangles, int64, [f, 3].
 
     Raises:
-        UserError: the file cannot be read, a line is cut off or no triangle, or a vertex is not there or not finite.
+        UserError: the file cannot be read, a line is cut off or no triangle, or a vertex is missing or not finite.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -132,12 +132,11 @@ def read_obj(path: Path) -> tuple[Tensor, Tensor]:
     last = max(max(face) for face in faces) + 1
     if last > len(vertices):
         raise UserError(f"{path}: expected faces of vertices 1 to {len(vertices)}, got one of vertex {last}.")
-    table, corners = np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64)
-    return torch.from_numpy(table), torch.from_numpy(corners)
+    return torch.tensor(vertices, dtype=torch.float64), torch.tensor(faces)
 
 
 def _vertex(words: list[str]) -> tuple[float, ...]:
-    """Read the three coordinates; numbers behind them are a colour or a weight."""
+    """Read three coordinates; further numbers are a colour or a weight."""
     x, y, z = (float(word) for word in words[:3])
     if not all(math.isfinite(value) for value in (x, y, z)):
         raise ValueError("not finite")
@@ -145,7 +144,7 @@ def _vertex(words: list[str]) -> tuple[float, ...]:
 
 
 def _face(words: list[str], count: int) -> tuple[int, ...]:
-    """Indices from 0 of a triangle's corners; OBJ counts from 1, and backwards from the latest vertex below 0."""
+    """Return a triangle's vertices from 0; OBJ counts from 1, or from -1 backwards from the last of ``count``."""
     a, b, c = (int(word.split("/")[0]) for word in words)
     if len({word.count("/") for word in words}) > 1:
         raise ValueError("a corner is cut off")  # OBJ has all corners of a face in the same form

@@ -1,7 +1,7 @@
-"""Fit the quadruped template to masks: similarity, facing, proportions and poses over time.
+"""Fit the quadruped template to masks under known cameras: similarity, proportions and poses over time.
 
-Masks and known cameras only. Facing is a local minimum (an animal seen from its head looks much like one seen from its
-tail), so all turns compete and the reverse of the leader stays in the race until joints and proportions have settled.
+The heading is a local minimum (animals look alike from head and tail), so many headings compete, and the best reversed
+one is kept until joints and proportions have settled.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from rewild4d.contracts import Log
-from rewild4d.errors import UserError
 from rewild4d.priors.config import PriorConfig
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.io import seal
@@ -19,7 +18,7 @@ from rewild4d.priors.kinematics import pose
 from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.race import Race
 from rewild4d.priors.search import facings, mask_rays, single_view, trajectory, up_directions, working_frame
-from rewild4d.priors.silhouettes import overlap
+from rewild4d.priors.silhouettes import known_camera, overlap
 from rewild4d.priors.template import PARENTS, diagonal, posed_prior, quadruped
 from rewild4d.transforms import camera_in_object, similarity, skin_points
 from rewild4d.types import OBJECT_DIAGONAL, Clip, Frame, Prior
@@ -27,13 +26,13 @@ from rewild4d.types import OBJECT_DIAGONAL, Clip, Frame, Prior
 
 @dataclass(frozen=True)
 class Animal:
-    """The outcome of a fit, before cameras are attached.
+    """Result of a fit, before cameras are attached.
 
     Attributes:
         shape: body proportions.
         object_to_world: float64, [T, 4, 4], of the template scaled to `OBJECT_DIAGONAL`.
         angles: axis-angle vectors in radians, [T, J, 3].
-        figures: cost of the best guess, its lead over the opposite facing.
+        figures: cost of the best guess, its lead over the opposite heading, and costs of the starts.
     """
 
     shape: Proportions
@@ -46,29 +45,29 @@ def fit_template(clip: Clip, *, config: PriorConfig, seed: int, log: Log) -> Pri
     """Fit the template to a clip's masks.
 
     Args:
-        clip: frames with known world cameras; nothing else is looked at.
-        config: every choice of the fit.
+        clip: its masks and known world cameras are used.
+        config: settings.
         seed: of the frames drawn for each step of a long clip.
         log: progress.
 
     Returns:
-        A prior with one pose per frame; `quality` holds mask_iou, cost, facing_margin, starts (their number) and
+        A prior with one pose per frame; `quality` has mask_iou, cost, facing_margin, starts (their number) and
         start_00_cost, ... (after the first stage).
 
     Raises:
         UserError: a frame has no camera, or no mask shows anything.
     """
-    moments = list(range(len(clip.frames)))
-    animal = fit_animal(clip.frames, moments, len(moments), clip.name, config, seed, log)
-    provenance = f"Template fitted to the {len(moments)} masks of the clip under known cameras, seed {seed}."
+    count = len(clip.frames)
+    animal = fit_animal(clip.frames, range(count), count, clip.name, config, seed, log)
+    provenance = f"Template fitted to the {count} masks of the clip under known cameras, seed {seed}."
     return make_prior(animal, clip, "template", provenance)
 
 
 def fit_animal(
-    frames: Sequence[Frame], moments: Sequence[int], count: int, name: str, config: PriorConfig, seed: int, log: Log
+    frames: Sequence[Frame], timesteps: Sequence[int], count: int, name: str, config: PriorConfig, seed: int, log: Log
 ) -> Animal:
-    """Fit the template to any number of observations of each of ``count`` moments."""
-    rays = mask_rays(frames, moments, name)
+    """Fit the template to frames of ``count`` times, any number of each; ``timesteps`` are indices of their times."""
+    rays = mask_rays(frames, timesteps, name)
     path = trajectory(rays, count)
     ups = up_directions(rays, config.elevations)
     total = len(ups) * config.stages[0].steps + sum(stage.steps for stage in config.stages[1:])
@@ -76,8 +75,8 @@ def fit_animal(
     best: list[KnownCameras] = []
     for index, up in enumerate(ups):
         working = working_frame(rays, path, up)
-        race = KnownCameras(frames, moments, name, working, config, generator, log, total)
-        race.gaze = single_view(rays, working)
+        race = KnownCameras(frames, timesteps, name, working, config, generator, log, total)
+        race.view = single_view(rays, working)
         race.done = index * config.stages[0].steps
         local = torch.linalg.solve(working[:3, :3], (path - working[:3, 3]).T).T
         race.begin(Hypotheses.start(facings(config.yaw_starts), local.float()))
@@ -96,15 +95,15 @@ class KnownCameras(Race):
     """Hypotheses under one choice of the up direction.
 
     Attributes:
-        gaze: the one direction in which all cameras look, in the working frame, [3]; None where there are several.
+        view: the one direction in which all cameras look, in the working frame, [3]; None where there are several.
     """
 
-    gaze: Tensor | None = None
+    view: Tensor | None = None
 
     def evidence(self) -> Tensor | float:
-        if self.gaze is None:
+        if self.view is None:
             return 0.0
-        return self.config.view_weight * (self.guesses.heading() @ self.gaze).square()
+        return self.config.view_weight * (self.guesses.heading() @ self.view).square()
 
     def winner(self) -> Animal:
         """Return the best guess in the world, with the rest mesh's diagonal scaled to the object frame's."""
@@ -121,11 +120,10 @@ def make_prior(animal: Animal, clip: Clip, name: str, provenance: str) -> Prior:
     """Attach the clip's cameras and the mirrored half, and measure the mask IoU."""
     template = quadruped(animal.shape)
     transforms = pose(animal.angles, template.bones[:, 0], PARENTS)
-    cameras = []
-    for frame, matrix in zip(clip.frames, animal.object_to_world, strict=True):
-        if frame.camera is None:
-            raise UserError(f"{clip.name}: expected a camera for every frame, but {frame.time:g} s has none.")
-        cameras.append(camera_in_object(frame.camera, matrix))
+    cameras = [
+        camera_in_object(known_camera(frame, clip.name), matrix)
+        for frame, matrix in zip(clip.frames, animal.object_to_world, strict=True)
+    ]
     posed = skin_points(template.vertices, template.weights, transforms)
     quality = {"mask_iou": overlap(list(posed), template.faces, cameras, [f.mask for f in clip.frames])}
     times = torch.tensor(clip.times, dtype=torch.float64)

@@ -1,8 +1,7 @@
-"""Fit the quadruped template to real footage: masks, and cameras that nobody knows.
+"""Fit the quadruped template to masks under unknown cameras.
 
-Body proportions are shared by the clip and its mirrored copy; cameras and poses are found for each on its own (the two
-groups of the method). No world is known, so the object frame is the world: `object_to_world` is the identity and all
-motion of camera and animal lies in the per-frame cameras.
+Body proportions are shared by the clip and its mirrored copy; cameras and poses are fitted to each on its own. The
+object frame is the world: `object_to_world` is the identity, and the cameras of the frames hold all motion.
 """
 
 import math
@@ -13,7 +12,6 @@ from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from rewild4d.contracts import Log
-from rewild4d.errors import UserError
 from rewild4d.priors.config import PriorConfig, Stage
 from rewild4d.priors.io import seal
 from rewild4d.priors.judge import measured
@@ -22,7 +20,8 @@ from rewild4d.priors.landmarks import Marks
 from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.race import Race
 from rewild4d.priors.search import facings
-from rewild4d.priors.template import MIRROR, PARENTS, diagonal, quadruped
+from rewild4d.priors.silhouettes import require_mask
+from rewild4d.priors.template import PARENTS, diagonal, posed_prior, quadruped
 from rewild4d.priors.views import FIELD_OF_VIEW, Views, fauna_camera, windows
 from rewild4d.transforms import nearest_rotation, rigid
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Prior
@@ -30,7 +29,7 @@ from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Prior
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a person or the images say besides the masks; all optional.
+    """Optional input of the fit besides the masks.
 
     Attributes:
         marks: keypoints in pixels of the clip's frames.
@@ -41,30 +40,30 @@ class Evidence:
     travel: Tensor | None = None
 
     def __str__(self) -> str:
-        """What was known, for a sentence: each part ends with a comma and a space."""
+        """Name the parts for a sentence, each followed by a comma and a space."""
         points = "" if self.marks is None else f"with {len(self.marks)} keypoints, "
         return points + ("" if self.travel is None else "with the animal's travel, ")
 
     def mirrored(self, width: int) -> "Evidence":
-        """Return the same for the horizontally flipped frames."""
+        """Return the evidence of the horizontally flipped frames."""
         travel = None if self.travel is None else self.travel * self.travel.new_tensor((-1.0, 1.0))
         return Evidence(None if self.marks is None else self.marks.mirrored(width), travel)
 
 
 NOTHING = Evidence()
 ASCENT = 0.3
-"""Motion up the image per motion away over the ground (sine of a camera's elevation); taken high, since it is noisy."""
+"""Motion up the image per motion away over the ground (sine of the camera's elevation, taken high: it is noisy)."""
 NEAR = 0.04
-"""Distance of a joint to its keypoint up to which the cost is quadratic and from which it is linear, window sides."""
+"""Distance of a joint to its keypoint, in window sides, below which the cost is quadratic and above which linear."""
 
 
 class StandingCamera(Race):
-    """Guesses before Fauna's camera.
+    """Hypotheses under Fauna's camera.
 
     Attributes:
         said: marks and travel.
         boxes: windows of the frames, [T, 3].
-        given: proportions are known and stay as they are.
+        given: keep scale and proportions as they are.
     """
 
     said: Evidence
@@ -77,7 +76,6 @@ class StandingCamera(Race):
         return [name for name in names if name not in ("scale", "shape", "relief")] if self.given else names
 
     def evidence(self) -> Tensor | float:
-        # towards or away from the camera a turned animal looks like a shorter one, as under known cameras
         cost = self.config.view_weight * self.guesses.roots()[..., 2, 2].mean(1).square()
         cost = cost + self.config.carriage_weight * self.guesses.carriage()
         if self.said.marks is not None and len(self.said.marks):
@@ -86,7 +84,7 @@ class StandingCamera(Race):
 
     def _off_marks(self, found: Marks) -> Tensor:
         """Return the robust mean distance of joints to their keypoints, [B]."""
-        boxes = self.boxes[found.moments]
+        boxes = self.boxes[found.frames]
         side = 2 * math.tan(FIELD_OF_VIEW / 2)
         wanted = (found.pixels - boxes[:, :2]) / boxes[:, 2:]
         distance = (self.guesses.projected(found) / side - wanted).square().sum(-1)
@@ -96,31 +94,30 @@ class StandingCamera(Race):
         return super().verdict(stage) + self.config.travel_weight * self._against_travel()
 
     def _against_travel(self) -> Tensor | float:
-        """Measure how far heads point against (1) or along (-1) the motion over the ground, [B]."""
+        """Return how far headings lie against (1) or along (-1) the motion over the ground, [B]."""
         if self.said.travel is None or not len(self.said.travel):
             return 0.0
         walked = self.said.travel / self.boxes[1:, 2:]
-        # a step is noise: legs move the mask's centre up and down, and what matters is where the way leads
+        # smoothed, since legs move the mask's centre up and down
         steps = torch.from_numpy(gaussian_filter1d(walked.numpy(), max(1.0, len(walked) / 12), axis=0, mode="nearest"))
-        # who walks up the image walks away, on a ground that is seen from above
+        # motion up the image is motion away over the ground, seen from above
         ground = torch.stack((steps[:, 0], steps[:, 1] / ASCENT), dim=1)
         certainty = torch.tanh(2 * ground.sum(0).norm())
         along = (self.guesses.roots()[:, 1:, (0, 2), 2] * ground).sum((1, 2))
         return -certainty * along / ground.norm(dim=1).sum().clamp_min(1e-6)
 
     def run(self, stage: Stage) -> None:
-        """One round; before the fine ones every guess gets its reflection in depth as a rival."""
+        """Fit for one round; the fine ones start from every guess and its reflection in depth."""
         if stage.rasterized:
             self.guesses = self.guesses.with_depth_mirrored()
         super().run(stage)
 
     def rivals(self, order: list[int]) -> list[int]:
         """Return the best of each quadrant: head to the left or right, towards or away from the camera."""
-        heads = self.guesses.heading().detach()
-        quadrants = [(bool(heads[row, 0] > 0), bool(heads[row, 2] > 0)) for row in order]
-        best: dict[tuple[bool, bool], int] = {}
-        for row, quadrant in zip(order, quadrants, strict=True):
-            best.setdefault(quadrant, row)
+        quadrants = (self.guesses.heading()[:, (0, 2)] > 0).tolist()
+        best: dict[tuple[bool, ...], int] = {}
+        for row in order:
+            best.setdefault(tuple(quadrants[row]), row)
         return list(best.values())
 
 
@@ -130,47 +127,42 @@ def fit_footage(
     """Fit the template to a clip's masks under unknown cameras.
 
     Args:
-        clip: frames; their cameras are not looked at, and their masks are all that is.
-        config: every choice of the fit.
+        clip: its masks are used, not its cameras.
+        config: settings.
         seed: of the frames drawn for each step of a long clip.
         log: progress.
         said: keypoints and the animal's travel, where known.
         name: of the prior.
 
     Returns:
-        A prior with one camera and pose per frame and for its mirror image; `quality` holds the figures of
-        `judge.measured`, cost, and facing_margin: the lead of the best guess over the best that heads the other way.
+        A prior with one camera and pose per frame and for its mirror image; `quality` has the figures of
+        `judge.measured`, cost, and facing_margin: the lead of the best guess over the best that heads against it.
 
     Raises:
         UserError: no mask shows anything.
     """
-    if not any((frame.mask > 0.5).any() for frame in clip.frames):
-        raise UserError(
-            f"{clip.name}: expected at least one mask that shows the animal, but all {len(clip.frames)} are empty."
-        )
-    total = 2 * sum(stage.steps for stage in config.stages)
-    race = _run(clip, clip.frames, said, config, seed, log, total, None)
+    require_mask(clip.frames, clip.name)
+    race = _run(clip.name, clip.frames, said, config, seed, log, None)
     flipped = tuple(replace(f, rgb=f.rgb.flip(-1), mask=f.mask.flip(-1)) for f in clip.frames)
     mirrored = said.mirrored(clip.frames[0].mask.shape[2])
-    race_flip = _run(clip, flipped, mirrored, config, seed, log, total, race.guesses)
+    race_flip = _run(clip.name, flipped, mirrored, config, seed, log, race.guesses)
     return _prior(clip, race, race_flip, name, seed)
 
 
 def _run(
-    clip: Clip, frames: tuple[Frame, ...], said: Evidence, config: PriorConfig, seed: int, log: Log, total: int,
-    known: Views | None,
-) -> StandingCamera:  # fmt: skip
-    """Run all rounds, from all starts to one guess; ``known`` is the animal whose proportions are taken over."""
+    case: str, frames: tuple[Frame, ...], said: Evidence, config: PriorConfig, seed: int, log: Log, known: Views | None
+) -> StandingCamera:
+    """Run all rounds, from all starts to one guess; scale and proportions are those of ``known``, if given."""
+    total = 2 * sum(stage.steps for stage in config.stages)
     boxes = windows(frames)
     seen = [
         replace(frame, camera=fauna_camera(box, frame.mask.shape[2], frame.mask.shape[1]))
         for frame, box in zip(frames, boxes, strict=True)
     ]
-    moments, working = list(range(len(frames))), torch.eye(4, dtype=torch.float64)
-    generator = torch.Generator().manual_seed(seed)
-    race = StandingCamera(seen, moments, clip.name, working, config, generator, log, total)
+    working, generator = torch.eye(4, dtype=torch.float64), torch.Generator().manual_seed(seed)
+    race = StandingCamera(seen, range(len(frames)), case, working, config, generator, log, total)
     race.said, race.boxes = said, boxes.float()
-    # with proportions given, Fauna's four quadrants and two more are enough
+    # known proportions need fewer starts
     count = config.yaw_starts if known is None else max(4, config.yaw_starts // 2)
     starts = Views.start(facings(count), torch.zeros(len(frames), 3))
     race.begin(starts)
@@ -185,6 +177,7 @@ def _run(
 
 
 def _prior(clip: Clip, race: StandingCamera, race_flip: StandingCamera, name: str, seed: int) -> Prior:
+    """Return the prior of the fitted clip and its mirrored copy."""
     template, count = quadruped(Proportions(race.guesses.shape[0], race.guesses.relief[0])), len(clip.frames)
     transforms, transforms_flip = (
         pose(half.guesses.joint_angles()[0], template.bones[:, 0], PARENTS) for half in (race, race_flip)
@@ -193,37 +186,25 @@ def _prior(clip: Clip, race: StandingCamera, race_flip: StandingCamera, name: st
     for suffix, half in (("", race), ("_flip", race_flip)):
         quality |= {f"{key}{suffix}": value for key, value in half.figures.items()}
         quality[f"cost{suffix}"] = float(half.costs.min())
-    prior = Prior(
-        name=name,
+    world, times = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1), torch.tensor(clip.times, dtype=torch.float64)
+    prior = posed_prior(
+        template, transforms, world, object_cameras(race), times, name=name,
         provenance=f"Template fitted to the {count} masks of the clip and of its mirror image, cameras unknown, "
         f"{race.said}seed {seed}.",
-        vertices=template.vertices,
-        faces=template.faces,
-        weights=template.weights,
-        bones=template.bones,
-        parents=torch.tensor(PARENTS),
-        mirror=torch.tensor(MIRROR),
-        times=torch.tensor(clip.times, dtype=torch.float64),
-        object_to_world=torch.eye(4, dtype=torch.float64).repeat(count, 1, 1),
-        cameras=object_cameras(race),
-        transforms=transforms,
-        cameras_flip=object_cameras(race_flip),
-        transforms_flip=transforms_flip,
-        quality=quality,
-        digest="",
-    )
+    )  # fmt: skip
+    prior = replace(prior, cameras_flip=object_cameras(race_flip), transforms_flip=transforms_flip)
     return seal(replace(prior, quality=quality | measured(prior, clip.frames)))
 
 
 def object_cameras(race: StandingCamera) -> tuple[Camera, ...]:
-    """The winner's cameras in the object frame, lengths scaled so that the rest diagonal is `OBJECT_DIAGONAL`."""
+    """Return the cameras of the best guess in the object frame, with a rest diagonal of `OBJECT_DIAGONAL`."""
     guesses = race.guesses
     size = guesses.scales()[0] * diagonal(quadruped(Proportions(guesses.shape, guesses.relief), unit=False).vertices)[0]
     cameras = []
     for frame, root in zip(race.frames, guesses.roots()[0].double(), strict=True):
         assert frame.camera is not None
         moved = frame.camera.world_to_camera @ root
-        # Single precision leaves errors of 1e-7.
+        # single precision leaves errors of 1e-7
         moved = rigid(nearest_rotation(moved[:3, :3]), moved[:3, 3] * (OBJECT_DIAGONAL / float(size)))
         cameras.append(replace(frame.camera, world_to_camera=moved))
     return tuple(cameras)

@@ -62,11 +62,11 @@ INTEGERS = ("faces", "parents", "mirror", "sizes")
 SINGLE = ("vertices", "weights", "bones", "transforms", "transforms_flip")
 RIGID = ("world_to_camera", "world_to_camera_flip", "transforms", "transforms_flip")
 OFF_ROTATION = 0.01
-"""How far R R^T may be from the identity: data sets give rotations to three digits."""
+"""Largest deviation of R R^T from the identity: data sets give rotations to three digits."""
 
 
 def seal(prior: Prior) -> Prior:
-    """Return the same prior with its digest, over everything else."""
+    """Return the prior with the digest of everything else."""
     cameras = [array for camera in (*prior.cameras, *prior.cameras_flip) for array in _camera_arrays(camera)]
     quality = json.dumps(prior.quality, sort_keys=True)
     arrays = (
@@ -91,16 +91,16 @@ def save_prior(prior: Prior, path: Path) -> None:
 
 
 def require_loadable(prior: Prior, source: Path) -> None:
-    """Hold a prior against all that `load_prior` asks of a file, before one is written.
+    """Check that `load_prior` would accept a file of the prior.
 
     Raises:
-        UserError: naming what the prior is made from and the first array that breaks its promise.
+        UserError: names ``source``, which the prior is made from, and the first invalid array.
     """
     _validated(source, _arrays(prior))
 
 
 def _arrays(prior: Prior) -> dict[str, Any]:
-    """Return what a prior file holds."""
+    """Return the arrays of a prior file."""
     arrays: dict[str, Any] = {
         name: getattr(prior, name).detach().cpu().numpy()
         for name in (*SHAPES, *FLIPPED)
@@ -130,23 +130,23 @@ def load_prior(path: Path) -> Prior:
     else:
         transforms_flip = mirror_transforms(arrays["transforms"], arrays["mirror"])
     shared = {key: arrays[key] for key in SHAPES if key not in ("world_to_camera", "intrinsics", "sizes")}
+    text = {key: str(raw[key]) for key in ("name", "provenance", "quality") if key in raw}
     return seal(
         Prior(
-            name=_text(raw, "name", path.stem),
-            provenance=_text(raw, "provenance", f"Read from {path.name}."),
+            name=text.get("name", path.stem),
+            provenance=text.get("provenance", f"Read from {path.name}."),
             cameras=cameras,
             cameras_flip=mirrored,
             transforms_flip=transforms_flip,
-            quality=_quality(path, _text(raw, "quality", "{}")),
+            quality=_quality(path, text.get("quality", "{}")),
             digest="",
-            notes=(),
             **shared,
         )
     )
 
 
 def _validated(path: Path, raw: Mapping[str, np.ndarray]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Return the arrays of `SHAPES` and those of `FLIPPED` that are there, after all checks."""
+    """Check all arrays; return those of `SHAPES`, and of `FLIPPED` where the file has them."""
     sizes: dict[str, int] = {}
     arrays = {key: _checked(path, raw, key, shape, sizes) for key, shape in SHAPES.items()}
     flipped = {key: _checked(path, raw, key, shape, sizes) for key, shape in FLIPPED.items() if key in raw}
@@ -154,8 +154,6 @@ def _validated(path: Path, raw: Mapping[str, np.ndarray]) -> tuple[dict[str, Ten
     return arrays, flipped
 
 
-def _text(raw: Mapping[str, np.ndarray], key: str, default: str) -> str:
-    return str(raw[key]) if key in raw else default
 
 
 def _quality(path: Path, text: str) -> dict[str, float]:
@@ -171,7 +169,7 @@ def _quality(path: Path, text: str) -> dict[str, float]:
 def _checked(
     path: Path, raw: Mapping[str, np.ndarray], key: str, shape: tuple[str | int, ...], sizes: dict[str, int]
 ) -> Tensor:
-    """Return one array with its documented shape and type; a letter stands for the size seen first."""
+    """Return one array after checks of shape and type; ``sizes`` holds the size of each letter once it is known."""
     if key not in raw:
         held = ", ".join(sorted(raw)) or "nothing"
         raise UserError(f"{path}: expected an array '{key}', but the file holds only {held}.")
@@ -186,18 +184,16 @@ def _checked(
     integer = key in INTEGERS
     if not np.issubdtype(array.dtype, np.integer if integer else np.floating):
         raise UserError(f"{path}: expected '{key}' to hold {'integers' if integer else 'floats'}, got {array.dtype}.")
-    if not np.isfinite(array).all():
-        raise UserError(
-            f"{path}: expected finite numbers in '{key}', got {int((~np.isfinite(array)).sum())} that are not."
-        )
+    if odd := int((~np.isfinite(array)).sum()):
+        raise UserError(f"{path}: expected finite numbers in '{key}', got {odd} that are not.")
     return torch.from_numpy(array.astype(np.int64 if integer else np.float32 if key in SINGLE else np.float64))
 
 
 def _check_values(path: Path, arrays: Mapping[str, Tensor], flipped: Mapping[str, Tensor]) -> None:
-    """What the shapes do not say.
+    """Check values.
 
     Raises:
-        UserError: naming the first array that breaks its promise.
+        UserError: names the first invalid array.
     """
     bones = torch.arange(len(arrays["parents"]))
     vertices, faces, mirror, parents = (arrays[key] for key in ("vertices", "faces", "mirror", "parents"))
@@ -206,7 +202,7 @@ def _check_values(path: Path, arrays: Mapping[str, Tensor], flipped: Mapping[str
     inside = {key: (arrays[key] >= low) & (arrays[key] < high) for key, low, high in (
         ("faces", 0, len(vertices)), ("parents", -1, len(bones)), ("mirror", 0, len(bones)),
     )}  # fmt: skip
-    promises = [
+    checks = [
         (bool(inside["faces"].all()), f"'faces' to be below {len(vertices)}", f"{int(faces.max())}"),
         (bool(inside["parents"].all()), f"'parents' to lie in -1..{len(bones) - 1}", f"{parents.tolist()}"),
         (_is_forest(parents), "'parents' to form a tree", f"a cycle in {parents.tolist()}"),
@@ -229,22 +225,22 @@ def _check_values(path: Path, arrays: Mapping[str, Tensor], flipped: Mapping[str
     for key, array in {**arrays, **flipped}.items():
         if key in RIGID:
             fault = off_similarity(array, rigid=True)
-            promises.append((fault <= OFF_ROTATION, f"rigid matrices in '{key}'", f"some that are {fault:.2g} off"))
+            checks.append((fault <= OFF_ROTATION, f"rigid matrices in '{key}'", f"some that are {fault:.2g} off"))
         elif key.startswith("intrinsics"):
-            promises.append((_is_pinhole(array), f"positive focal lengths and a last row 0 0 1 in '{key}'", "others"))
+            checks.append((_is_pinhole(array), f"positive focal lengths and a last row 0 0 1 in '{key}'", "others"))
     fault = off_similarity(arrays["object_to_world"], rigid=False)
-    promises.append((fault <= OFF_ROTATION, "similarities in 'object_to_world'", f"some that are {fault:.2g} off"))
-    for kept, expected, came in promises:
-        if not kept:
+    checks.append((fault <= OFF_ROTATION, "similarities in 'object_to_world'", f"some that are {fault:.2g} off"))
+    for passed, expected, came in checks:
+        if not passed:
             raise UserError(f"{path}: expected {expected}, got {came}.")
 
 
 def off_similarity(matrices: Tensor, *, rigid: bool) -> float:
-    """How far matrices are from rotation, translation and (unless rigid) one scale, [..., 4, 4]; 0 where they are."""
+    """Return the largest deviation of matrices [..., 4, 4] from rigid transforms, or else from similarities."""
     linear, last = matrices[..., :3, :3].double(), matrices[..., 3, :].double()
     scale = linear.det().sign().clamp_min(0) if rigid else linear.det().clamp_min(0) ** (1 / 3)
-    turn = linear / scale[..., None, None]
-    gram = turn @ turn.transpose(-1, -2) - torch.eye(3, dtype=torch.float64)
+    rotation = linear / scale[..., None, None]
+    gram = rotation @ rotation.transpose(-1, -2) - torch.eye(3, dtype=torch.float64)
     off = torch.maximum(gram.abs().amax(), (last - last.new_tensor((0, 0, 0, 1))).abs().amax())
     return float(off.nan_to_num(nan=torch.inf))
 
@@ -256,10 +252,10 @@ def _is_pinhole(intrinsics: Tensor) -> bool:
 
 def _is_forest(parents: Tensor) -> bool:
     """Tell whether every bone reaches a root."""
-    at = torch.arange(len(parents))
-    for _ in range(len(parents)):
-        at = torch.where(at >= 0, parents[at.clamp(0, len(parents) - 1)].clamp(-1, len(parents) - 1), at)
-    return bool((at < 0).all())
+    bone, last = torch.arange(len(parents)), len(parents) - 1
+    for _ in parents:
+        bone = torch.where(bone >= 0, parents[bone.clamp(0, last)].clamp(-1, last), bone)
+    return bool((bone < 0).all())
 
 
 def _cameras(world_to_camera: Tensor, intrinsics: Tensor, sizes: Tensor) -> tuple[Camera, ...]:

@@ -1,4 +1,4 @@
-"""How far a prior can be trusted: its joints beside annotated ones, its head, and what its own figures say."""
+"""Quality of a prior: mask IoU, joints against annotated keypoints, head and tail, and reasons to doubt it."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.priors.landmarks import FRONT, LANDMARKS, REAR, Marks, landmark_pixels
-from rewild4d.priors.silhouettes import overlap
+from rewild4d.priors.silhouettes import mask_box, overlap
 from rewild4d.priors.steady import steady
 from rewild4d.transforms import skin_points
 from rewild4d.types import Camera, Frame, Prior
@@ -17,9 +17,9 @@ CORRECT = 0.2
 POOR = 0.6
 """Mask IoU below which the template hardly fits."""
 UNDECIDED = 0.01
-"""Lead in cost below which head and tail are hardly told apart."""
+"""Lead in cost below which head and tail are uncertain."""
 AGREED = 0.9
-"""Share of frames in which the clip and its mirror image must agree about the head."""
+"""Share of frames in which the clip and its mirror image must agree about the heading."""
 
 
 def measured(prior: Prior, frames: Sequence[Frame]) -> dict[str, float]:
@@ -27,11 +27,11 @@ def measured(prior: Prior, frames: Sequence[Frame]) -> dict[str, float]:
 
     Args:
         prior: one row per frame.
-        frames: with masks, of which one at least shows something.
+        frames: with masks, of which at least one shows something.
 
     Returns:
-        mask_iou: mean intersection over union of template and mask; hops: frames whose camera is far from the others'
-        (`steady`); each with its twin of the mirror image, "<name>_flip"; facing_agreement (`agreement`).
+        mask_iou: mean intersection over union of template and mask; hops: number of frames whose camera is far from the
+        others' (`steady`); both also of the mirror image, "<name>_flip"; facing_agreement (`agreement`).
     """
     figures = {"facing_agreement": agreement(prior.cameras, prior.cameras_flip)}
     plain, flipped = [f.mask for f in frames], [f.mask.flip(-1) for f in frames]
@@ -46,9 +46,9 @@ def measured(prior: Prior, frames: Sequence[Frame]) -> dict[str, float]:
 
 
 def agreement(cameras: Sequence[Camera], cameras_flip: Sequence[Camera]) -> float:
-    """Share of frames in which heads of the clip and of its mirror image, fitted on their own, point the same way.
+    """Return the share of frames in which clip and mirror image agree about the heading within 90 degrees.
 
-    Ways are those over the ground as the camera sees it, right and away; they agree within 90 degrees.
+    Headings are over the ground in the camera's axes x and z.
     """
     heads, flipped = (
         torch.stack([camera.world_to_camera[(0, 2), 2].double() for camera in each]) for each in (cameras, cameras_flip)
@@ -58,7 +58,7 @@ def agreement(cameras: Sequence[Camera], cameras_flip: Sequence[Camera]) -> floa
 
 
 def doubts(quality: Mapping[str, float]) -> tuple[str, ...]:
-    """List what a prior's figures say against it, a sentence each."""
+    """Return the reasons to doubt a prior that its figures give, a sentence each."""
     found = []
     iou = min(quality.get("mask_iou", 1.0), quality.get("mask_iou_flip", 1.0))
     if iou < POOR:
@@ -72,27 +72,28 @@ def doubts(quality: Mapping[str, float]) -> tuple[str, ...]:
 
 
 def joint_scores(prior: Prior, frames: Sequence[Frame], found: Marks) -> dict[str, float]:
-    """Return the share of joints near their annotation, and of frames in which front and rear lie the right way round.
+    """Return the share of correct joints, and of frames with the correct heading.
 
     Args:
         prior: one row per frame.
         frames: with masks.
-        found: annotated points; their moments are rows.
+        found: annotated points; their frames are rows.
 
     Returns:
-        pck: share of the points within `CORRECT` of the box (Yang & Ramanan 2013), over all points; facing: share of
-        the frames with both ends annotated in which the direction from the mean rear point to the mean front point
-        agrees within 90 degrees in the image; and how many points and frames that are. Empty without points.
+        pck: share of points within `CORRECT` of the box (Yang & Ramanan 2013); facing: share of the frames with both
+        ends annotated in which the direction in the image from the mean rear point to the mean front point agrees
+        within 90 degrees; pck_points and facing_frames: their numbers. Empty without points.
     """
     if not len(found):
         return {}
     drawn = landmark_pixels(prior, found)
-    sides = torch.tensor([_longer_side(frames[int(row)].mask[0]) for row in found.moments])
+    boxes = [mask_box(frames[int(row)].mask[0] > 0.5) or (0, 0, 0, 0) for row in found.frames]
+    sides = torch.tensor([float(max(right - left, bottom - top)) for left, top, right, bottom in boxes])
     near = (drawn - found.pixels).norm(dim=1) <= CORRECT * sides
     front, rear = _among(found, FRONT), _among(found, REAR)
     agree = []
-    for moment in found.moments.unique():
-        here = found.moments == moment
+    for frame in found.frames.unique():
+        here = found.frames == frame
         if (here & front).any() and (here & rear).any():
             wanted, got = (
                 points[here & front].double().mean(0) - points[here & rear].double().mean(0)
@@ -105,15 +106,8 @@ def joint_scores(prior: Prior, frames: Sequence[Frame], found: Marks) -> dict[st
     return scores
 
 
-def _longer_side(mask: Tensor) -> float:
-    rows, columns = torch.nonzero(mask > 0.5, as_tuple=True)
-    if not len(rows):
-        return 0.0
-    return float(max(rows.max() - rows.min(), columns.max() - columns.min()) + 1)
-
-
 def _among(found: Marks, names: Sequence[str]) -> Tensor:
     """Return which marks are one of the named landmarks, bool, [m]."""
-    places = {LANDMARKS[name] for name in names}
+    points = {LANDMARKS[name] for name in names}
     marks = zip(found.bones.tolist(), found.along.tolist(), strict=True)
-    return torch.tensor([(bone, round(along, 4)) in places for bone, along in marks])
+    return torch.tensor([(bone, round(along, 4)) in points for bone, along in marks])

@@ -1,4 +1,4 @@
-"""Named points of the template, and the files that say which annotated keypoint is which of them."""
+"""Named points of the template, and the files that map annotated keypoints to them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from rewild4d.errors import UserError, shown, unknown_name
+from rewild4d.priors.kinematics import moved
 from rewild4d.priors.template import MIRROR
 from rewild4d.texts import read_toml
-from rewild4d.types import Camera, Keypoints, Prior
+from rewild4d.types import Keypoints, Prior
 
 
 def _landmarks() -> dict[str, tuple[int, float]]:
@@ -30,39 +31,39 @@ def _landmarks() -> dict[str, tuple[int, float]]:
 
 
 LANDMARKS = _landmarks()
-"""Where each point lies: the bone and the share of its length from start (the pivot, 0) to end (1). On legs: "top" is
-the shoulder or hip, "upper" the elbow or stifle, "lower" the wrist or hock."""
+"""Bone of each point and the share of its length from start (the pivot, 0) to end (1). On legs: "top" is the shoulder
+or hip, "upper" the elbow or stifle, "lower" the wrist or hock."""
 FRONT = tuple(name for name in LANDMARKS if name.startswith("front_")) + ("nose", "jaw", "eye", "poll", "neck")
 REAR = tuple(name for name in LANDMARKS if name.startswith("rear_")) + ("tail_root",)
 
 
 @dataclass(frozen=True)
 class Marks:
-    """Keypoints as places on the template.
+    """Keypoints as points of the template.
 
     Attributes:
-        moments: index of the frame of each mark, int64, [m].
+        frames: index of the frame of each mark, int64, [m].
         bones: int64, [m].
         along: share of the bone's length, [m].
-        pixels: where it was seen, in the frame's pixels, [m, 2].
+        pixels: annotated position in the frame's pixels, [m, 2].
     """
 
-    moments: Tensor
+    frames: Tensor
     bones: Tensor
     along: Tensor
     pixels: Tensor
 
     def mirrored(self, width: int) -> "Marks":
-        """Return the same in horizontally flipped frames."""
+        """Return the marks of the horizontally flipped frames."""
         flipped = torch.stack((width - self.pixels[:, 0], self.pixels[:, 1]), dim=1)
-        return Marks(self.moments, torch.tensor(MIRROR)[self.bones], self.along, flipped)
+        return Marks(self.frames, torch.tensor(MIRROR)[self.bones], self.along, flipped)
 
     def chosen(self, rows: Tensor) -> "Marks":
         """Return some of the marks, by index or bool, [m]."""
-        return Marks(self.moments[rows], self.bones[rows], self.along[rows], self.pixels[rows])
+        return Marks(*(value[rows] for value in vars(self).values()))
 
     def __len__(self) -> int:
-        return len(self.moments)
+        return len(self.frames)
 
 
 def mapping_names() -> list[str]:
@@ -72,7 +73,7 @@ def mapping_names() -> list[str]:
 
 
 def load_mapping(name: str) -> dict[str, str]:
-    """Keypoint name -> name of a landmark; ``name`` is one of ours or the path of a TOML file with a table [points].
+    """Return the landmark of each keypoint name, from one of our files or a TOML file with a table [points].
 
     Raises:
         UserError: no such mapping, not TOML, or a landmark that does not exist.
@@ -92,30 +93,23 @@ def load_mapping(name: str) -> dict[str, str]:
 
 
 def marks(keypoints: Sequence[Keypoints | None], mapping: dict[str, str]) -> Marks:
-    """Return all visible keypoints that the mapping knows; frames without any have None."""
+    """Return all visible keypoints that the mapping names, of all frames (None: without any)."""
     rows, pixels = [], []
-    for moment, points in enumerate(keypoints):
+    for frame, points in enumerate(keypoints):
         if points is None:
             continue
-        for name, place, visible in zip(points.names, points.points.tolist(), points.visible.tolist(), strict=True):
+        for name, pixel, visible in zip(points.names, points.points.tolist(), points.visible.tolist(), strict=True):
             if visible and name in mapping:
-                bone, along = LANDMARKS[mapping[name]]
-                rows.append((moment, bone, along))
-                pixels.append(place)
-    return Marks(
-        torch.tensor([moment for moment, _, _ in rows], dtype=torch.long),
-        torch.tensor([bone for _, bone, _ in rows], dtype=torch.long),
-        torch.tensor([along for _, _, along in rows], dtype=torch.float32),
-        torch.tensor(pixels, dtype=torch.float32).reshape(-1, 2),
-    )
+                rows.append((frame, *LANDMARKS[mapping[name]]))
+                pixels.append(pixel)
+    frames, bones, along = torch.tensor(rows, dtype=torch.float32).reshape(-1, 3).unbind(1)
+    return Marks(frames.long(), bones.long(), along, torch.tensor(pixels, dtype=torch.float32).reshape(-1, 2))
 
 
-def landmark_pixels(prior: Prior, found: Marks, cameras: Sequence[Camera] | None = None) -> Tensor:
-    """Return where the prior puts the marks, in pixels, [m, 2]; the marks' moments are rows of the prior."""
-    cameras = cameras or prior.cameras
+def landmark_pixels(prior: Prior, found: Marks) -> Tensor:
+    """Project the prior's points of the marks to pixels, [m, 2]; the marks' frames are rows of the prior."""
     start, end = prior.bones[found.bones].unbind(1)
     rest = start + found.along[:, None] * (end - start)
-    transforms = prior.transforms[found.moments, found.bones]
-    posed = (transforms[:, :3, :3] @ rest[..., None])[..., 0] + transforms[:, :3, 3]
-    shown = [cameras[int(row)].project(point.double())[0] for row, point in zip(found.moments, posed, strict=True)]
+    posed = moved(rest, prior.transforms[found.frames, found.bones])
+    shown = [prior.cameras[int(row)].project(point.double())[0] for row, point in zip(found.frames, posed, strict=True)]
     return torch.stack(shown) if shown else torch.zeros(0, 2, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""A prior between its frames, and Gaussians on its surface: what every method starts from."""
+"""Interpolate a prior between its frames, and place Gaussians on its surface."""
 
 import math
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ class SurfaceSample:
         points: object frame, [n, 3].
         normals: unit, outwards, [n, 3].
         weights: skinning weights, rows sum to one, [n, J].
-        radius: of a disc with each point's share of the area, object units.
+        radius: of a disc with a point's share of the area, object units.
     """
 
     points: Tensor
@@ -77,7 +77,7 @@ def pose_at(prior: Prior, time: float) -> tuple[Tensor, Tensor]:
 
 
 def camera_at(prior: Prior, time: float) -> Camera:
-    """The prior's camera at any time in the object frame: exact at its frames, between them on the straight way."""
+    """Return the prior's camera at any time, in the object frame; see `pose_at`."""
     before, after, part = _neighbours(prior.times, time)
     first, second = prior.cameras[before], prior.cameras[after]
     if before == after:
@@ -88,12 +88,12 @@ def camera_at(prior: Prior, time: float) -> Camera:
 
 
 def world_camera(prior: Prior, time: float) -> Camera:
-    """Return `camera_at` in the world where the prior's animal stands."""
+    """Return the prior's camera at any time, in the world."""
     return camera_in_object(camera_at(prior, time), torch.linalg.inv(pose_at(prior, time)[0]))
 
 
 def _neighbours(times: Tensor, time: float) -> tuple[int, int, float]:
-    """Return the frames before and after a time, and its part of the way; one frame twice at it and beyond the ends."""
+    """Return the frames before and after a time, and its fraction between them; at a frame and beyond the ends, one."""
     after = min(int(torch.searchsorted(times, torch.tensor(time, dtype=times.dtype) - 1e-9)), len(times) - 1)
     if after == 0 or time >= float(times[after]) - 1e-9:
         return after, after, 0.0
@@ -102,13 +102,13 @@ def _neighbours(times: Tensor, time: float) -> tuple[int, int, float]:
 
 
 def blend_similarities(a: Tensor, b: Tensor, part: float) -> Tensor:
-    """Between two proper similarities: normalised quaternion blend, linear translation, geometric scale."""
-    (scale_a, turn_a, move_a), (scale_b, turn_b, move_b) = split_similarity(a), split_similarity(b)
-    quat_a, quat_b = matrix_to_quat(turn_a), matrix_to_quat(turn_b)
+    """Interpolate two proper similarities: normalised quaternion blend, linear translation, geometric scale."""
+    (scale_a, rotation_a, shift_a), (scale_b, rotation_b, shift_b) = split_similarity(a), split_similarity(b)
+    quat_a, quat_b = matrix_to_quat(rotation_a), matrix_to_quat(rotation_b)
     quat_b = torch.where((quat_a * quat_b).sum(-1, keepdim=True) < 0, -quat_b, quat_b)
-    turn = quat_to_matrix((1 - part) * quat_a + part * quat_b)
+    rotation = quat_to_matrix((1 - part) * quat_a + part * quat_b)
     scale = scale_a ** (1 - part) * scale_b**part
-    return similarity(scale, turn, (1 - part) * move_a + part * move_b)
+    return similarity(scale, rotation, (1 - part) * shift_a + part * shift_b)
 
 
 def pose_gaussians(sample: SurfaceSample, quats: Tensor, scales: Tensor, colors: Tensor, transforms: Tensor) -> Splats:
@@ -132,15 +132,14 @@ def pose_gaussians(sample: SurfaceSample, quats: Tensor, scales: Tensor, colors:
 
 
 def colors_from_frames(prior: Prior, sample: SurfaceSample, frames: Sequence[Frame]) -> Tensor:
-    """Colour of each surface point: mean over the frames that see it, else its mirror image's, else the mean colour.
+    """Return RGB of each surface point in [0, 1], [n, 3].
+
+    It is the mean over the frames that see the point, else that of the mirrored point, else the mean colour.
 
     Args:
         prior: posed at the frames' times.
         sample: points on its rest surface.
         frames: training frames, with mattes.
-
-    Returns:
-        RGB in [0, 1], [n, 3].
     """
     total = torch.zeros(len(sample.points), 3)
     weight = torch.zeros(len(sample.points), 1)
@@ -148,8 +147,8 @@ def colors_from_frames(prior: Prior, sample: SurfaceSample, frames: Sequence[Fra
         index = int((prior.times - frame.time).abs().argmin())
         camera, transforms = prior.cameras[index], prior.transforms[index]
         points = skin_points(sample.points, sample.weights, transforms)
-        turned = torch.einsum("nj,jab,nb->na", sample.weights, transforms[:, :3, :3], sample.normals)
-        facing = -(normalize(turned, dim=-1) * normalize(points - camera.center.to(points), dim=-1)).sum(-1)
+        normals = torch.einsum("nj,jab,nb->na", sample.weights, transforms[:, :3, :3], sample.normals)
+        facing = -(normalize(normals, dim=-1) * normalize(points - camera.center.to(points), dim=-1)).sum(-1)
         pixels, depth = camera.project(points)
         color, alpha = _look_up(frame, pixels)
         shown = (facing > 0.2) & (alpha > 0.5) & _nearest(pixels, depth, camera)

@@ -1,4 +1,4 @@
-"""Pictures for people: the fitted template over the frames it was fitted to."""
+"""Pictures of the fitted template over its frames."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.files import atomic
-from rewild4d.priors.silhouettes import outline
+from rewild4d.priors.silhouettes import mask_box, outline
 from rewild4d.transforms import skin_points
 from rewild4d.types import Clip, Prior
 
@@ -19,23 +19,23 @@ BODY_COLOR, LEFT_COLOR, RIGHT_COLOR = (255, 255, 255), (255, 170, 0), (0, 170, 2
 HEAD_COLOR = (255, 0, 80)
 
 
-def overlay(clip: Clip, prior: Prior, moments: Sequence[int] | None = None, photo: float = 0.0) -> Tensor:
+def overlay(clip: Clip, prior: Prior, rows: Sequence[int] | None = None, photo: float = 0.0) -> Tensor:
     """Draw masks in green, the template in magenta (grey where they agree), bones on top.
 
-    Left legs are drawn orange, right legs blue, the spine white and the head red, so that a turned template shows.
+    Left legs are drawn orange, right legs blue, the spine white and the head red.
 
     Args:
         clip: the frames.
         prior: a prior with one pose per frame.
-        moments: which frames; None is all.
+        rows: indices of the frames; None is all.
         photo: share of the animal's picture in the colours under the bones, from 0 to 1.
 
     Returns:
         float32 in [0, 1], [k, 3, h, w].
     """
     pictures = []
-    for moment in range(len(clip.frames)) if moments is None else moments:
-        frame, camera, transforms = clip.frames[moment], prior.cameras[moment], prior.transforms[moment]
+    for row in range(len(clip.frames)) if rows is None else rows:
+        frame, camera, transforms = clip.frames[row], prior.cameras[row], prior.transforms[row]
         drawn = outline(skin_points(prior.vertices, prior.weights, transforms), prior.faces, camera)
         mask = (frame.mask[0].numpy() * 255).astype(np.uint8)
         shades = np.stack((drawn, mask, drawn), -1) * (0.5 * (1 - photo))
@@ -67,7 +67,7 @@ def save_overlay(clip: Clip, prior: Prior, beside: Path, side: int = 320) -> lis
     Returns:
         The files written: <beside>.png and <beside>.mp4.
     """
-    tiles: list[Any] = [_tile(clip, prior, moment, side) for moment in range(len(clip.frames))]
+    tiles: list[Any] = [_tile(clip, prior, row, side) for row in range(len(clip.frames))]
     shown = [tiles[i] for i in np.linspace(0, len(tiles) - 1, min(12, len(tiles))).round().astype(int)]
     shown += [np.zeros_like(tiles[0])] * (-len(shown) % 4 if len(shown) > 4 else 0)
     rows = [np.concatenate(shown[i : i + 4], axis=1) for i in range(0, len(shown), 4)]
@@ -80,15 +80,14 @@ def save_overlay(clip: Clip, prior: Prior, beside: Path, side: int = 320) -> lis
     return [picture, video]
 
 
-def _tile(clip: Clip, prior: Prior, moment: int, side: int) -> np.ndarray:
-    """Return the square around the animal: its picture, dimmed, under the overlay, uint8 [side, side, 3]."""
-    frame = clip.frames[moment]
-    drawn = overlay(clip, prior, [moment], photo=0.5)[0]
-    rows, columns = torch.nonzero(torch.maximum(frame.mask[0], drawn.amax(0)) > 0.2, as_tuple=True)
-    if not len(rows):
+def _tile(clip: Clip, prior: Prior, row: int, side: int) -> np.ndarray:
+    """Return the square around the animal: its dimmed picture under the overlay, uint8 [side, side, 3]."""
+    drawn = overlay(clip, prior, [row], photo=0.5)[0]
+    box = mask_box(torch.maximum(clip.frames[row].mask[0], drawn.amax(0)) > 0.2)
+    if box is None:
         return np.zeros((side, side, 3), np.uint8)
-    reach = 0.55 * float(max(rows.max() - rows.min(), columns.max() - columns.min()) + 1)
-    x, y = float(columns.min() + columns.max() + 1) / 2, float(rows.min() + rows.max() + 1) / 2
-    matrix = np.array(((2 * reach / side, 0, x - reach), (0, 2 * reach / side, y - reach)))
+    left, top, right, bottom = box
+    half, x, y = 0.55 * max(bottom - top, right - left), (left + right) / 2, (top + bottom) / 2
+    matrix = np.array(((2 * half / side, 0, x - half), (0, 2 * half / side, y - half)))
     image = (drawn.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
     return cv2.warpAffine(image, matrix, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)

@@ -1,4 +1,4 @@
-"""A prior brought to a clip: other sizes, square crops, other moments, and cameras for frames that have none."""
+"""Fit a prior to a clip: image size, square crops, times, and cameras for frames without one."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,13 +10,14 @@ from rewild4d.cameras.recropping import recropped
 from rewild4d.errors import UserError
 from rewild4d.priors.io import seal
 from rewild4d.priors.motion import camera_at, pose_at, world_camera
+from rewild4d.priors.silhouettes import require_mask
 from rewild4d.transforms import camera_in_object
 from rewild4d.types import Camera, Clip, Prior
 
 SAME = 0.1
-"""Two moments are one where they lie closer than this share of the clip's frame interval."""
+"""Times are equal within this share of the clip's frame interval."""
 NEAR = 0.01
-"""A prior's camera is the clip's where it puts every joint within this share of the image's longer side."""
+"""Cameras are equal where they project every joint within this share of the image's longer side."""
 
 
 def resized(prior: Prior, width: int, height: int) -> Prior:
@@ -30,11 +31,11 @@ def resized(prior: Prior, width: int, height: int) -> Prior:
 def placed(prior: Prior, clip: Clip) -> Prior:
     """Fit a prior from a file to the frames of a clip with unknown cameras.
 
-    It may have been made for the clip's own images (then its times are the clip's) or for whole frames of the video
-    that the clip was cut from (then they are the video's). Frames that it does not know lie between two that it does.
+    It may be for the clip's own images (then its times are the clip's) or for whole frames of the video that the clip
+    was cut from (then they are the video's). Frames that it lacks are interpolated.
 
     Raises:
-        UserError: it is for images of another size, or for other moments.
+        UserError: it is for images of another size, or for other times.
     """
     first, frame = prior.cameras[0], clip.frames[0]
     sizes = {(camera.width, camera.height) for camera in (*prior.cameras, *prior.cameras_flip)}
@@ -53,11 +54,10 @@ def in_world(prior: Prior, clip: Clip, file: str) -> Prior:
     """Fit a prior from a file to a clip with known cameras: at its times, seen by its cameras.
 
     Raises:
-        UserError: it is for other moments, or its cameras and `object_to_world` contradict the clip's cameras, or no
-            mask shows the animal.
+        UserError: it is for other times, or its cameras and `object_to_world` contradict the clip's cameras, or no mask
+            shows the animal.
     """
-    if not any((frame.mask > 0.5).any() for frame in clip.frames):
-        raise UserError(f"{clip.name}: expected at least one mask that shows the animal, but all are empty.")
+    require_mask(clip.frames, clip.name)
     try:
         found = at_times(prior, clip.times, clip)
     except UserError as error:
@@ -80,22 +80,22 @@ def in_world(prior: Prior, clip: Clip, file: str) -> Prior:
 
 
 def _apart(prior: Prior, row: int, first: Camera, second: Camera) -> float:
-    """Return the largest distance between the images of a posed bone's end under two cameras, pixels."""
+    """Return the largest distance between the projections of a posed bone's end by two cameras, pixels."""
     transforms = prior.transforms[row].double()
     ends = prior.bones.double() @ transforms[:, :3, :3].transpose(1, 2) + transforms[:, None, :3, 3]
     return float((first.project(ends)[0] - second.project(ends)[0]).norm(dim=-1).max())
 
 
 def at_times(prior: Prior, times: Sequence[float], clip: Clip) -> Prior:
-    """The prior at the clip's moments, rows those of its frames and times the clip's; a note tells which were between.
+    """Return the prior with a row for each of the clip's frames, and the clip's times; a note counts interpolated rows.
 
     Args:
-        prior: to be read.
-        times: of the clip's frames on the prior's clock, seconds.
-        clip: for its frame rate and for messages.
+        prior: to be interpolated.
+        times: of the clip's frames in the prior's time, seconds.
+        clip: gives times, frame rate and the name for messages.
 
     Raises:
-        UserError: the prior does not span the moments, or knows less than half of them.
+        UserError: the prior does not span the times, or has less than half of them.
     """
     wanted = torch.tensor(times, dtype=torch.float64)
     apart, rows = (prior.times[:, None] - wanted).abs().min(0)
@@ -109,12 +109,11 @@ def at_times(prior: Prior, times: Sequence[float], clip: Clip) -> Prior:
             f"which {len(wanted) - len(between)} are at their times (was it made with another --fps?)."
         )
     note = f"{len(between)} of {len(wanted)} frames are not in the prior's file: cameras and poses lie between those of"
-    clock = prior.times[rows]
-    clock[between] = wanted[between]
-    roots, transforms, cameras = _sampled(prior, clock)
-    _, transforms_flip, cameras_flip = _sampled(
-        replace(prior, cameras=prior.cameras_flip, transforms=prior.transforms_flip), clock
-    )
+    taken = prior.times[rows]
+    taken[between] = wanted[between]
+    roots, transforms, cameras = _sampled(prior, taken)
+    mirrored = replace(prior, cameras=prior.cameras_flip, transforms=prior.transforms_flip)
+    _, transforms_flip, cameras_flip = _sampled(mirrored, taken)
     return seal(
         replace(
             prior,
@@ -130,17 +129,13 @@ def at_times(prior: Prior, times: Sequence[float], clip: Clip) -> Prior:
 
 
 def _sampled(prior: Prior, times: Tensor) -> tuple[Tensor, Tensor, tuple[Camera, ...]]:
-    """object_to_world, transforms and cameras at some moments; its own where it knows them."""
-    own = {float(time): row for row, time in enumerate(prior.times)}
-    poses = [pose_at(prior, float(time)) for time in times]
-    cameras = tuple(
-        prior.cameras[own[float(time)]] if float(time) in own else camera_at(prior, float(time)) for time in times
-    )
-    return torch.stack([root for root, _ in poses]), torch.stack([transforms for _, transforms in poses]), cameras
+    """Return object_to_world, transforms and cameras at some times."""
+    roots, transforms = zip(*(pose_at(prior, time) for time in times.tolist()), strict=True)
+    return torch.stack(roots), torch.stack(transforms), tuple(camera_at(prior, time) for time in times.tolist())
 
 
 def in_crops(prior: Prior, clip: Clip) -> Prior:
-    """Convert a prior of whole frames for a clip of square crops of them; it has a row for each of the clip's frames.
+    """Convert a prior of whole frames, with a row for each of the clip's, for a clip of square crops of them.
 
     Raises:
         UserError: a frame is no crop, or the prior is for frames of another size.
@@ -149,32 +144,38 @@ def in_crops(prior: Prior, clip: Clip) -> Prior:
     for row, frame in enumerate(clip.frames):
         plain, crop, size = prior.cameras[row], frame.crop, frame.mask.shape[2]
         if crop is None or (plain.width, plain.height) != (crop.width, crop.height):
-            held = "a whole frame" if crop is None else f"a crop of {crop.width}x{crop.height} pixels"
+            came = "a whole frame" if crop is None else f"a crop of {crop.width}x{crop.height} pixels"
             raise UserError(
                 f"{clip.name}: expected crops of {plain.width}x{plain.height} frames as prior '{prior.name}' knows, "
-                f"got {held}."
+                f"got {came}."
             )
         cameras.append(crop.cropped_camera(plain, size))
-        # in the flipped frame the crop starts as far from the left as it ends from the right
+        # flipping the frame swaps the crop's distances from the left and the right border
         mirrored = replace(crop, left=crop.width - crop.left - crop.side)
         flipped.append(mirrored.cropped_camera(prior.cameras_flip[row], size))
     return seal(replace(prior, cameras=tuple(cameras), cameras_flip=tuple(flipped)))
 
 
+def has_cameras(clip: Clip) -> bool:
+    """Tell whether all cameras of the clip are known."""
+    return all(frame.camera is not None for frame in clip.frames)
+
+
 def with_cameras(clip: Clip, prior: Prior) -> Clip:
-    """The clip with the prior's cameras, in the prior's world, where its own are unknown; frames match by time."""
-    if all(frame.camera is not None for frame in clip.frames):
+    """Return the clip with the prior's cameras, by time and in the prior's world, for frames without one."""
+    if has_cameras(clip):
         return clip
-    shown, frames = known_frames(clip, prior), []
-    for frame in clip.frames:
-        camera = frame.camera or recropped(world_camera(prior, frame.time), shown, frame)
-        frames.append(replace(frame, camera=camera))
-    return replace(clip, frames=tuple(frames), guessed_cameras=True)
+    shown = known_frames(clip, prior)
+    frames = tuple(
+        replace(frame, camera=frame.camera or recropped(world_camera(prior, frame.time), shown, frame))
+        for frame in clip.frames
+    )
+    return replace(clip, frames=frames, guessed_cameras=True)
 
 
 def known_frames(clip: Clip, prior: Prior) -> Clip:
-    """The frames with a camera of their own or a row in the prior: others of a filtered one must supervise nothing."""
-    if all(frame.camera is not None for frame in clip.frames):
+    """Return the clip's frames that have a camera or a row in the prior: a filtered prior lacks unreliable ones."""
+    if has_cameras(clip):
         return clip
     distance = (torch.tensor(clip.times, dtype=torch.float64)[:, None] - prior.times).abs().min(1).values
     rows = torch.nonzero(distance * clip.fps <= SAME)[:, 0].tolist()

@@ -1,4 +1,4 @@
-"""Body proportions: what the quadruped template is a function of."""
+"""Body proportions, the parameters of the quadruped template."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -68,12 +68,12 @@ RELIEF_SPREAD = (0.15, 0.15, 0.05, 0.05)
 
 @dataclass(frozen=True)
 class Proportions:
-    """Body proportions as deviations from the average quadruped, in spreads: zeros are the average animal.
+    """Body proportions as deviations from the average quadruped, in standard deviations.
 
     Attributes:
-        deviations: one column per entry of `PROPORTIONS`, float32, [..., P]; gradients flow through.
-        relief: what no measure names: logarithm of width and height, shift in y and z of each of `SECTIONS` cross
-            sections (body from the nose, front legs and rear legs from the top), in spreads, [..., S, 4]; None is none.
+        deviations: one column per entry of `PROPORTIONS`, float32, [..., P].
+        relief: logarithm of width and height, shift in y and z of each of `SECTIONS` cross sections (body from the
+            nose, front legs and rear legs from the top), [..., S, 4]; None is zero.
     """
 
     deviations: Tensor
@@ -85,7 +85,7 @@ class Proportions:
 
     @staticmethod
     def of(**measures: float) -> "Proportions":
-        """Return the average animal but for the named measures (object units, radians)."""
+        """Return the average animal with other values of the named measures (object units, radians)."""
         deviations = torch.zeros(len(PROPORTIONS))
         for name, value in measures.items():
             average, spread, additive = PROPORTIONS[name]
@@ -94,11 +94,11 @@ class Proportions:
         return Proportions(deviations)
 
     def reliefs(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the relief of the body, the front legs and the rear legs: logarithms and object units, [..., s, 4]."""
-        if self.relief is None:
-            flat = self.deviations.new_zeros(*self.deviations.shape[:-1], sum(SECTIONS), 4)
-            return flat.split(SECTIONS, dim=-2)
-        return (self.relief * self.relief.new_tensor(RELIEF_SPREAD)).split(SECTIONS, dim=-2)
+        """Return the relief of body, front legs and rear legs, logarithms and object units, each [..., s, 4]."""
+        relief = self.relief
+        if relief is None:
+            relief = self.deviations.new_zeros(*self.deviations.shape[:-1], sum(SECTIONS), 4)
+        return (relief * relief.new_tensor(RELIEF_SPREAD)).split(SECTIONS, dim=-2)
 
     def measures(self) -> dict[str, Tensor]:
         """Return every measure by name, each [...]."""

@@ -1,4 +1,4 @@
-"""Hypotheses that compete: rounds of gradient descent on silhouettes, and cuts between them."""
+"""Fit competing hypotheses: rounds of gradient descent on silhouettes; after each the worst are dropped."""
 
 from collections.abc import Sequence
 
@@ -12,14 +12,14 @@ from rewild4d.priors.search import match_areas
 from rewild4d.priors.silhouettes import Targets, crop_targets, mismatch
 from rewild4d.types import Frame
 
-STILL_PARAMETERS = ("scale", "turn", "shift", "shape")
+STILL_PARAMETERS = ("scale", "rotation", "shift", "shape")
 
 
 class Race:
     """Guesses that are fitted side by side.
 
     Attributes:
-        guesses: those still in the race.
+        guesses: those that remain.
         costs: of each after the last round, [B].
         start_costs: of every start after the first round.
         figures: named figures of the race (facing_margin, ...).
@@ -27,17 +27,10 @@ class Race:
     """
 
     def __init__(
-        self,
-        frames: Sequence[Frame],
-        moments: Sequence[int],
-        name: str,
-        working: Tensor,
-        config: PriorConfig,
-        generator: torch.Generator,
-        log: Log,
-        total: int,
-    ) -> None:
-        self.frames, self.moments, self.name = frames, moments, name
+        self, frames: Sequence[Frame], timesteps: Sequence[int], name: str, working: Tensor, config: PriorConfig,
+        generator: torch.Generator, log: Log, total: int,
+    ) -> None:  # fmt: skip
+        self.frames, self.timesteps, self.name = frames, timesteps, name
         self.working, self.config, self.generator = working, config, generator
         self.log, self.total, self.done = log, total, 0
         self.costs = self.start_costs = torch.zeros(0)
@@ -45,29 +38,33 @@ class Race:
         self.guesses: Hypotheses
 
     def begin(self, guesses: Hypotheses) -> None:
-        """Take the starts, at the size that covers the masks' area."""
+        """Take the starts, scaled to the masks' area."""
         self.guesses = guesses
         match_areas(self.guesses, self._targets(self.config.stages[0].size), self.config.stages[0])
 
     def free(self, stage: Stage) -> list[str]:
-        """Return names of the parameters that a round may change."""
+        """Return names of the parameters that a round fits."""
         return [*STILL_PARAMETERS, *("angles",) * stage.joints, *("relief",) * stage.relief]
 
     def evidence(self) -> Tensor | float:
-        """Return what speaks against each guess at every step besides its silhouette and its penalties, [B]."""
+        """Return the cost of each guess at every step besides its silhouette and penalties, [B]."""
         return 0.0
 
     def verdict(self, stage: Stage) -> Tensor | float:
-        """Return what counts only when guesses are compared, [B]."""
+        """Return the cost that is added only when guesses are compared, [B]."""
         return self.config.gait_weight * self.guesses.backward_gait() if stage.joints else 0.0
 
     def rivals(self, order: list[int]) -> list[int]:
-        """Return guesses that stay in the race although others are better, most wanted first; ``order`` is by cost."""
+        """Return guesses to keep although others are better, most important first; ``order`` is by cost."""
+        return self._reversed(order)[:1]
+
+    def _reversed(self, order: list[int]) -> list[int]:
+        """Return the guesses that head against the best, by cost."""
         heads = self.guesses.heading().detach()
-        return [row for row in order if heads[row] @ heads[order[0]] < 0][:1]
+        return [row for row in order if heads[row] @ heads[order[0]] < 0]
 
     def run(self, stage: Stage) -> None:
-        """One round of descent, then the cut."""
+        """Fit for one round, then drop the worst guesses."""
         targets = self._targets(stage.size)
         names = self.free(stage)
         leaves = [getattr(self.guesses, name).detach().requires_grad_() for name in names]
@@ -94,10 +91,10 @@ class Race:
         self._cut(stage.keep)
 
     def _targets(self, size: int) -> Targets:
-        return crop_targets(self.frames, self.moments, self.working, size, self.name)
+        return crop_targets(self.frames, self.timesteps, self.working, size, self.name)
 
     def _draw(self, targets: Targets, count: int) -> Targets:
-        """Return all observations, or a fresh sample of as many as a step may look at."""
+        """Return all observations, or ``count`` of them at random."""
         if len(targets.masks) <= count:
             return targets
         rows = torch.randperm(len(targets.masks), generator=self.generator)[:count]
@@ -111,11 +108,9 @@ class Race:
         return mismatch(self.guesses.silhouettes(targets, stage), targets, sigma) + penalty
 
     def _cut(self, keep: int) -> None:
-        """Keep the best, and its rivals while there is room."""
+        """Keep the best guess, its rivals and the next best, ``keep`` in all."""
         order = self.costs.argsort().tolist()
-        heads = self.guesses.heading().detach()
-        away = [row for row in order if heads[row] @ heads[order[0]] < 0]
-        if away:
+        if away := self._reversed(order):
             self.figures["facing_margin"] = float(self.costs[away[0]] - self.costs[order[0]])
         wanted = [order[0], *(row for row in self.rivals(order) if row != order[0])][:keep]
         rest = [row for row in order if row not in wanted][: keep - len(wanted)]
@@ -124,6 +119,6 @@ class Race:
 
 
 def _spaced(targets: Targets, count: int) -> Targets:
-    """At most ``count`` evenly spaced observations."""
+    """Return at most ``count`` evenly spaced observations."""
     count = min(len(targets.masks), count)
     return targets.select(torch.linspace(0, len(targets.masks) - 1, count).round().long())

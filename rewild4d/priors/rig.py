@@ -1,9 +1,9 @@
-"""A prior that is the truth: the data set's own shape, skinning weights and skeleton, posed as it was.
+"""Make a prior of the truth: the data set's own shape, skinning weights, skeleton and poses.
 
-With it a method shows what it makes of one camera when shape and motion need no guessing: a bound on what a better
-prior could give. For studies: never the default, and named in the record.
+It bounds what a better prior could give. For studies only: never the default, and named in the record.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,11 +13,13 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from rewild4d.priors.io import seal
+from rewild4d.priors.kinematics import moved
 from rewild4d.priors.silhouettes import known_camera, overlap
 from rewild4d.transforms import (
     axis_angle_to_matrix,
     camera_in_object,
     mirror_camera,
+    mirror_points,
     mirror_transforms,
     nearest_rotation,
     rigid,
@@ -27,20 +29,20 @@ from rewild4d.transforms import (
 from rewild4d.types import OBJECT_DIAGONAL, Clip, Prior, Rig
 
 YAWS = np.radians(np.arange(-40, 41, 10))
-"""Turns of the symmetry plane about the vertical that are tried, around the template's."""
+"""Yaws of the symmetry plane that are tried, from the template's, radians."""
 TWINS = 0.05 * OBJECT_DIAGONAL
-"""How far a bone may be from where its twin's mirror image is, object units."""
+"""Largest distance of a bone from the mirror image of the bone on the other side, object units."""
 SAMPLES = 3000
-"""Points by which the symmetry plane is judged."""
+"""Points that the symmetry plane is fitted to."""
 
 
 def rig_prior(clip: Clip, rig: Rig, template: Prior) -> Prior:
     """Make a prior of the true animal.
 
     Args:
-        clip: what the method sees; the prior's frames and cameras are its.
+        clip: gives the prior's frames and cameras.
         rig: of the same frames.
-        template: fitted to the clip: it tells left from right and head from tail, which a rig does not.
+        template: fitted to the clip; it gives left and head, which a rig does not name.
 
     Returns:
         A prior named "rig".
@@ -48,19 +50,19 @@ def rig_prior(clip: Clip, rig: Rig, template: Prior) -> Prior:
     Raises:
         UserError: a frame has no camera.
     """
-    moved = rig.bones @ torch.linalg.inv(rig.bones_rest)
-    posed = torch.stack([skin_points(rig.vertices, rig.weights, transforms) for transforms in moved])
+    motion = rig.bones @ torch.linalg.inv(rig.bones_rest)
+    posed = [skin_points(rig.vertices, rig.weights, transforms) for transforms in motion]
     body = torch.stack([rigid_motion(rig.vertices, points) for points in posed])
     row = int((template.times - clip.times[0]).abs().argmin())
     axes = torch.linalg.inv(body[0])[:3, :3] @ template.object_to_world[row, :3, :3]
     object_to_rest = symmetric_frame(rig.vertices, axes / axes.norm(dim=0))
     rest_to_object = torch.linalg.inv(object_to_rest)
     object_to_world = body @ object_to_rest
-    pivots = _moved(rig.bones_rest[:, :3, 3], rest_to_object)
+    pivots = _in_frame(rig.bones_rest[:, :3, 3], rest_to_object)
     bones = torch.stack((pivots, _ends(pivots, rig.parents)), dim=1)
     mirror = twins(bones)
-    transforms = _rigid_about(torch.linalg.inv(object_to_world)[:, None] @ moved @ object_to_rest, pivots).float()
-    vertices = _moved(rig.vertices, rest_to_object).float()
+    transforms = _rigid_about(torch.linalg.inv(object_to_world)[:, None] @ motion @ object_to_rest, pivots).float()
+    vertices = _in_frame(rig.vertices, rest_to_object).float()
     weights = rig.weights.float()
     cameras = tuple(
         camera_in_object(known_camera(frame, clip.name), matrix)
@@ -80,19 +82,19 @@ def rig_prior(clip: Clip, rig: Rig, template: Prior) -> Prior:
     )  # fmt: skip
 
 
-def rigid_motion(points: Tensor, moved: Tensor) -> Tensor:
-    """The rotation and translation that bring points closest to where they moved (Kabsch), [n, 3] each -> [4, 4]."""
-    before, after = points.mean(0), moved.mean(0)
-    turn = nearest_rotation((moved - after).T @ (points - before))
-    return rigid(turn, after - turn @ before)
+def rigid_motion(points: Tensor, others: Tensor) -> Tensor:
+    """Return the rigid motion that best maps points to others (Kabsch), [n, 3] each -> [4, 4]."""
+    before, after = points.mean(0), others.mean(0)
+    rotation = nearest_rotation((others - after).T @ (points - before))
+    return rigid(rotation, after - rotation @ before)
 
 
 def symmetric_frame(points: Tensor, axes: Tensor) -> Tensor:
-    """The object frame of a rest shape: x across its symmetry plane, y up, z to the head, bounding box as promised.
+    """Find the object frame of a rest shape: x normal to its symmetry plane, y up, z to the head.
 
     Args:
         points: of the shape, [n, 3].
-        axes: the three directions as columns, right but for some degrees, [3, 3].
+        axes: the three directions as columns, correct to some degrees, [3, 3].
 
     Returns:
         Similarity from the object frame to the points', [4, 4].
@@ -107,34 +109,31 @@ def symmetric_frame(points: Tensor, axes: Tensor) -> Tensor:
         mirrored = drawn - 2 * (drawn @ normal - guess[2] * size)[:, None] * normal
         return float(tree.query(mirrored)[0].mean()) / size
 
-    starts = [np.array((yaw, 0.0, local.mean(axis=0) @ _normal(np.array((yaw, 0.0))) / size)) for yaw in YAWS]
+    starts = [np.array((yaw, 0.0, local.mean(axis=0) @ _normal((yaw, 0.0)) / size)) for yaw in YAWS]
     best = minimize(cost, min(starts, key=cost), method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-7}).x
-    turned = axes @ axis_angle_to_matrix(torch.tensor((0.0, best[0], best[1]), dtype=axes.dtype))
-    seen = points @ turned
+    rotation = axes @ axis_angle_to_matrix(torch.tensor((0.0, best[0], best[1]), dtype=axes.dtype))
+    seen = points @ rotation
     low, high = seen.amin(0), seen.amax(0)
     center = (low + high) / 2
     center[0] = best[2] * size
-    return similarity(float((high - low).norm()) / OBJECT_DIAGONAL, turned, turned @ center)
+    return similarity(float((high - low).norm()) / OBJECT_DIAGONAL, rotation, rotation @ center)
 
 
-def _normal(guess: np.ndarray) -> np.ndarray:
-    """Rotate the x axis about y and z, by one axis-angle vector (0, y, z)."""
-    turn = axis_angle_to_matrix(torch.tensor((0.0, guess[0], guess[1]), dtype=torch.float64))
-    return turn[:, 0].numpy()
+def _normal(guess: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return the x axis rotated by the axis-angle vector (0, guess[0], guess[1])."""
+    return axis_angle_to_matrix(torch.tensor((0.0, guess[0], guess[1]), dtype=torch.float64))[:, 0].numpy()
 
 
 def twins(bones: Tensor) -> Tensor:
-    """The bone on the other side of each, itself where there is none, from both ends at rest: [J, 2, 3] -> [J]."""
-    ends = bones.flatten(1)
-    across = (bones * bones.new_tensor((-1.0, 1.0, 1.0))).flatten(1)
-    apart, nearest = torch.cdist(across, ends).min(dim=1)
+    """Return each bone's counterpart on the other side, else itself, from both ends at rest, [J, 2, 3] -> [J]."""
+    apart, nearest = torch.cdist(mirror_points(bones).flatten(1), bones.flatten(1)).min(dim=1)
     own = torch.arange(len(bones))
     agreed = (nearest[nearest] == own) & (apart <= TWINS)
     return torch.where(agreed & agreed[nearest], nearest, own)
 
 
 def _ends(pivots: Tensor, parents: Tensor) -> Tensor:
-    """Return where bones end: the mean of their children's pivots; a bone without any goes on as its parent does."""
+    """Return the ends of bones: the mean of their children's pivots; without children half the parent's length on."""
     ends = pivots.clone()
     for bone, pivot in enumerate(pivots):
         children = pivots[parents == bone]
@@ -145,12 +144,11 @@ def _ends(pivots: Tensor, parents: Tensor) -> Tensor:
     return ends
 
 
-def _moved(points: Tensor, matrix: Tensor) -> Tensor:
+def _in_frame(points: Tensor, matrix: Tensor) -> Tensor:
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def _rigid_about(transforms: Tensor, pivots: Tensor) -> Tensor:
     """Return the nearest rigid transforms that move the pivots [J, 3] as these [T, J, 4, 4] do: bones may be scaled."""
-    turn = nearest_rotation(transforms[..., :3, :3])
-    there = (transforms[..., :3, :3] @ pivots[..., None])[..., 0] + transforms[..., :3, 3]
-    return rigid(turn, there - (turn @ pivots[..., None])[..., 0])
+    rotation = nearest_rotation(transforms[..., :3, :3])
+    return rigid(rotation, moved(pivots, transforms) - (rotation @ pivots[..., None])[..., 0])

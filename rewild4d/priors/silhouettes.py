@@ -1,9 +1,8 @@
-"""What the fit compares: soft silhouettes in square crops around the animal.
+"""Soft silhouettes in square crops around the animal, and their difference.
 
-The benchmark's own rasterizer has the last word: `rasterized` draws flat Gaussians on the surface. That is one
-call per pose and view, hundreds a step while many hypotheses race, so there `splat` stands in: the image of a round
-Gaussian is separable, hence the summed density of all blobs is one matrix product per view for all hypotheses at once,
-and alpha = 1 - exp(-density). The final score draws the exact outline of the mesh.
+`rasterized` draws flat Gaussians on the surface by the benchmark's rasterizer, one call per pose and view. `splat` is
+its fast approximation while there are many hypotheses: the image of a round Gaussian is separable, so the density of
+all of them is one matrix product per view, and alpha = 1 - exp(-density). The final score draws the mesh (`outline`).
 """
 
 from collections.abc import Sequence
@@ -26,7 +25,7 @@ CROP_MARGIN = 0.25
 DISC_SIZE, DISC_OPACITY = 0.4, 0.95
 """Standard deviations, in edge lengths, and opacity of the flat Gaussian on a quadrilateral."""
 DENSITY = 2.5
-"""Optical depth in the middle of one blob, so that a few overlapping blobs are opaque."""
+"""Optical depth at the centre of one round Gaussian, so that a few that overlap are opaque."""
 
 
 @dataclass(frozen=True)
@@ -38,19 +37,17 @@ class Targets:
         valid: share of each pixel that lies inside the image, [v, s, s].
         world_to_camera: [v, 4, 4].
         intrinsics: of the crops, [v, 3, 3].
-        moments: index of the moment of each observation, int64, [v].
+        timesteps: index of the time of each observation, int64, [v].
     """
 
     masks: Tensor
     valid: Tensor
     world_to_camera: Tensor
     intrinsics: Tensor
-    moments: Tensor
+    timesteps: Tensor
 
     def select(self, rows: Tensor) -> "Targets":
-        return Targets(
-            self.masks[rows], self.valid[rows], self.world_to_camera[rows], self.intrinsics[rows], self.moments[rows]
-        )
+        return Targets(*(value[rows] for value in vars(self).values()))
 
 
 def known_camera(frame: Frame, name: str) -> Camera:
@@ -67,28 +64,38 @@ def known_camera(frame: Frame, name: str) -> Camera:
     return frame.camera
 
 
-def crop_targets(frames: Sequence[Frame], moments: Sequence[int], world: Tensor, size: int, name: str) -> Targets:
-    """Square crops around the masks, resampled by area; frames with an empty mask are left out (not all may be).
+def require_mask(frames: Sequence[Frame], name: str) -> None:
+    """Check that a mask of the case ``name`` shows something.
+
+    Raises:
+        UserError: none does.
+    """
+    if not any((frame.mask > 0.5).any() for frame in frames):
+        raise UserError(f"{name}: expected at least one mask that shows the animal, but all {len(frames)} are empty.")
+
+
+def crop_targets(frames: Sequence[Frame], timesteps: Sequence[int], world: Tensor, size: int, name: str) -> Targets:
+    """Cut square crops around the masks, resampled by area; frames with an empty mask are left out (not all may be).
 
     Args:
         frames: observations with cameras.
-        moments: index of each frame's moment.
-        world: similarity from the working frame to the world, [4, 4]; the targets' cameras look at the working frame.
+        timesteps: index of each frame's time.
+        world: similarity from the working frame, where the targets' cameras are, to the world, [4, 4].
         size: side of the crop in pixels.
         name: of the case, for messages.
     """
     masks, valid, cameras, kept = [], [], [], []
-    for frame, moment in zip(frames, moments, strict=True):
-        box = _square(frame.mask[0])
+    for frame, timestep in zip(frames, timesteps, strict=True):
+        box = mask_box(frame.mask[0] > 0.5)
         if box is None:
             continue
-        left, top, side = box
+        left, top, side = _square(*box)
         camera = camera_in_object(known_camera(frame, name), world)
         cameras.append(camera.shifted(left, top, side, side).resized(size, size))
         inside = torch.ones_like(frame.mask[0])
         masks.append(_window(frame.mask[0], left, top, side, size))
         valid.append(_window(inside, left, top, side, size))
-        kept.append(moment)
+        kept.append(timestep)
     return Targets(
         torch.stack(masks),
         torch.stack(valid),
@@ -98,15 +105,18 @@ def crop_targets(frames: Sequence[Frame], moments: Sequence[int], world: Tensor,
     )
 
 
-def _square(mask: Tensor) -> tuple[int, int, int] | None:
-    """Return the left, top and side of the crop window; it may reach beyond the image."""
-    rows, columns = torch.nonzero(mask > 0.5, as_tuple=True)
+def mask_box(shown: Tensor) -> tuple[int, int, int, int] | None:
+    """Return left, top, right and bottom (one past the last pixel) of what is true, [h, w]; None where nothing is."""
+    rows, columns = torch.nonzero(shown, as_tuple=True)
     if len(rows) == 0:
         return None
-    low_x, high_x = int(columns.min()), int(columns.max()) + 1
-    low_y, high_y = int(rows.min()), int(rows.max()) + 1
-    side = round(max(high_x - low_x, high_y - low_y) * (1 + 2 * CROP_MARGIN)) + 2
-    return (low_x + high_x - side) // 2, (low_y + high_y - side) // 2, side
+    return int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1
+
+
+def _square(left: int, top: int, right: int, bottom: int) -> tuple[int, int, int]:
+    """Return the left, top and side of the crop around a box; it may extend beyond the image."""
+    side = round(max(right - left, bottom - top) * (1 + 2 * CROP_MARGIN)) + 2
+    return (left + right - side) // 2, (top + bottom - side) // 2, side
 
 
 def _window(image: Tensor, left: int, top: int, side: int, size: int) -> Tensor:
@@ -145,8 +155,8 @@ def splat(points: Tensor, sizes: Tensor, intrinsics: Tensor, size: int) -> Tenso
 def rasterized(vertices: Tensor, quads: Tensor, intrinsics: Tensor, size: int) -> Tensor:
     """Render silhouettes of a surface by the benchmark's rasterizer: a flat Gaussian on every quadrilateral.
 
-    Size and opacity are such that the 50 % contour is the surface's outline to a few hundredths of its area. Gradients
-    reach the vertices through the Gaussians' centres alone, which is most of it and half the time.
+    The 50 % contour is the surface's outline to a few hundredths of its area. Gradients reach the vertices through the
+    Gaussians' centres alone, which is most of them at half the cost.
 
     Args:
         vertices: in camera coordinates, [..., n, 3].
@@ -178,9 +188,9 @@ def rasterized(vertices: Tensor, quads: Tensor, intrinsics: Tensor, size: int) -
 
 @cache
 def _blur_matrix(size: int, sigma: float) -> Tensor:
-    """Return rows that sum to at most one: what leaves the crop is lost, [size, size]."""
-    at = torch.arange(size)
-    kernel = torch.exp(-0.5 * ((at[:, None] - at) / sigma).square())
+    """Return a blur along one axis, zero outside, [size, size]."""
+    index = torch.arange(size)
+    kernel = torch.exp(-0.5 * ((index[:, None] - index) / sigma).square())
     return kernel / torch.exp(-0.5 * (torch.arange(-size, size + 1) / sigma).square()).sum()
 
 
@@ -191,7 +201,7 @@ def blur(images: Tensor, sigma: float) -> Tensor:
 
 
 def mismatch(rendered: Tensor, targets: Targets, sigma: float) -> Tensor:
-    """Squared difference over the animal's area, plus Dice, of blurred silhouettes; [..., v, s, s] -> [...]."""
+    """Return squared difference over the animal's area plus Dice loss, blurred, [..., v, s, s] -> [...]."""
     rendered = blur(rendered * targets.valid, sigma)
     wanted = blur(targets.masks, sigma)
     square = (rendered - wanted).square().sum((-1, -2)) / wanted.sum((-1, -2))
@@ -205,7 +215,7 @@ def outline(vertices: Tensor, faces: Tensor, camera: Camera) -> np.ndarray:
     Args:
         vertices: in the camera's world, [n, 3].
         faces: [f, 3].
-        camera: where to look from.
+        camera: of the image.
     """
     pixels, depth = camera.project(vertices.double())
     image = np.zeros((4 * camera.height, 4 * camera.width), np.uint8)

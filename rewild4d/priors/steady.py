@@ -1,7 +1,7 @@
-"""Which cameras of a sequence belong together: an estimate that hops between facings must not supervise anything.
+"""Filter frames whose camera is far from the others', as where the heading is reversed for a while.
 
-The density clustering of Ester et al. 1996 (DBSCAN) on the direction of the camera's centre and on its translation; the
-largest cluster stays (METHOD, section 2). Both sequences, the clip and its mirror image, are filtered on their own.
+DBSCAN (Ester et al. 1996) clusters the direction of the camera's centre and its translation; the largest cluster stays
+(METHOD, section 2). The clip and its mirror image are filtered on their own.
 """
 
 from collections.abc import Sequence
@@ -14,22 +14,22 @@ from rewild4d.priors.io import seal
 from rewild4d.transforms import mirror_camera, mirror_matrix
 from rewild4d.types import Camera, Prior
 
-REACH, NEIGHBOURS = 0.25, 3
-"""DBSCAN's eps, in units of the feature, and min_samples (a point counts itself)."""
+EPS, NEIGHBOURS = 0.25, 3
+"""DBSCAN's eps and min_samples (a point counts itself)."""
 GAP = 2
-"""Missing frames that a smooth way is drawn over."""
+"""Most missing frames in a row that are interpolated."""
 TRANSLATION_RANGE = 0.11
-"""Reach of Fauna's translation along the view over its camera's distance: 1.1 of 10 units."""
+"""Range of Fauna's translation along the view over its camera's distance: 1.1 of 10 units."""
 
 
 @dataclass(frozen=True)
 class Filtered:
-    """A prior without the frames whose camera fell out.
+    """A prior without the frames whose camera was filtered out.
 
     Attributes:
-        prior: with the kept rows; a mirrored camera that fell out is the mirror image of the plain one.
+        prior: with the kept rows; a mirrored camera that was filtered out is the mirror image of the plain one.
         kept: rows of the original prior.
-        notes: what fell out, a sentence each.
+        notes: what was changed, a sentence each.
     """
 
     prior: Prior
@@ -37,28 +37,27 @@ class Filtered:
     notes: tuple[str, ...]
 
 
-def clusters(points: Tensor, reach: float = REACH, neighbours: int = NEIGHBOURS) -> Tensor:
-    """Cluster points by DBSCAN: the cluster of each, counted from 0, -1 for noise, int64, [n].
+def clusters(points: Tensor, eps: float = EPS, neighbours: int = NEIGHBOURS) -> Tensor:
+    """Return the DBSCAN cluster of each point [n, d], from 0, -1 for noise, int64, [n].
 
     Args:
         points: [n, d].
-        reach: points at most this far apart are neighbours.
-        neighbours: a point with at least as many, itself included, starts or spreads a cluster.
+        eps: largest distance of neighbours.
+        neighbours: least number of neighbours, itself included, of a point inside a cluster.
     """
-    from sklearn.cluster import DBSCAN  # takes a second to import, which no other command has to wait for
+    from sklearn.cluster import DBSCAN  # takes a second to import
 
-    return torch.from_numpy(DBSCAN(eps=reach, min_samples=neighbours).fit_predict(points.numpy()))
+    return torch.from_numpy(DBSCAN(eps=eps, min_samples=neighbours).fit_predict(points.numpy()))
 
 
 def steady(cameras: Sequence[Camera], times: Tensor) -> Tensor:
-    """Return which cameras belong to the largest cluster; all of them where no cluster forms. bool, [T].
+    """Return which cameras belong to the largest cluster, or all where there is none, bool, [T].
 
-    Where a few frames lie between two of the sequence because they are held out or were not used, a steady camera has
-    moved on by as many steps: points on the straight way stand in for them.
+    Points of up to `GAP` missing frames, such as held-out ones, are interpolated.
 
     Args:
         cameras: in the object frame.
-        times: of their frames, seconds, ascending, [T].
+        times: of their frames, in seconds, ascending, [T].
     """
     matrices = torch.stack([camera.world_to_camera.double() for camera in cameras])
     centers = -(matrices[:, :3, :3].transpose(1, 2) @ matrices[:, :3, 3:])[..., 0]
@@ -85,10 +84,9 @@ def _between(features: Tensor, times: Tensor) -> Tensor:
 
 
 def without_hops(prior: Prior) -> Filtered:
-    """Leave out frames whose camera is not steady, and mend mirrored ones by the mirror image of the plain one.
+    """Remove frames whose camera is not steady; replace such mirrored ones by the mirror image of the plain one.
 
-    A sequence of which less than half of the cameras agree stays as it is, and that is told: nobody knows then which
-    are right.
+    A sequence in which less than half of the cameras agree is not filtered, and a note says so.
     """
     plain, flipped = steady(prior.cameras, prior.times), steady(prior.cameras_flip, prior.times)
     count, undecided = len(plain), []
@@ -103,24 +101,24 @@ def without_hops(prior: Prior) -> Filtered:
     for row in mended:
         cameras_flip[row] = mirror_camera(prior.cameras[row])
         transforms_flip[row] = mirror_matrix(prior.transforms[row, prior.mirror])
-    rows = torch.tensor(kept)
     smaller = replace(
         prior,
-        times=prior.times[rows],
-        object_to_world=prior.object_to_world[rows],
+        times=prior.times[plain],
+        object_to_world=prior.object_to_world[plain],
         cameras=tuple(prior.cameras[row] for row in kept),
-        transforms=prior.transforms[rows],
+        transforms=prior.transforms[plain],
         cameras_flip=tuple(cameras_flip[row] for row in kept),
-        transforms_flip=transforms_flip[rows],
+        transforms_flip=transforms_flip[plain],
     )
-    left = [row for row in range(count) if not plain[row]]
-    notes = [_told(left, count, "left out: the camera is far from those of the other frames")]
-    notes.append(_told(mended, count, "mirrored from the plain frame: the camera of the mirrored one is far off"))
-    return Filtered(seal(smaller), kept, tuple(note for note in (*notes, *undecided) if note))
+    changes = (
+        (torch.nonzero(~plain)[:, 0].tolist(), "left out: the camera is far from those of the other frames"),
+        (mended, "mirrored from the plain frame: the camera of the mirrored one is far off"),
+    )
+    notes = [_told(rows, count, what) for rows, what in changes if rows]
+    return Filtered(seal(smaller), kept, (*notes, *undecided))
 
 
 def _told(rows: list[int], count: int, what: str) -> str:
-    if not rows:
-        return ""
+    """Return the sentence about some rows."""
     shown = ", ".join(map(str, rows[:12])) + (", ..." if len(rows) > 12 else "")
     return f"{len(rows)} of {count} frames {what}: {shown}"

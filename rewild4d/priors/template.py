@@ -2,11 +2,10 @@
 
 Layout and numbering are 3D-Fauna's (design notes, FORMATS 4.4): body bones 0-3 run from the head to the middle of the
 back, 4-7 from the tail tip to the middle; legs are front left 8-10, rear left 11-13, rear right 14-16, front right
-17-19, each from foot to top. Unlike Fauna's, the joints are placed by proportions instead of being estimated from
-vertices, and a leg starts at its shoulder or hip beside the spine.
+17-19, each from foot to top. Joints follow from the proportions, and a leg starts at its shoulder or hip.
 
-The mesh is five closed tubes (nose to tail tip, and four legs) lofted through a few elliptical control sections by
-quadratic B-splines, so its topology and its skinning weights never change while the proportions do.
+The mesh is five closed tubes (nose to tail tip, and four legs) lofted through elliptical control sections by quadratic
+B-splines, so that topology and skinning weights are constant.
 """
 
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ import numpy as np
 import torch
 from scipy.interpolate import BSpline
 from torch import Tensor
+from torch.nn.functional import normalize, pad
 
 from rewild4d.priors.proportions import Proportions
 from rewild4d.transforms import mirror_camera, mirror_points, mirror_transforms
@@ -41,7 +41,7 @@ class Template:
         faces: counter-clockwise from outside, int64, [f, 3].
         weights: rows sum to one, [n, J].
         bones: start (the pivot) and end of each bone, [..., J, 2, 3].
-        blobs: centres of a few hundred round Gaussians that fill the same tubes, [..., m, 3].
+        blobs: centres of a few hundred round Gaussians that fill the tubes, [..., m, 3].
         blob_sizes: their standard deviations, [..., m].
         blob_weights: rows sum to one, [m, J].
     """
@@ -77,7 +77,7 @@ class _Tube(NamedTuple):
         return torch.cat((self.points(segments), self.centers[..., :1, :], self.centers[..., -1:, :]), dim=-2)
 
     def blobs(self, segments: int) -> tuple[Tensor, Tensor]:
-        """Round Gaussians inside whose common 50 % contour is close to the tube, [..., m, 3] and [..., m]."""
+        """Return round Gaussians whose common 50 % contour is close to the tube, [..., m, 3] and [..., m]."""
         sizes = 0.3 * torch.minimum(self.widths, self.heights)
         return self.points(segments, 2.1 * sizes), sizes.repeat_interleave(segments, dim=-1)
 
@@ -93,21 +93,20 @@ def _spline(controls: int, rings: int) -> tuple[Tensor, Tensor]:
 
 
 def _loft(sections: Sequence[tuple[Tensor, Tensor, Tensor]], relief: Tensor, rings: int) -> _Tube:
-    """A tube through control sections: centre [..., 3], half width and half height [...]; relief is [..., c, 4]."""
+    """Loft a tube through sections: centre [..., 3], half width and half height [...]; relief is [..., c, 4]."""
     centers, sides, tops = zip(*sections, strict=True)
-    controls = torch.stack(centers, -2) + torch.nn.functional.pad(relief[..., 2:], (1, 0))
+    controls = torch.stack(centers, -2) + pad(relief[..., 2:], (1, 0))
     widths, heights = torch.stack(sides, -1) * relief[..., 0].exp(), torch.stack(tops, -1) * relief[..., 1].exp()
-    values, slopes = _spline(controls.shape[-2], rings)
-    tangents = torch.nn.functional.normalize(slopes @ controls, dim=-1)
-    lateral = torch.tensor((1.0, 0.0, 0.0))
-    across = torch.nn.functional.normalize(lateral - tangents * tangents[..., :1], dim=-1)
+    values, derivatives = _spline(controls.shape[-2], rings)
+    tangents = normalize(derivatives @ controls, dim=-1)
+    across = normalize(torch.tensor((1.0, 0.0, 0.0)) - tangents * tangents[..., :1], dim=-1)
     upward = torch.linalg.cross(tangents, across)
     return _Tube(values @ controls, across, upward, widths @ values.T, heights @ values.T)
 
 
 @cache
 def _tube_quads(rings: int, segments: int) -> Tensor:
-    """Return corners of the quadrilaterals of a tube whose vertices are ordered as `_Tube.mesh` gives them, [q, 4]."""
+    """Return corners of the quadrilaterals of a tube with the vertices of `_Tube.mesh`, [q, 4]."""
     ring, segment = torch.meshgrid(torch.arange(rings - 1), torch.arange(segments), indexing="ij")
     a = (ring * segments + segment).flatten()
     b = (ring * segments + (segment + 1) % segments).flatten()
@@ -117,18 +116,11 @@ def _tube_quads(rings: int, segments: int) -> Tensor:
 @cache
 def _tube_faces(rings: int, segments: int) -> Tensor:
     """Return triangles of the same tube with its caps, [f, 3]."""
-    a, b, c, d = _tube_quads(rings, segments).unbind(1)
-    around = torch.arange(segments)
+    quads, around = _tube_quads(rings, segments), torch.arange(segments)
     following, last = (around + 1) % segments, (rings - 1) * segments
     start, end = torch.full_like(around, rings * segments), torch.full_like(around, rings * segments + 1)
-    return torch.cat(
-        (
-            torch.stack((a, b, c), 1),
-            torch.stack((a, c, d), 1),
-            torch.stack((start, following, around), 1),
-            torch.stack((end, last + around, last + following), 1),
-        )
-    )
+    caps = torch.stack((start, following, around), 1), torch.stack((end, last + around, last + following), 1)
+    return torch.cat((quads[:, (0, 1, 2)], quads[:, (0, 2, 3)], *caps))
 
 
 def _point(y: Tensor, z: Tensor, x: Tensor | None = None) -> Tensor:
@@ -169,10 +161,10 @@ def _leg(m: dict[str, Tensor], end: str) -> list[Tensor]:
 
 
 def _body_tube(m: dict[str, Tensor], joints: list[Tensor], relief: Tensor) -> _Tube:
-    """Nose to tail tip."""
+    """Return the tube from nose to tail tip."""
     half, zero = m["body_length"] / 2, torch.zeros_like(m["body_length"])
     nose, poll, neck, withers, _, hips, root, tail, tip = joints
-    snout = torch.nn.functional.normalize(nose - poll, dim=-1)
+    snout = normalize(nose - poll, dim=-1)
     sections = (
         (nose, 0.55 * m["muzzle"], 0.55 * m["muzzle"]),
         (nose - 0.18 * snout * m["head_length"][..., None], m["muzzle"], m["muzzle"]),
@@ -196,11 +188,11 @@ def _body_tube(m: dict[str, Tensor], joints: list[Tensor], relief: Tensor) -> _T
 BODY_STATIONS = (0.0, 0.2, 0.5, 0.95, 1.25, 2.0, 3.0, 3.25, 4.0, 4.75, 5.5, 6.0, 6.5, 7.25, 8.0)
 """Bone coordinate of each body section: k to k + 1 is the k-th bone from the nose (bones 0 1 2 3 7 6 5 4)."""
 LEG_STATIONS = (-0.3, 0.1, 0.6, 1.0, 1.5, 2.0, 2.5, 2.85, 3.0)
-"""Bone coordinate of each leg section: 0 to 1 is the top bone; below zero the vertex hangs on the body bone."""
+"""Bone coordinate of each leg section: 0 to 1 is the top bone, below zero the body bone."""
 
 
 def _leg_tube(m: dict[str, Tensor], joints: list[Tensor], end: str, relief: Tensor) -> _Tube:
-    """From inside the body to the toes."""
+    """Return the tube of a left leg, from inside the body to the toes."""
     top, knee, hock, foot = joints
     thigh, shank, paw = m[f"{end}_thigh"], m[f"{end}_shank"], m["paw"]
     lift, forward = _point(0.9 * thigh, torch.zeros_like(thigh)), _point(torch.zeros_like(paw), paw)
@@ -219,7 +211,7 @@ def _leg_tube(m: dict[str, Tensor], joints: list[Tensor], end: str, relief: Tens
 
 
 def _chain_weights(stations: tuple[float, ...], rings: int, bones: tuple[int, ...], first: float) -> Tensor:
-    """Smooth weights of rings along a chain of bones, [rings, J]; ``first`` is where the chain's coordinate starts."""
+    """Return smooth weights of rings along a chain of bones, [rings, J]; the chain's coordinate starts at ``first``."""
     values, _ = _spline(len(stations), rings)
     along = values @ torch.tensor(stations)
     middle = torch.arange(len(bones)) + first + 0.5
@@ -231,7 +223,7 @@ def _chain_weights(stations: tuple[float, ...], rings: int, bones: tuple[int, ..
 
 @cache
 def _skinning() -> tuple[tuple[Tensor, ...], Tensor]:
-    """Return weights of the rings of every tube, each [r, J] (body, then the legs by number), and all faces, [f, 3]."""
+    """Return weights of each tube's rings, [r, J], of the body and the legs by number, and all faces, [f, 3]."""
     body = _chain_weights(BODY_STATIONS, BODY_RINGS, (0, 1, 2, 3, 7, 6, 5, 4), 0.0)
     tops = (10, 13, 16, 19)
     legs = tuple(_chain_weights(LEG_STATIONS, LEG_RINGS, (PARENTS[t], t, t - 1, t - 2), -1.0) for t in tops)
@@ -269,15 +261,12 @@ def quadruped(shape: Proportions | None = None, *, unit: bool = True) -> Templat
     left = [_leg_tube(m, front, "front", reliefs[1]), _leg_tube(m, rear, "rear", reliefs[2])]
     ring_weights, faces = _skinning()
 
-    meshes = [body.mesh(BODY_SEGMENTS), *(leg.mesh(LEG_SEGMENTS) for leg in left)]
-    meshes += [mirror_points(meshes[2]), mirror_points(meshes[1])]
+    vertices = torch.cat(_with_right_legs([body.mesh(BODY_SEGMENTS), *(leg.mesh(LEG_SEGMENTS) for leg in left)]), -2)
     weights = [
         torch.cat((w.repeat_interleave(BODY_SEGMENTS if k == 0 else LEG_SEGMENTS, 0), w[:1], w[-1:]))
         for k, w in enumerate(ring_weights)
     ]
-    body_blobs, front_blobs, rear_blobs = body.blobs(6), left[0].blobs(3), left[1].blobs(3)
-    blobs = [body_blobs[0], front_blobs[0], rear_blobs[0], mirror_points(rear_blobs[0]), mirror_points(front_blobs[0])]
-    sizes = [body_blobs[1], front_blobs[1], rear_blobs[1], rear_blobs[1], front_blobs[1]]
+    blobs, sizes = zip(body.blobs(6), *(leg.blobs(3) for leg in left), strict=True)
     blob_weights = [w.repeat_interleave(6 if k == 0 else 3, 0) for k, w in enumerate(ring_weights)]
 
     segments = [(spine[k + 1], spine[k]) for k in range(4)] + [(spine[k - 1], spine[k]) for k in (8, 7, 6, 5)]
@@ -285,17 +274,21 @@ def quadruped(shape: Proportions | None = None, *, unit: bool = True) -> Templat
     segments += [(leg[k], leg[k + 1]) for leg in legs for k in (2, 1, 0)]
     bones = torch.stack([torch.stack(pair, -2) for pair in segments], -3)
 
-    vertices = torch.cat(meshes, -2)
     scale = OBJECT_DIAGONAL / diagonal(vertices) if unit else torch.ones_like(vertices[..., 0, 0])
     return Template(
         vertices=vertices * scale[..., None, None],
         faces=faces,
         weights=torch.cat(weights),
         bones=bones * scale[..., None, None, None],
-        blobs=torch.cat(blobs, -2) * scale[..., None, None],
-        blob_sizes=torch.cat(sizes, -1) * scale[..., None],
+        blobs=torch.cat(_with_right_legs(blobs), -2) * scale[..., None, None],
+        blob_sizes=torch.cat((*sizes, sizes[2], sizes[1]), -1) * scale[..., None],
         blob_weights=torch.cat(blob_weights),
     )
+
+
+def _with_right_legs(parts: Sequence[Tensor]) -> list[Tensor]:
+    """Append mirrored points, rear leg first, to those of the body and the left front and rear leg."""
+    return [*parts, mirror_points(parts[2]), mirror_points(parts[1])]
 
 
 def diagonal(vertices: Tensor) -> Tensor:

@@ -1,65 +1,66 @@
-"""Guesses of an animal that is seen by a camera nobody knows: 3D-Fauna's camera model in place of a world.
+"""Guesses of an animal under unknown cameras: 3D-Fauna's camera model in place of a world.
 
-The camera stands still ten units from the origin, upright, with a field of view of 25 degrees over a square window
-around the animal; the animal turns and shifts before it (design notes, METHOD sections 1 and 2). Azimuth and elevation
-are the only turns, so there is no roll. The working frame is the camera's with y up and z towards the camera.
+The camera is fixed ten units from the origin, upright, with a field of view of 25 degrees over a square window around
+the animal, which rotates by azimuth and elevation (no roll) and shifts (design notes, METHOD sections 1 and 2). The
+working frame is the camera's with y up and z towards the camera.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
-from rewild4d.priors.hypotheses import ANGLE_SPREADS, Hypotheses, cosine_series
-from rewild4d.priors.kinematics import pose
+from rewild4d.priors.hypotheses import Hypotheses, cosine_series
+from rewild4d.priors.kinematics import moved, pose, rotation_about
 from rewild4d.priors.landmarks import Marks
-from rewild4d.priors.proportions import PROPORTIONS, SECTIONS, Proportions
+from rewild4d.priors.proportions import Proportions
+from rewild4d.priors.silhouettes import mask_box
 from rewild4d.priors.template import MIRROR, PARENTS, quadruped
 from rewild4d.transforms import rigid
 from rewild4d.types import Camera, Frame
 
 FIELD_OF_VIEW = math.radians(25.0)
 DISTANCE = 10.0
-"""From the camera to the working frame's origin, as Fauna's camera offset."""
+"""From the camera to the working frame's origin (Fauna's camera offset)."""
 WINDOW = 1.3
 """Side of the window over the longer side of the mask's box: Fauna's crops are padded by 15 % on each side."""
 BOX_SMOOTHING = 2.0
-"""Standard deviation over time, in frames, of the window's centre and side: a swinging tail moves no camera."""
+"""Standard deviation, in frames, of the smoothing of windows: a swinging tail moves no camera."""
 AZIMUTH_SPREAD, ELEVATION_SPREAD, ELEVATION = 0.35, math.radians(8.0), math.radians(8.0)
-"""Radians: natural spread of the turn over time, of the camera's elevation, and its mean."""
+"""Standard deviations of azimuth and elevation, and the mean elevation, radians."""
 SHIFT_SPREADS = (0.10, 0.10, 0.6)
-"""Natural spread of the animal's position in its window in x, y and depth, working units."""
+"""Standard deviations of the animal's position in its window in x, y and depth, working units."""
 HEAD_FORWARD, NOSE_FORWARD, POLL_FORWARD = 0.4, 0.35, 0.1
-"""How far heads reach forwards at least: the nose from the poll, in head lengths; nose and poll from the withers, in
-body lengths."""
-CARRIAGE_MOMENTS = 16
-"""Moments of a clip at which the carriage is looked at."""
-STEADY = 24
-"""Frames of a clip whose motion is penalised as `Hypotheses` does; longer ones by the same periods in frames."""
+"""Least distance forwards of the nose from the poll, in head lengths; of nose and poll from the withers, in body
+lengths."""
+CARRIAGE_FRAMES = 16
+"""About as many frames of a clip are looked at for the carriage of head and tail."""
+LONG = 24
+"""Frames of a clip up to which motion is penalised as in `Hypotheses`; of longer ones by the same periods in frames."""
 
 
 def windows(frames: tuple[Frame, ...]) -> Tensor:
-    """Square windows around the masks, smooth over time: centre x, centre y and side in pixels, float64, [T, 3].
+    """Return square windows around the masks, smooth over time: centre x, y and side in pixels, float64, [T, 3].
 
-    Frames with an empty mask get a window between their neighbours'; at least one mask must hold something.
+    Windows of frames with an empty mask are interpolated; at least one mask must show something.
     """
     known, rows = [], []
     for index, frame in enumerate(frames):
-        high, wide = np.nonzero(frame.mask[0].numpy() > 0.5)
-        if len(high):
+        if box := mask_box(frame.mask[0] > 0.5):
+            left, top, right, bottom = box
             known.append(index)
-            x0, x1, y0, y1 = wide.min(), wide.max() + 1, high.min(), high.max() + 1
-            rows.append(((x0 + x1) / 2, (y0 + y1) / 2, WINDOW * max(x1 - x0, y1 - y0)))
+            rows.append(((left + right) / 2, (top + bottom) / 2, WINDOW * max(right - left, bottom - top)))
     boxes = np.array(rows, dtype=np.float64)
     filled = np.stack([np.interp(np.arange(len(frames)), known, column) for column in boxes.T], axis=1)
     return torch.from_numpy(gaussian_filter1d(filled, BOX_SMOOTHING, axis=0, mode="nearest"))
 
 
 def fauna_camera(window: Tensor, width: int, height: int) -> Camera:
-    """Return the standing camera over one window ([3]: centre and side) of an image, in the working frame."""
+    """Return the fixed camera over one window ([3]: centre and side) of an image, in the working frame."""
     x, y, side = window.tolist()
     focal = side / 2 / math.tan(FIELD_OF_VIEW / 2)
     intrinsics = torch.tensor(((focal, 0.0, x), (0.0, focal, y), (0.0, 0.0, 1.0)), dtype=torch.float64)
@@ -70,96 +71,71 @@ def fauna_camera(window: Tensor, width: int, height: int) -> Camera:
 
 @dataclass
 class Views(Hypotheses):
-    """A batch of guesses under the standing camera.
+    """A batch of guesses under the fixed camera.
 
-    Unlike under known cameras, `turn` is a series of (azimuth, elevation), [B, K, 2], and `shift` holds every moment on
-    its own, [B, T, 3]: a window follows the outline, so positions may change as fast as boxes do.
+    Unlike under known cameras, `rotation` is a series of (azimuth, elevation), [B, K, 2], and `shift` has a row for
+    each frame, [B, T, 3], since the windows may move fast.
     """
 
-    @staticmethod
-    def start(facing: Tensor, path: Tensor) -> "Views":
-        """Average animals at rest at the window's centre, [B, 3, 3] and [T, 3]."""
-        batch, moments = len(facing), len(path)
-        return Views(
-            facing,
-            path,
-            scale=torch.zeros(batch),
-            turn=torch.zeros(batch, 1 + (moments - 1) // 4, 2),
-            shift=torch.zeros(batch, moments, 3),
-            shape=torch.zeros(batch, len(PROPORTIONS)),
-            relief=torch.zeros(batch, sum(SECTIONS), 4),
-            angles=torch.zeros(batch, 1 + (moments - 1) // 2, len(PARENTS), 3),
-        )
+    @classmethod
+    def start(cls, facing: Tensor, path: Tensor) -> Self:
+        """Return average animals at rest at the window's centre, from facings [B, 3, 3] and a path [T, 3]."""
+        still = super().start(facing, path)
+        rotation, shift = torch.zeros(*still.rotation.shape[:2], 2), torch.zeros(len(facing), len(path), 3)
+        return replace(still, rotation=rotation, shift=shift)
 
-    def select(self, rows: Tensor) -> "Views":
-        rest = {f.name: getattr(self, f.name).detach()[rows] for f in fields(self) if f.name != "path"}
-        return Views(path=self.path, **rest)
+    def with_depth_mirrored(self) -> Self:
+        """Return these guesses and their reflections in the image plane, [2 B].
 
-    def with_depth_mirrored(self) -> "Views":
-        """These guesses and their reflections in the image plane: animals with left and right exchanged that head away
-        instead of towards the camera. From afar and at eye level the two have the same outline, [2 B].
+        A reflection has left and right exchanged and heads away from the camera instead of towards it. From afar and
+        at eye level both have the same outline.
         """
-        # the reflection of a turn by a about y is one by pi - a, shared by the facing and the series
-        half_turn = torch.diag(torch.tensor((-1.0, 1.0, -1.0)))
-        swapped = self.angles[..., list(MIRROR), :] * torch.tensor((1.0, -1.0, -1.0))
-        parts = {
-            "facing": half_turn @ self.facing.transpose(-1, -2),
-            "turn": self.turn * torch.tensor((-1.0, 1.0)),
-            "angles": swapped,
-        }
-        both = {
-            f.name: torch.cat((getattr(self, f.name), parts.get(f.name, getattr(self, f.name)))).detach()
-            for f in fields(self)
-            if f.name != "path"
-        }
-        return Views(path=self.path, **both)
+        # the reflection of a rotation by a about y is one by pi - a, shared by the facing and the series
+        half_circle = torch.diag(torch.tensor((-1.0, 1.0, -1.0)))
+        mirrored = self.by_guess()
+        mirrored["facing"] = half_circle @ self.facing.transpose(-1, -2)
+        mirrored["rotation"] = self.rotation.detach() * torch.tensor((-1.0, 1.0))
+        mirrored["angles"] = self.angles.detach()[..., list(MIRROR), :] * torch.tensor((1.0, -1.0, -1.0))
+        both = {name: torch.cat((value, mirrored[name])) for name, value in self.by_guess().items()}
+        return replace(self, **both)
 
     def roots(self) -> Tensor:
         """Return the rigid root motion without the scale: azimuth, then the camera's elevation, [B, T, 4, 4]."""
-        series = cosine_series(len(self.path), self.turn.shape[1])
-        azimuth, elevation = (series @ self.turn).unbind(-1)
-        turn = _about_x(ELEVATION + ELEVATION_SPREAD * elevation) @ _about_y(AZIMUTH_SPREAD * azimuth)
-        # facing is a turn about y, which commutes with azimuth and must come before the elevation
-        return rigid(turn @ self.facing[:, None], self.path + self.shift * torch.tensor(SHIFT_SPREADS))
+        series = cosine_series(len(self.path), self.rotation.shape[1])
+        azimuth, elevation = (series @ self.rotation).unbind(-1)
+        pitch = rotation_about(0, ELEVATION + ELEVATION_SPREAD * elevation)
+        # facing is a rotation about y, which commutes with azimuth and must come before the elevation
+        rotation = pitch @ rotation_about(1, AZIMUTH_SPREAD * azimuth) @ self.facing[:, None]
+        return rigid(rotation, self.path + self.shift * torch.tensor(SHIFT_SPREADS))
 
     def projected(self, found: Marks) -> Tensor:
-        """Return where each guess puts the marks: x and y over depth in the camera's axes, [B, m, 2]."""
+        """Project the marks of each guess: x and y over depth in the camera's axes, [B, m, 2]."""
         bones = quadruped(Proportions(self.shape, self.relief), unit=False).bones
-        moments, rows = found.moments.unique(return_inverse=True)
-        transforms = pose(self.joint_angles()[:, moments], bones[:, None, :, 0], PARENTS)[:, rows, found.bones]
+        frames, rows = found.frames.unique(return_inverse=True)
+        transforms = pose(self.joint_angles()[:, frames], bones[:, None, :, 0], PARENTS)[:, rows, found.bones]
         start, end = bones[:, found.bones].unbind(2)
-        rest = start + found.along[:, None] * (end - start)
-        posed = (transforms[..., :3, :3] @ rest[..., None])[..., 0] + transforms[..., :3, 3]
-        roots = self.roots()[:, found.moments]
-        seen = (roots[..., :3, :3] @ (self.scales()[:, None, None] * posed)[..., None])[..., 0] + roots[..., :3, 3]
+        posed = moved(start + found.along[:, None] * (end - start), transforms)
+        seen = moved(self.scales()[:, None, None] * posed, self.roots()[:, found.frames])
         return torch.stack((seen[..., 0], -seen[..., 1]), -1) / (DISTANCE - seen[..., 2:]).clamp_min(1.0)
 
     def penalties(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """How unusual proportions, relief, joint angles and root motion are, each [B]; see `Hypotheses.penalties`."""
-        per_frame = min(1.0, STEADY / len(self.path))
-        pace = per_frame * torch.arange(self.angles.shape[1])
-        swing = self.angles.square() * (ANGLE_SPREADS > 0) * (0.3 + (pace / 4).square())[:, None, None]
-        haste = (per_frame * torch.arange(self.turn.shape[1])).square()
-        azimuth, elevation = self.turn.square().unbind(-1)
-        root = 0.01 * (azimuth * haste).sum(1) + 0.1 * elevation[:, 0] + (elevation * (1 + haste))[:, 1:].sum(1)
+        """Return penalties of proportions, relief, joint angles and root motion, each [B], as `Hypotheses` does."""
+        frequency = min(1.0, LONG / len(self.path))
+        speed = (frequency * torch.arange(self.rotation.shape[1])).square()
+        azimuth, elevation = self.rotation.square().unbind(-1)
+        root = 0.01 * (azimuth * speed).sum(1) + 0.1 * elevation[:, 0] + (elevation * (1 + speed))[:, 1:].sum(1)
         root = root + 0.1 * self.shift.square().mean((1, 2))
         if len(self.path) > 2:
             root = root + self.shift.diff(n=2, dim=1).square().mean((1, 2))
-        return (
-            self.shape.square().mean(1),
-            self.relief.square().mean((1, 2)),
-            swing.sum(1).mean((1, 2)),
-            root,
-        )
+        return *self._body_penalties(frequency), root
 
     def carriage(self) -> Tensor:
-        """Return how unlike an animal head and tail are carried, squared shares of the body's length, [B].
+        """Return a penalty on heads folded into the body and on raised tails, squared body lengths, [B].
 
-        A head points forwards and reaches beyond the withers, a tail hangs behind the hips. Outlines alone would fold
-        the head into the body and take a raised tail for a neck.
+        A head points forwards and lies before the withers, a tail hangs behind the hips; outlines alone do not tell.
         """
         bones = quadruped(Proportions(self.shape, self.relief), unit=False).bones
-        every = max(1, len(self.path) // CARRIAGE_MOMENTS)
+        every = max(1, len(self.path) // CARRIAGE_FRAMES)
         chain = pose(self.joint_angles()[:, ::every, :8], bones[:, None, :8, 0], PARENTS[:8])
         ends = torch.einsum("btjac,bjkc->btjka", chain[..., :3, :3], bones[:, :8]) + chain[..., None, :3, 3]
         nose, poll, withers, tip, hips = (
@@ -175,15 +151,3 @@ class Views(Hypotheses):
             (tip - hips)[..., 2],
         )
         return (torch.stack(faults).clamp_min(0) / length).square().mean(2).sum(0)
-
-
-def _about_x(angle: Tensor) -> Tensor:
-    zero, one = torch.zeros_like(angle), torch.ones_like(angle)
-    rows = (one, zero, zero, zero, angle.cos(), -angle.sin(), zero, angle.sin(), angle.cos())
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
-
-
-def _about_y(angle: Tensor) -> Tensor:
-    zero, one = torch.zeros_like(angle), torch.ones_like(angle)
-    rows = (angle.cos(), zero, angle.sin(), zero, one, zero, -angle.sin(), zero, angle.cos())
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))

@@ -18,7 +18,7 @@ from rewild4d.datasets.video.travel import TravelMeter
 from rewild4d.errors import UserError
 from rewild4d.priors.config import FOOTAGE
 from rewild4d.priors.io import load_prior, save_prior
-from rewild4d.priors.steady import REACH, clusters, steady, without_hops
+from rewild4d.priors.steady import EPS, clusters, steady, without_hops
 
 
 def test_clusters_are_those_of_the_definition() -> None:
@@ -56,7 +56,7 @@ def test_a_camera_that_hops_is_left_out_and_a_hop_of_the_mirrored_one_is_mended(
 def test_a_frame_that_is_held_out_parts_no_smooth_way_but_a_hop_stays_one() -> None:
     shown = [t for t in range(15) if t % 5 != 2]
     times, fast = torch.tensor(shown).double() / 24, [0.2 * t for t in shown]
-    assert 2 * math.sin(0.2) > REACH > 2 * math.sin(0.1)  # two steps are too far apart, one is not
+    assert 2 * math.sin(0.2) > EPS > 2 * math.sin(0.1)  # two steps are too far apart, one is not
     assert steady(ring(fast), times).all()
     assert not steady(ring(fast), torch.arange(12).double()).all()
     turned = [angle + math.pi / 2 * (t > 12) for angle, t in zip(fast, shown, strict=True)]

@@ -147,7 +147,7 @@ def test_only_a_single_direction_of_view_is_a_gaze_and_it_is_told_in_the_working
 
 def test_heading_is_free_but_leaning_and_turning_over_time_cost() -> None:
     guesses = Hypotheses.start(torch.eye(3).expand(3, 3, 3), torch.zeros(8, 3))
-    guesses.turn[0, 0, 1] = guesses.turn[1, 0, 0] = guesses.turn[2, 1, 1] = 1.0
+    guesses.rotation[0, 0, 1] = guesses.rotation[1, 0, 0] = guesses.rotation[2, 1, 1] = 1.0
     assert guesses.penalties()[3].tolist() == pytest.approx([0.0, 1.0, 1.0])
     turned = torch.tensor((math.sin(0.35), 0.0, math.cos(0.35)))
     assert torch.allclose(guesses.heading()[0], turned, atol=1e-5)

@@ -194,8 +194,8 @@ def test_marks_project_like_the_prior_that_a_guess_becomes(fitted: Prior) -> Non
 def test_a_guess_reflected_in_depth_has_the_same_outline_from_afar() -> None:
     generator = torch.Generator().manual_seed(0)
     guess = Views.start(axis_angle_to_matrix(torch.tensor(((0.0, 0.7, 0.0),))), torch.zeros(8, 3))
-    guess.turn = torch.randn(guess.turn.shape, generator=generator) * torch.tensor((1.0, 0.0))
-    guess.turn[..., 0, 1] = -ELEVATION / ELEVATION_SPREAD  # eye level
+    guess.rotation = torch.randn(guess.rotation.shape, generator=generator) * torch.tensor((1.0, 0.0))
+    guess.rotation[..., 0, 1] = -ELEVATION / ELEVATION_SPREAD  # eye level
     guess.angles = 0.5 * torch.randn(guess.angles.shape, generator=generator)
     both = guess.with_depth_mirrored()
     assert torch.allclose(both.heading()[0] * torch.tensor((1.0, 1.0, -1.0)), both.heading()[1], atol=1e-5)
@@ -223,7 +223,7 @@ def test_mappings_name_landmarks_and_mirrored_marks_swap_sides() -> None:
     points = Keypoints(("left_elbow", "right_hip", "nose", "tuft"), torch.tensor(((1.0, 2), (3, 4), (5, 6), (7, 8))),
                        torch.tensor((True, True, False, True)))  # fmt: skip
     found = marks([None, points], load_mapping("aptv2"))
-    assert found.moments.tolist() == [1, 1] and found.bones.tolist() == [9, 16]
+    assert found.frames.tolist() == [1, 1] and found.bones.tolist() == [9, 16]
     flipped = found.mirrored(10)
     assert flipped.bones.tolist() == [MIRROR[9], MIRROR[16]] and flipped.pixels.tolist() == [[9, 2], [7, 4]]
     assert len(marks([None], load_mapping("badja"))) == 0
