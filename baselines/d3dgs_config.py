@@ -1,4 +1,4 @@
-"""Settings of D-3DGS and D-3DGS*, and what tables say of the two; a light module, read before the method is loaded."""
+"""Settings of D-3DGS and D-3DGS*, and their rows in tables; without torch, since flags read it first."""
 
 import msgspec
 
@@ -13,33 +13,33 @@ STAR_INFO = MethodInfo(title="D-3DGS*", paper=f"{PAPER}; the star as in the pape
 
 
 class NetworkShape(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Sizes of the network; the defaults are the original's."""
+    """Sizes of the deformation network; the defaults are the original's."""
 
     depth: Count = 8
-    """Layers before the heads."""
+    """Number of layers before the heads."""
     width: Count = 256
     """Hidden width of each layer."""
     skip: Whole = 4
-    """The input joins once more after this layer (counted from 0)."""
+    """Layer after which the input is added again, counted from 0."""
     place_octaves: Whole = 10
     """Octaves of the position code."""
     time_octaves: Whole = 6
     """Octaves of the time code."""
     time_width: Count = 256
-    """Hidden width of the time's own network."""
+    """Hidden width of the network that encodes time."""
     time_features: Count = 30
-    """Features of the time."""
+    """Outputs of that network."""
     half: bool = True
     """Multiply in bfloat16 on a CPU that has it (docs/experiments/bfloat16.md)."""
 
 
 class Motion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """When and how the deformation learns."""
+    """Schedule of the deformation network."""
 
     warm_up: Weight = 0.075
-    """Fraction with the Gaussians standing still (3k of 40k)."""
+    """Fraction before which the Gaussians are not deformed (3k of 40k)."""
     noise: Weight = 0.1
-    """Standard deviation of the time's jitter in frames, falling linearly to zero."""
+    """Standard deviation of the time jitter in frames, falling linearly to zero."""
     noise_until: Weight = 0.5
     """Fraction at which the jitter ends (20k of 40k)."""
     rate: Rate = (8e-4, 1.6e-6)
@@ -50,9 +50,7 @@ class D3dgsCanonical(Canonical, frozen=True, forbid_unknown_fields=True, kw_only
     """The canonical Gaussians."""
 
     opacity: Opacity = 0.1
-    """At the start (3DGS)."""
     sh_degree: Degree = 3
-    """Spherical harmonics of colour, 0 to 3."""
 
 
 class D3dgsDensity(Density, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -61,15 +59,15 @@ class D3dgsDensity(Density, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     start: Weight = 0.0125
     """Fraction of the first round (500 of 40k)."""
     end: Weight = 0.375
-    """Fraction of the last (15k of 40k)."""
+    """Fraction of the last round (15k of 40k)."""
     every: Positive = 0.0025
     """Fraction between rounds (100 of 40k)."""
     prune_opacity: Share = 0.005
-    """Gaussians below this opacity are removed (3DGS); a reset must leave more."""
+    """Remove Gaussians below this opacity (3DGS); less than `resets.opacity`."""
 
 
 class D3dgsResets(Resets, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Opacity resets: every Gaussian has to earn its opacity again, so that floaters are pruned."""
+    """Opacity resets."""
 
     every: Weight = 0.075
     """Fraction between resets (3k of 40k); 0 for none."""
@@ -91,20 +89,18 @@ class StarCanonical(D3dgsCanonical, frozen=True, forbid_unknown_fields=True, kw_
     """The canonical Gaussians, on the prior's surface."""
 
     opacity: Opacity = 0.9
-    """At the start, as `ours`."""
 
 
 class StarLoss(ImageLoss, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Losses of one rendered view."""
 
     silhouette: Weight = 0.1
-    """BCE + Dice of the matte, as `ours`."""
 
 
 class D3dgsStarConfig(D3dgsConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """`d3dgs-star`; the defaults are `d3dgs`'s with the silhouette loss of `ours` and its start."""
+    """`d3dgs-star`; the defaults are those of `d3dgs` with the initial opacity and the silhouette loss of `ours`."""
 
     mirrored: Share = 0.5
-    """Share of the steps that see a mirror image, at negative times; the paper leaves it open."""
+    """Share of the steps that see a mirror image, at negative times (paper: open)."""
     canonical: StarCanonical = StarCanonical()
     loss: StarLoss = StarLoss()

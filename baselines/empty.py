@@ -1,4 +1,4 @@
-"""The floor under every score: a reconstruction with nothing in it."""
+"""The lower bound of every score: a reconstruction without Gaussians."""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ class EmptyReconstruction:
 
 
 class Empty:
-    """Renders the background: on white, a small animal costs it little, which is why it is always printed."""
+    """A method that renders the background alone: on white, its scores are high where the animal is small."""
 
     info = EMPTY_INFO
     Config = EmptyConfig

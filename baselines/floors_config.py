@@ -1,4 +1,4 @@
-"""Settings of the two floors, and what tables say of them; a light module, read before the methods are loaded."""
+"""Settings of the two lower bounds, and their rows in tables; without torch, since flags read it first."""
 
 import msgspec
 
@@ -12,13 +12,13 @@ PRIOR_ONLY_INFO = MethodInfo(
 
 
 class EmptyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Nothing to choose."""
+    """No settings."""
 
 
 class PriorOnlyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the prior's surface is drawn."""
+    """Gaussians on the prior's surface."""
 
     gaussians: Count = 12000
-    """Points on the surface: enough that their discs close at 512 pixels."""
+    """Number of Gaussians; the default leaves no gaps at 512 pixels."""
     thickness: Positive = 0.3
-    """Along the normal, as a share of the disc's radius: a thin shell."""
+    """Scale along the normal over the scale in the surface."""

@@ -1,36 +1,33 @@
 """GART: Gaussians on an articulated template, with learned skinning and per-frame poses; and GART*.
 
-Paper: Lei et al., GART: Gaussian Articulated Template Models, CVPR 2024; the authors' code is under the MIT licence.
-Nothing of it is copied; it is written anew from the paper and its dog profile on this package's rasterizer.
+Paper: Lei et al., GART: Gaussian Articulated Template Models, CVPR 2024. Written anew from the paper and its dog
+profile on this package's rasterizer; nothing is copied from the authors' code (MIT).
 
-The original drives D-SMAL, a model of dogs that may not be passed on. Here the template is the prior: its 20 bones and
-its surface, posed as it was fitted to this clip. Who owns a D-SMAL file can name it (`template`): a SMAL pickle
-(`v_template`, `f`, `weights`, `J_regressor` or `J`, `kintree_table`; read without running what it holds) or an npz
-with `vertices`, `faces`, `weights`, `joints`, `parents`; it then takes its first poses from the prior (gart_smal.py).
-A run's settings name the path, so the file should not change between runs.
+The original drives D-SMAL, a model of dogs that may not be distributed. Here the template is the prior: its 20 bones
+and its surface, with the poses fitted to this clip. The setting `template` names the file of a D-SMAL that a user owns
+(gart_smal.py); its initial poses follow the prior's. Settings hold the path alone, so the file must not change between
+runs.
 
 `gart-star` then fits the pose of each frame once more to that frame, everything else frozen: SGD, 160 steps, at a rate
-of 2e-2 halved every 50. The original does so with the image it is scored on. Where views are held out that is, here as
-there, the training camera's image of each moment and never a held-out view. Where moments of a video are held out, the
-fit does not see them; the evaluation then fits their poses to them (`GartStarReconstruction.refined`), and every table
-says that the row has seen the images that it is scored on.
+of 2e-2 halved every 50. Where views are held out, the fit uses the training camera's image of each frame, as the
+original does there, and never a held-out view. Where frames of a video are held out, the fit does not see them; the
+evaluation then fits their poses to them (`GartStarReconstruction.refined`), and every table says that the row has seen
+the test images.
 
-What differs from the original: positions get no gradient through the skinning grid, a Gaussian turns with the blended
-quaternion of its joints instead of the blended matrix (which would shrink it), the grid is a cube, neighbours are
-looked up when the Gaussians change instead of in every step, colours start from the frames, scales are logarithms with
-a cap, the number of Gaussians is capped. A unit of length of the original is the template's diagonal. The schedule is
-given in fractions of the original's 10k steps.
+Differences from the original: positions get no gradient through the skinning grid; a Gaussian rotates by the blended
+quaternion of its joints, not by the blended matrix, which would shrink it; the grid is a cube; neighbours are searched
+when the set of Gaussians changes, not in every step; colours start from the frames; scales are logarithms with a cap;
+the number of Gaussians is capped. The original's unit of length is the template's diagonal here. The schedule is in
+fractions of the original's 10k steps.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from rewild4d.baselines.common.saved import Root, gaussians_from_state, load_state
-from rewild4d.baselines.common.splatting import SplatTraining, run_steps, surface_gaussians
+from rewild4d.baselines.common.splatting import STATE, SplatTraining, run_training, surface_gaussians
 from rewild4d.baselines.gart_config import INFO, STAR_INFO, GartConfig, GartStarConfig
 from rewild4d.baselines.gart_reconstruction import GartReconstruction, GartStarReconstruction
 from rewild4d.baselines.gart_refine import refine_step
@@ -41,8 +38,9 @@ from rewild4d.contracts import Log, MethodInfo
 from rewild4d.harmonics import C0
 from rewild4d.kernels.threads import torch_on_one
 from rewild4d.ours.canonical import REST_GAIN, Gaussians
-from rewild4d.ours.checkpoint import fit_digest
+from rewild4d.ours.checkpoint import fit_digest, load_fitted
 from rewild4d.ours.losses.regularizers import neighbours
+from rewild4d.ours.motion import Root
 from rewild4d.ours.schedule import exponential, for_clip
 from rewild4d.ours.symmetry import Key, Supervision, Target, match_times
 from rewild4d.rasterizer import RasterInfo
@@ -58,19 +56,22 @@ class GartModel(nn.Module):
 
 
 class GartTraining(SplatTraining):
-    """The loop's body; the steps after `GartConfig.iterations` are the star's."""
+    """One fit; the steps after `GartConfig.iterations` refine the poses of the star."""
 
     model: GartModel
+    config: GartConfig
 
     def __init__(
         self, model: GartModel, config: GartConfig, supervision: Supervision, generator: torch.Generator
     ) -> None:
         groups = {"turns": [model.poses.turns], "shifts": [model.poses.shifts], "skinning": [model.field.residual]}
         super().__init__(model, groups, config, supervision, generator)
-        self.config = config
-        self.total += config.refine.steps * supervision.frames if isinstance(config, GartStarConfig) else 0
-        self.near: Tensor | None = None
         self.weights: Tensor | None = None
+
+    @property
+    def total(self) -> int:
+        refine = self.config.refine.steps if isinstance(self.config, GartStarConfig) else 0
+        return super().total + refine * self.supervision.frames
 
     def rate(self, name: str, progress: float) -> float:
         poses = self.config.poses
@@ -79,42 +80,31 @@ class GartTraining(SplatTraining):
             return 0.0 if progress < start else exponential(*poses.skinning_rate, (progress - start) / (1 - start))
         return 0.0 if progress < poses.start else poses.rate * (OBJECT_DIAGONAL if name == "shifts" else 1.0)
 
-    def changed(self) -> None:
-        self.near = None
-
-    def state(self) -> dict[str, Any]:
-        return super().state() | {"near": self.near}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        super().restore(state)
-        # Looked up anew they would be those of today's places, not of the last change's.
-        self.near = state["near"]
-
     def step(self, index: int) -> dict[str, float]:
         done = index - self.config.iterations
         return super().step(index) if done < 0 else self._refine_step(done)
 
-    def losses(self, index: int) -> tuple[dict[str, Tensor], RasterInfo, Target]:
+    def drawn_losses(self, index: int) -> tuple[dict[str, Tensor], RasterInfo, Target]:
         config, model = self.config, self.model
         progress = index / config.iterations
         frame = int(torch.randint(self.supervision.frames, (), generator=self.generator))
         target = self.supervision.target(Key(1, 1, frame))
         learns = config.skinning.learn and progress >= config.poses.skinning_start
-        counts = learns and index % config.regularisers.every == 0
+        regularised = learns and index % config.regularisers.every == 0
         if learns:
-            weights, variation = model.field(model.gaussians.means.detach(), counts)
+            weights, variation = model.field(model.gaussians.means.detach(), regularised)
         else:
             weights, variation = model.field.still(model.gaussians.means), None
         shape = posed(model.gaussians, weights, *model.poses(frame))
         rgb, alpha, info = self.render(shape, target, progress)
         losses = self.image_losses(rgb, alpha, target) | self._alike()
-        if counts and variation is not None:
+        if regularised and variation is not None:
             terms = config.regularisers
             losses["residual"] = terms.every * (terms.variation * variation + terms.norm * model.field.norm())
         return losses, info, target
 
     def _alike(self) -> dict[str, Tensor]:
-        """Hold neighbours alike, and no Gaussian large."""
+        """Compute the loss of attributes that differ among neighbours, and of large Gaussians."""
         own, config = self.model.gaussians, self.config.regularisers
         if self.near is None:
             others = neighbours(own.means, min(config.neighbours, len(own)) - 1).to(own.means.device)
@@ -133,10 +123,9 @@ class GartTraining(SplatTraining):
         return {"alike": total}
 
     def _refine_step(self, done: int) -> dict[str, float]:
-        """Take one step of SGD on the pose of one frame; white background, as the original's."""
+        """Take a step of SGD on the pose of one frame."""
         assert isinstance(self.config, GartStarConfig)
-        frame, step = divmod(done, self.config.refine.steps)
-        model = self.model
+        model, (frame, step) = self.model, divmod(done, self.config.refine.steps)
         if self.weights is None:
             self.weights = model.field.still(model.gaussians.means)
         target = self.supervision.target(Key(1, 1, frame))
@@ -181,14 +170,14 @@ class Gart:
         model = GartModel(gaussians, ResidualField(template, config.skinning), poses).to(device)
         training = GartTraining(model, config, supervision, generator)
         with torch_on_one():
-            run_steps(training, f"{self.name} {fit_digest(config, clip, template, seed)}", log, workdir)
+            run_training(training, f"{self.name} {fit_digest(config, clip, template, seed)}", log, workdir)
         weights = model.field.still(model.gaussians.means)
         return self.Result(model.gaussians, weights, model.poses, config, Root.of(clip, prior))
 
     def load(self, folder: Path, device: torch.device) -> GartReconstruction:
         """Read back what `GartReconstruction.save` wrote."""
-        state, config = load_state(folder, self.name, self.Config)
-        gaussians = gaussians_from_state(state["model"], config.canonical.max_scale)
+        state, config = load_fitted(folder, STATE, self.name, self.Config)
+        gaussians = Gaussians.from_state(state["model"], config.canonical.max_scale)
         gaussians.blur.copy_(state["model"]["gaussians.blur"])
         saved: dict[str, Any] = state["poses"]
         poses = PoseTable(saved["quats"], saved["offsets"], saved["pivots"], state["parents"])
@@ -198,7 +187,7 @@ class Gart:
 
 
 class GartStar(Gart):
-    """The method with the poses of all scored moments fitted once more to the input view (contracts.Method)."""
+    """The method with the poses of all scored frames fitted once more to the input view (contracts.Method)."""
 
     name: ClassVar[str] = "gart-star"
     info: ClassVar[MethodInfo] = STAR_INFO

@@ -1,6 +1,6 @@
-"""Settings of GART and GART*, and what tables say of the two; a light module, read before the method is loaded.
+"""Settings of GART and GART*, and their rows in tables; without torch, since flags read it first.
 
-"fraction" means a share of the original's 10k steps, or of as many as `iterations` says.
+"10k" in a setting's help are the original's steps.
 """
 
 from typing import Annotated
@@ -33,48 +33,46 @@ STAR_INFO = MethodInfo(
 
 
 class Poses(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Poses and skinning: when and how fast they learn."""
+    """Schedule of poses and skinning."""
 
     rate: Positive = 1e-4
-    """Of the joints' rotations, radians a step (Adam); the shifts have `OBJECT_DIAGONAL` times that."""
+    """Learning rate of the joints' rotations, radians a step (Adam); translations have 5 times that."""
     start: Weight = 0.05
     """Fraction before which poses are the prior's (500 of 10k)."""
     skinning_rate: Rate = (1e-4, 1e-5)
-    """Of the skinning residual, falling exponentially."""
+    """Learning rate of the skinning residual, falling exponentially."""
     skinning_start: Annotated[float, Meta(ge=0, lt=1)] = 0.2
     """Fraction before which skinning is the template's (2k of 10k)."""
 
 
 class Regularisers(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Weights of what keeps neighbours alike and the residual small."""
+    """Weights of the regularisers."""
 
     neighbours: Count = 3
-    """Gaussians that are compared, itself counted."""
+    """Gaussians that are compared, the Gaussian itself included."""
     quats: Weight = 1e-3
-    """Standard deviation of the orientations among neighbours."""
+    """Weight of the standard deviation of orientations among neighbours."""
     scales: Weight = 1e-3
-    """Of the scales."""
+    """Weight of the standard deviation of scales."""
     opacities: Weight = 1e-3
-    """Of the opacities."""
+    """Weight of the standard deviation of opacities."""
     colors: Weight = 1e-3
-    """Of the colours, as harmonics' coefficients."""
+    """Weight of the standard deviation of colours, as coefficients of the harmonics."""
     variation: Weight = 0.5
-    """Total variation of the skinning residual."""
+    """Weight of the total variation of the skinning residual."""
     norm: Weight = 0.1
-    """Size of the skinning residual."""
+    """Weight of the mean norm of the skinning residual."""
     every: Count = 1
-    """Steps between evaluations of these two, weights multiplied accordingly: their cost grows with the grid."""
+    """Steps between evaluations of these two, weights multiplied accordingly."""
     small: Weight = 0.05
-    """Mean square of a Gaussian's largest scale."""
+    """Weight of the mean square of a Gaussian's largest scale."""
 
 
 class GartCanonical(Canonical, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The canonical Gaussians, on the template's surface."""
 
     opacity: Opacity = 0.99
-    """At the start."""
     sh_degree: Degree = 3
-    """Spherical harmonics of colour, 0 to 3."""
     sh_every: Positive = 0.1
     """Fraction after which one more degree joins (1k of 10k)."""
 
@@ -83,18 +81,15 @@ class GartRates(GaussianRates, frozen=True, forbid_unknown_fields=True, kw_only=
     """Learning rates of the Gaussians' attributes (Adam)."""
 
     quats: Weight = 5e-3
-    """Orientations."""
     colors: Weight = 1.4e-3
-    """Colours: 5e-3 on harmonics' coefficients."""
+    """Colours: 5e-3 on the coefficients of the harmonics."""
 
 
 class GartLoss(ImageLoss, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Losses of one rendered view, sums over pixels divided by the area of the animal's box as in `ours`."""
 
     l1: Weight = 1.0
-    """Absolute difference of colour."""
     ssim: Weight = 0.1
-    """One minus SSIM."""
 
 
 class GartDensity(Density, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -103,35 +98,30 @@ class GartDensity(Density, frozen=True, forbid_unknown_fields=True, kw_only=True
     start: Weight = 0.01
     """Fraction of the first round (100 of 10k)."""
     end: Weight = 0.8
-    """Fraction of the last (8k of 10k)."""
+    """Fraction of the last round (8k of 10k)."""
     every: Positive = 0.03
     """Fraction between rounds (300 of 10k)."""
     gradient: Weight = 5e-4
-    """Mean image gradient above which a Gaussian is refined, in half sides of the animal's box."""
     prune_opacity: Share = 0.05
-    """Gaussians below this opacity are removed."""
 
 
 class GartResets(Resets, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Opacity resets: every Gaussian has to earn its opacity again."""
+    """Opacity resets."""
 
     every: Weight = 0.1
     """Fraction between resets (1k of 10k); 0 for none."""
     until: Weight = 0.95
     """Fraction after which there are none (the last is at 9,002 of 10k)."""
     opacity: Opacity = 0.06
-    """Opacities above this are set to it (the original's 0.05 is also where it prunes)."""
+    """Opacities above this are set to it (original: 0.05, which is also `density.prune_opacity`)."""
 
 
 class GartSkinning(Skinning, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The skinning grid."""
 
     resolution: Annotated[int, Meta(ge=2)] = 64
-    """Voxels along each axis."""
     neighbours: Count = 30
-    """Vertices averaged by inverse distance to fill a voxel."""
     sweeps: Whole = 30
-    """Neighbour averages."""
 
 
 class GartConfig(SplatConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -140,7 +130,7 @@ class GartConfig(SplatConfig, frozen=True, forbid_unknown_fields=True, kw_only=T
     iterations: Whole = 10_000
     """Steps (the original's)."""
     template: str = ""
-    """Path of a D-SMAL file that you own; empty for the prior's own 20 bones."""
+    """Path of a D-SMAL file; empty for the prior's surface and its 20 bones."""
     canonical: GartCanonical = GartCanonical()
     rates: GartRates = GartRates()
     loss: GartLoss = GartLoss()
@@ -152,17 +142,17 @@ class GartConfig(SplatConfig, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class Refine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The pose of each frame fitted once more to that frame, by SGD."""
+    """Second fit of each frame's pose to that frame, by SGD."""
 
     steps: Whole = 160
-    """Steps a frame."""
+    """Steps for each frame."""
     rate: Positive = 2e-2
-    """At the start."""
+    """Initial learning rate."""
     halve_every: Count = 50
     """Steps after which the rate is halved."""
 
 
 class GartStarConfig(GartConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """`gart-star`: `gart`, then the poses once more."""
+    """`gart-star`: `gart`, then the second fit of the poses."""
 
     refine: Refine = Refine()

@@ -1,4 +1,4 @@
-"""What GART and GART* leave behind: Gaussians at rest, skinning weights and a pose for every frame."""
+"""Reconstructions by GART and GART*: canonical Gaussians, skinning weights and a pose for every frame."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,13 +6,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from rewild4d.baselines.common.saved import Root, save_state, splats_of
+from rewild4d.baselines.common.splatting import STATE
 from rewild4d.baselines.gart_config import GartConfig, GartStarConfig
-from rewild4d.baselines.gart_refine import refine_moments
+from rewild4d.baselines.gart_refine import refine_held_out
 from rewild4d.baselines.gart_skeleton import PoseTable
 from rewild4d.baselines.gart_skinning import posed
 from rewild4d.contracts import Log
 from rewild4d.ours.canonical import Gaussians
+from rewild4d.ours.checkpoint import save_fitted
+from rewild4d.ours.motion import Root
 from rewild4d.types import Camera, Frame, Splats
 
 SEEN = "has seen the test image: the poses of held-out frames were fitted to those frames"
@@ -33,13 +35,13 @@ class GartReconstruction:
 
     @torch.no_grad()
     def at(self, time: float) -> Splats:
-        """Return the Gaussians at a time in seconds in the world; between frames the joints' rotations slerp."""
+        """Return the Gaussians at a time in seconds in the world; poses are interpolated between frames."""
         position = self.root.position(time)
         shape = posed(self.gaussians, self.weights, *self.poses.between(position))
-        return self.root.in_world(splats_of(self.gaussians, *shape), position)
+        return self.root.in_world(self.gaussians.splats_at(*shape), position)
 
     def camera(self, time: float) -> Camera | None:
-        """Return the input camera of the frame nearest to a time."""
+        """Return the input camera at a time, in the world; between frames it interpolates."""
         return self.root.camera(time)
 
     def canonical(self) -> Splats:
@@ -47,7 +49,7 @@ class GartReconstruction:
         return self.gaussians.splats()
 
     def diagnostics(self) -> dict[str, float]:
-        """Return how many Gaussians there are, how opaque, and how far poses went from the prior's."""
+        """Return the number of Gaussians, their mean opacity and the mean rotation of joints against the prior's."""
         return {
             "gaussians": float(len(self.gaussians)),
             "opacity_mean": float(self.gaussians.opacities().mean()),
@@ -61,22 +63,22 @@ class GartReconstruction:
             "model": model, "weights": self.weights, "poses": self.poses.state_dict(),
             "parents": self.poses.parents, "root": self.root.state(),
         }  # fmt: skip
-        save_state(folder, state, self.config)
+        save_fitted(folder, STATE, state, self.config)
 
 
 class GartStarReconstruction(GartReconstruction):
-    """The same of `gart-star`.
+    """A reconstruction by `gart-star`.
 
     Attributes:
-        marks: what every table has to say of it.
+        marks: printed with its rows in every table.
     """
 
     marks: tuple[str, ...] = ()
 
     def refined(self, frames: Sequence[Frame], log: Log) -> "GartStarReconstruction":
-        """With poses of held-out frames of the input view fitted to those frames; see contracts.Reconstruction."""
+        """Fit poses of held-out frames of the input view to those frames; see contracts.Reconstruction."""
         assert isinstance(self.config, GartStarConfig)
-        poses, root = refine_moments(self.gaussians, self.weights, self.poses, self.root, frames, self.config, log)
+        poses, root = refine_held_out(self.gaussians, self.weights, self.poses, self.root, frames, self.config, log)
         found = GartStarReconstruction(self.gaussians, self.weights, poses, self.config, root)
         found.marks = (SEEN,)
         return found

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from rewild4d.baselines.common.saved import Root
 from rewild4d.baselines.common.splatting import image_losses, render
 from rewild4d.baselines.gart_config import GartStarConfig
 from rewild4d.baselines.gart_skeleton import PoseTable
@@ -13,6 +12,7 @@ from rewild4d.baselines.gart_skinning import posed
 from rewild4d.contracts import Log
 from rewild4d.kernels.threads import torch_on_one
 from rewild4d.ours.canonical import Gaussians
+from rewild4d.ours.motion import Root
 from rewild4d.ours.symmetry import Target, animal_side
 from rewild4d.transforms import camera_in_object
 from rewild4d.types import Frame
@@ -21,16 +21,16 @@ from rewild4d.types import Frame
 def refine_step(
     own: Gaussians, weights: Tensor, poses: PoseTable, frame: int, target: Target, step: int, config: GartStarConfig
 ) -> float:
-    """Take one step; white background, as the original's.
+    """Take one step on the pose of a frame; the background is white, as in the original.
 
     Args:
         own: canonical Gaussians.
         weights: their skinning weights, [n, J].
         poses: changed in place.
-        frame: whose pose.
+        frame: index of the frame.
         target: its image, and its camera in the object frame.
-        step: of this frame's steps, from 0.
-        config: the fit's.
+        step: index of the step within this frame.
+        config: of the fit.
 
     Returns:
         The loss before the step.
@@ -43,30 +43,30 @@ def refine_step(
     loss = torch.stack(list(losses.values())).sum()
     rate = config.refine.rate * 0.5 ** (step // config.refine.halve_every)
     learned = (poses.turns, poses.shifts)
-    for parameter, slope in zip(learned, torch.autograd.grad(loss, learned), strict=True):
-        if not torch.isfinite(slope).all():
+    for parameter, grad in zip(learned, torch.autograd.grad(loss, learned), strict=True):
+        if not torch.isfinite(grad).all():
             raise FloatingPointError(f"frame {frame}, refinement step {step}: the gradient of its pose is not finite")
-        parameter.data -= rate * slope
+        parameter.data -= rate * grad
     return float(loss.detach())
 
 
-def refine_moments(
+def refine_held_out(
     own: Gaussians, weights: Tensor, poses: PoseTable, root: Root, frames: Sequence[Frame], config: GartStarConfig,
     log: Log,
 ) -> tuple[PoseTable, Root]:  # fmt: skip
-    """Fit poses for further times of the input view, each begun between those of its neighbours, to its images.
+    """Fit poses to further frames of the input view, each from the interpolated pose at its time.
 
     Args:
         own: canonical Gaussians.
         weights: their skinning weights, [n, J].
-        poses: of the frames that were fitted; stays as it is.
-        root: where they stand.
-        frames: with cameras in the world; those without an animal, and moments that are known already, are passed over.
-        config: the fit's.
+        poses: of the fitted frames; not changed.
+        root: of the fitted frames.
+        frames: with cameras in the world; those without an animal or at a fitted time are skipped.
+        config: of the fit.
         log: progress.
 
     Returns:
-        Poses and roots of all moments, in the order of time.
+        Poses and root of all frames, in the order of time.
     """
     known = set(root.times.tolist())
     held = [frame for frame in frames if frame.time not in known and (frame.mask > 0.5).any()]

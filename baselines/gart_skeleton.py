@@ -1,4 +1,4 @@
-"""Poses of GART: one rotation per joint and frame along a chain, one shift per frame, and what lies between frames."""
+"""Poses of GART: a rotation per joint and frame along a chain, a translation per frame, and their interpolation."""
 
 import torch
 from torch import Tensor, nn
@@ -9,7 +9,7 @@ from rewild4d.types import Prior
 
 
 class PoseTable(nn.Module):
-    """Learned corrections of given poses; all zero, they are the given poses.
+    """Given poses with learned corrections, which start at zero.
 
     Attributes:
         turns: axis-angle corrections of each joint's rotation against its parent, radians, [T, J, 3].
@@ -39,24 +39,24 @@ class PoseTable(nn.Module):
         return self._chained(self._local(frame), self.offsets[frame], self.shifts[frame])
 
     def between(self, position: float) -> tuple[Tensor, Tensor]:
-        """Return the pose at a position between frames (1.5: half-way from the second to the third): joints slerp."""
+        """Return the pose at a position between frames, as from `frame_position`; rotations slerp."""
         return self._chained(*self._at(position))
 
     @torch.no_grad()
     def with_frame(self, row: int, position: float) -> "PoseTable":
-        """The table with one frame more, which is row ``row`` then and starts as the pose at a place between frames."""
+        """Return a table with one more frame at index ``row``, which starts at the pose between frames."""
         local, offsets, shift = self._at(position)
 
-        def put(rows: Tensor, added: Tensor) -> Tensor:
+        def inserted(rows: Tensor, added: Tensor) -> Tensor:
             return torch.cat((rows[:row], added[None], rows[row:]))
 
-        table = PoseTable(put(self.quats, local), put(self.offsets, offsets), self.pivots, self.parents)
-        table.turns.copy_(put(self.turns, torch.zeros_like(offsets)))
-        table.shifts.copy_(put(self.shifts, shift))
+        table = PoseTable(inserted(self.quats, local), inserted(self.offsets, offsets), self.pivots, self.parents)
+        table.turns.copy_(inserted(self.turns, torch.zeros_like(offsets)))
+        table.shifts.copy_(inserted(self.shifts, shift))
         return table.to(local.device)
 
     def _at(self, position: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what `_chained` takes, at a position between frames."""
+        """Return the arguments of `_chained` at a position between frames."""
         low = int(position)
         part = position - low
         if part == 0:
@@ -73,19 +73,20 @@ class PoseTable(nn.Module):
     def _chained(self, local: Tensor, offsets: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
         """Chain P_j = P_parent T(c + d) R T(-c) from root to leaf, level by level."""
         rotation = quat_to_matrix(local)
-        moves = self.pivots + offsets - (rotation @ self.pivots[..., None])[..., 0]
-        quats, turns, places = local, rotation, moves
+        translation = self.pivots + offsets - (rotation @ self.pivots[..., None])[..., 0]
+        quats, rotations, translations = local, rotation, translation
         for level, above in zip(self.levels[1:], self.above[1:], strict=True):
             level, above = level.to(local.device), above.to(local.device)
             quats = quats.index_copy(0, level, quat_multiply(quats[above], local[level]))
-            turned = turns[above]
-            places = places.index_copy(0, level, (turned @ moves[level][..., None])[..., 0] + places[above])
-            turns = turns.index_copy(0, level, turned @ rotation[level])
-        return quats, rigid(turns, places + shift)
+            outer = rotations[above]
+            moved = (outer @ translation[level][..., None])[..., 0] + translations[above]
+            translations = translations.index_copy(0, level, moved)
+            rotations = rotations.index_copy(0, level, outer @ rotation[level])
+        return quats, rigid(rotations, translations + shift)
 
 
 def pose_table(transforms: Tensor, pivots: Tensor, parents: Tensor) -> PoseTable:
-    """Make the table that starts at given poses.
+    """Make the table of given poses.
 
     Args:
         transforms: rest -> posed, rigid, [T, J, 4, 4].
@@ -103,18 +104,18 @@ def pose_table(transforms: Tensor, pivots: Tensor, parents: Tensor) -> PoseTable
 
 
 def prior_poses(prior: Prior, rows: list[int]) -> PoseTable:
-    """Return the prior's poses at some of its frames."""
+    """Return the table of the prior's poses at some of its frames."""
     return pose_table(prior.transforms[rows], prior.bones[:, 0], prior.parents)
 
 
-def exponential_quats(turns: Tensor) -> Tensor:
-    """Return the unit quaternions of axis-angle vectors, smooth at zero, [..., 3] -> [..., 4]."""
-    angle = (turns.square().sum(-1, keepdim=True) + 1e-16).sqrt()
-    return torch.cat(((angle / 2).cos(), turns / angle * (angle / 2).sin()), dim=-1)
+def exponential_quats(rotations: Tensor) -> Tensor:
+    """Return the unit quaternions of axis-angle vectors, differentiable at zero, [..., 3] -> [..., 4]."""
+    angle = (rotations.square().sum(-1, keepdim=True) + 1e-16).sqrt()
+    return torch.cat(((angle / 2).cos(), rotations / angle * (angle / 2).sin()), dim=-1)
 
 
 def slerp(first: Tensor, last: Tensor, part: float) -> Tensor:
-    """Along the shorter arc between unit quaternions, [..., 4]; a straight blend where they nearly coincide."""
+    """Interpolate along the shorter arc between unit quaternions, [..., 4]; linearly where they nearly coincide."""
     cosine = (first * last).sum(-1, keepdim=True)
     last = torch.where(cosine < 0, -last, last)
     angle = cosine.abs().clamp(max=1.0).acos()

@@ -14,11 +14,11 @@ from rewild4d.transforms import skin_points, skin_quats
 from rewild4d.types import Prior
 
 BEND = 1e-4
-"""Below this difference the total variation is a parabola instead of an absolute value (a Huber function)."""
+"""Huber threshold of the total variation."""
 
 
 class ResidualField(nn.Module):
-    """Weights = grid of the template's weights + residual, both sampled trilinearly; the sum is not renormalised.
+    """Sum of two voxel grids, the template's weights and a learned residual; not renormalised.
 
     Attributes:
         base: the template's weights in every voxel, x slowest, [R^3, J].
@@ -36,27 +36,27 @@ class ResidualField(nn.Module):
         self.residual = nn.Parameter(torch.zeros_like(self.base))
 
     def forward(self, points: Tensor, variation: bool) -> tuple[Tensor, Tensor]:
-        """Return weights of points [n, 3], no gradient flows to them: [n, J]; and the residual's total variation.
+        """Sample weights [n, J] at points [n, 3], without their gradient, and the residual's total variation.
 
         Args:
             points: in the object frame.
-            variation: whether the mean over the axes of the mean absolute forward difference is wanted (else zero).
+            variation: compute the mean over the axes of the mean absolute forward difference; else it is zero.
         """
         with torch.no_grad():
             base = self.field.sample(self.base, points)
         if not RESIDUAL_FIELD.takes(points, owner=self):
             return base + self.field.sample(self.residual, points), self._variation() if variation else points.sum() * 0
-        place = (points, self.field.origin, self.field.pitch, self.field.resolution)
-        added, total = sample_grid(self.residual, *place, BEND if variation else None)
+        cube = (points, self.field.origin, self.field.pitch, self.field.resolution)
+        added, total = sample_grid(self.residual, *cube, BEND if variation else None)
         return base + added, total / BEND
 
     def still(self, points: Tensor) -> Tensor:
-        """Return weights without a gradient, [n, 3] -> [n, J]."""
+        """Sample weights without any gradient, [n, 3] -> [n, J]."""
         with torch.no_grad():
             return self.field.sample(self.base, points) + self.field.sample(self.residual, points)
 
     def norm(self) -> Tensor:
-        """Return the mean over the voxels of the residual's length, scalar."""
+        """Return the mean norm of the residual over the voxels, scalar."""
         return (self.residual.square().sum(-1) + 1e-16).sqrt().mean()
 
     def _variation(self) -> Tensor:
@@ -64,7 +64,7 @@ class ResidualField(nn.Module):
 
 
 def posed(own: Gaussians, weights: Tensor, quats: Tensor, transforms: Tensor) -> Shape:
-    """Return the skinned Gaussians.
+    """Skin the canonical Gaussians.
 
     Args:
         own: canonical.

@@ -1,4 +1,4 @@
-"""A SMAL-like template (D-SMAL) in place of the prior's own surface and bones, for users who have the file.
+"""Read a SMAL-like template (D-SMAL), which replaces the prior's surface and bones, for users who have the file.
 
 Two kinds of file are read:
 
@@ -6,12 +6,10 @@ Two kinds of file are read:
     pickle  SMAL's: v_template, f, weights, kintree_table, and J or J_regressor; posedirs and shapedirs are ignored
 
 Axes are SMAL's: x towards the head, y to the animal's left, z up. The mean shape is scaled to the object frame's
-diagonal and laid on the prior's rest shape; its proportions are not fitted. It takes its poses from the prior: the
-template's surface is moved along with the nearest prior surface, and the chain of joints that follows it best is its
-pose.
+diagonal and centred on the prior's rest shape; its proportions are not fitted. Its vertices move with the nearest
+vertices of the prior, and its poses are the chains of joints that fit these moved vertices best.
 
-A pickle can run any code when it is opened. Only arrays, sparse matrices and the values of chumpy variables are let
-through.
+A pickle can run any code when it is opened, so only arrays, sparse matrices and chumpy variables are built.
 """
 
 import copyreg
@@ -38,24 +36,21 @@ from rewild4d.types import OBJECT_DIAGONAL, Prior
 NEEDED = ("vertices", "faces", "weights", "joints", "parents")
 NAMES_IN_SMAL = {"vertices": "v_template", "faces": "f", "joints": "J"}
 LEAST_MASS = 3.0
-"""A joint with fewer vertices than this (summed weights) turns with its parent."""
+"""A joint with less than this sum of weights rotates with its parent."""
 
 
 def template_prior(path: Path, prior: Prior) -> Prior:
-    """Return the prior with the file's surface, bones and weights, and with poses that follow the prior's.
+    """Return the prior with the file's surface, bones and weights, and with poses fitted to the prior's.
 
     Args:
         path: npz or SMAL pickle.
-        prior: gives place, poses and cameras.
-
-    Returns:
-        A prior whose mirror is the joint nearest to each joint's mirror image.
+        prior: gives rest position, poses and cameras.
 
     Raises:
-        UserError: no such file, or not what the module's text says.
+        UserError: no such file, or not of the two kinds above.
     """
     arrays = _checked(path, _read(path))
-    points, joints = _laid_on(prior, arrays["vertices"], arrays["joints"])
+    points, joints = _in_object_frame(prior, arrays["vertices"], arrays["joints"])
     parents = arrays["parents"].tolist()
     _, nearest = cKDTree(prior.vertices.double().numpy()).query(points.double().numpy())
     moved = skin_points(points, prior.weights[torch.from_numpy(nearest)], prior.transforms)
@@ -80,7 +75,7 @@ def template_prior(path: Path, prior: Prior) -> Prior:
 
 
 def follow(points: Tensor, moved: Tensor, weights: Tensor, joints: Tensor, parents: list[int]) -> Tensor:
-    """Rest -> posed transforms of a chain that follows moved vertices: each joint turns as its own vertices do.
+    """Fit a chain of joints to moved vertices: each joint has the best rotation of its own vertices.
 
     Args:
         points: rest, [n, 3].
@@ -90,7 +85,7 @@ def follow(points: Tensor, moved: Tensor, weights: Tensor, joints: Tensor, paren
         parents: -1 for a root.
 
     Returns:
-        Rigid, joints stay attached to their parents, [T, J, 4, 4].
+        Rest -> posed transforms, rigid, joints attached to their parents, [T, J, 4, 4].
     """
     posed: dict[int, Tensor] = {}
     start, end = points.double(), moved.double()
@@ -98,34 +93,34 @@ def follow(points: Tensor, moved: Tensor, weights: Tensor, joints: Tensor, paren
         for joint in level:
             share = weights[:, joint].double()
             above = posed.get(parents[joint])
-            rotation, center, place = _turn(start, end, share)
+            rotation, center, moved_center = _best_rotation(start, end, share)
             if share.sum() < LEAST_MASS and above is not None:
                 rotation = above[:, :3, :3]
             pivot = joints[joint].double()
-            if above is None:  # a root goes where its vertices go
-                target = (rotation @ (pivot - center)) + place
+            if above is None:  # a root moves with its vertices
+                target = (rotation @ (pivot - center)) + moved_center
             else:
                 target = above[:, :3, :3] @ pivot + above[:, :3, 3]
             posed[joint] = rigid(rotation, target - rotation @ pivot)
     return torch.stack([posed[joint] for joint in range(len(parents))], dim=1).float()
 
 
-def _turn(start: Tensor, end: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _best_rotation(start: Tensor, end: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the best rotation [T, 3, 3] of weighted points (Kabsch), their centre before [3] and after [T, 3]."""
     part = share / share.sum().clamp_min(1e-12)
-    center, place = part @ start, torch.einsum("n,tna->ta", part, end)
-    cross = torch.einsum("n,tna,nb->tab", part, end - place[:, None], start - center)
-    return nearest_rotation(cross), center, place
+    before, after = part @ start, torch.einsum("n,tna->ta", part, end)
+    cross = torch.einsum("n,tna,nb->tab", part, end - after[:, None], start - before)
+    return nearest_rotation(cross), before, after
 
 
-def _laid_on(prior: Prior, vertices: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
-    """Vertices and joints in the object frame: its axes, its diagonal, the box's centre on the prior's (x = 0)."""
-    turned = [points[:, [1, 2, 0]] for points in (vertices, joints)]
-    low, high = turned[0].amin(0), turned[0].amax(0)
+def _in_object_frame(prior: Prior, vertices: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
+    """Return vertices and joints in the object frame's axes and size, their box centred on the prior's (x = 0)."""
+    permuted = [points[:, [1, 2, 0]] for points in (vertices, joints)]
+    low, high = permuted[0].amin(0), permuted[0].amax(0)
     scale = OBJECT_DIAGONAL / float((high - low).norm())
     center = 0.5 * (prior.vertices.amin(0) + prior.vertices.amax(0)) * torch.tensor((0.0, 1.0, 1.0))
-    placed = [((points - 0.5 * (low + high)) * scale + center).float() for points in turned]
-    return placed[0], placed[1]
+    vertices, joints = (((points - 0.5 * (low + high)) * scale + center).float() for points in permuted)
+    return vertices, joints
 
 
 def _mirror(joints: Tensor) -> Tensor:
@@ -140,7 +135,7 @@ def _child(parents: list[int], joint: int) -> int:
 
 
 class _Chumpy:
-    """Stands for a chumpy variable: its value is the array `x`."""
+    """Stand-in for a chumpy variable, whose value is the array `x`."""
 
     x: Any = None
 
@@ -153,7 +148,7 @@ def _encode(text: str, encoding: str = "latin1") -> bytes:
 
 
 LET_THROUGH: dict[tuple[str, str], Any] = {
-    # numpy's own makers of arrays and numbers moved between modules; their reduction names the present ones.
+    # numpy moved these functions between modules; the reduction of an array and of a number names the present ones.
     ("numpy", "_reconstruct"): np.zeros(0).__reduce__()[0],
     ("numpy", "scalar"): np.float64(0).__reduce__()[0],
     ("numpy", "ndarray"): np.ndarray,
@@ -165,11 +160,11 @@ LET_THROUGH: dict[tuple[str, str], Any] = {
     ("copyreg", "_reconstructor"): copyreg._reconstructor,  # type: ignore[attr-defined]
     ("builtins", "object"): object,
 }
-"""By the top package's name and the object's."""
+"""What a pickle may name, by the names of the top package and of the object."""
 
 
 class _Careful(pickle.Unpickler):
-    """Builds arrays, sparse matrices and chumpy variables, nothing else."""
+    """Unpickler of arrays, sparse matrices and chumpy variables alone."""
 
     def find_class(self, module: str, name: str) -> Any:
         known = LET_THROUGH.get((module.split(".")[0], name))
@@ -179,23 +174,18 @@ class _Careful(pickle.Unpickler):
 
 
 def _read(path: Path) -> Mapping[str, Any]:
-    """Return the arrays of a file under the npz's names.
-
-    Raises:
-        UserError: no such file, or neither kind.
-    """
+    """Return the arrays of a file by the names that an npz has."""
+    wanted = f"{path}: expected a D-SMAL file (npz or SMAL pickle)"
     try:
         content = path.read_bytes()
         if content[:2] == b"PK":
             return arrays_of(path, content, "a D-SMAL file (npz or SMAL pickle)")
         raw = _Careful(io.BytesIO(content), encoding="latin1").load()
     except FileNotFoundError as error:
-        raise UserError(f"{path}: expected a D-SMAL file (npz or SMAL pickle), but there is no such file.") from error
+        raise UserError(f"{wanted}, but there is no such file.") from error
     except (OSError, ValueError, EOFError, pickle.UnpicklingError, AttributeError, TypeError,
             IndexError, KeyError, ImportError) as error:  # fmt: skip
-        raise UserError(
-            f"{path}: expected a D-SMAL file (npz or SMAL pickle), but it cannot be read: {error}."
-        ) from error
+        raise UserError(f"{wanted}, but it cannot be read: {error}.") from error
     if not isinstance(raw, dict):
         raise UserError(f"{path}: expected a SMAL pickle that holds a dictionary, got a {type(raw).__name__}.")
     found = {key: _array(raw[name]) for key in NEEDED if (name := NAMES_IN_SMAL.get(key, key)) in raw}
@@ -213,11 +203,7 @@ def _array(value: Any) -> np.ndarray:
 
 
 def _checked(path: Path, raw: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return the five arrays with the shapes that the module's text gives.
-
-    Raises:
-        UserError: naming the first array that is not as it should be.
-    """
+    """Return the five arrays as tensors; UserError where one has another shape or values out of range."""
     missing = [name for name in NEEDED if name not in raw]
     if missing:
         held = ", ".join(sorted(raw)) or "nothing"

@@ -1,7 +1,4 @@
-"""The prior on its own: its posed surface as Gaussians, coloured from the frames (the paper's Fauna row).
-
-What a method adds is its distance from this row.
-"""
+"""The prior alone: its posed surface as Gaussians, coloured from the frames (the paper's Fauna row)."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -28,7 +25,7 @@ from rewild4d.types import Camera, Clip, Prior, Splats
 
 
 class PriorOnlyReconstruction:
-    """A posed, coloured template."""
+    """A posed, coloured template (contracts.Articulated)."""
 
     def __init__(
         self, prior: Prior, sample: SurfaceSample, colors: Tensor, cameras: dict[float, Camera], thickness: float
@@ -37,6 +34,7 @@ class PriorOnlyReconstruction:
         self.thickness = thickness
         self.quats = quats_from_normals(sample.normals)
         self.scales = sample.radius * torch.tensor((1.0, 1.0, thickness)).expand(len(colors), 3)
+        self.weights, self.pivots, self.parents = sample.weights, prior.bones[:, 0], prior.parents
 
     def at(self, time: float) -> Splats:
         object_to_world, transforms = pose_at(self.prior, time)
@@ -45,31 +43,16 @@ class PriorOnlyReconstruction:
         )
 
     def camera(self, time: float) -> Camera | None:
-        """Return the input camera; at a time without an input frame the prior's."""
+        """Return the input camera at a time, in the world; without an input frame there, the prior's."""
         return self.cameras.get(time) or world_camera(self.prior, time)
 
     def canonical(self) -> Splats:
         """Return the Gaussians at rest, in the object frame."""
-        rest = torch.eye(4).expand(self.prior.bones.shape[0], 4, 4)
+        rest = torch.eye(4).expand(len(self.parents), 4, 4)
         return pose_gaussians(self.sample, self.quats, self.scales, self.colors, rest)
 
-    @property
-    def weights(self) -> Tensor:
-        """Skinning weights of the canonical Gaussians, [n, J]."""
-        return self.sample.weights
-
-    @property
-    def pivots(self) -> Tensor:
-        """Inner end of each bone at rest, [J, 3]."""
-        return self.prior.bones[:, 0]
-
-    @property
-    def parents(self) -> Tensor:
-        """Parent of each bone, -1 for a root, [J]."""
-        return self.prior.parents
-
     def articulation(self, time: float) -> tuple[Tensor, Tensor]:
-        """Return transforms from rest to pose, [J, 4, 4], and object_to_world, [4, 4]."""
+        """Return rest -> posed transforms, [J, 4, 4], and object_to_world, [4, 4]."""
         object_to_world, transforms = pose_at(self.prior, time)
         return transforms, object_to_world
 
@@ -85,7 +68,7 @@ class PriorOnlyReconstruction:
 
 
 class PriorOnly:
-    """The floor that a reconstruction has to leave behind."""
+    """The lower bound of methods that start from the prior."""
 
     info = PRIOR_ONLY_INFO
     Config = PriorOnlyConfig

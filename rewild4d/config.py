@@ -43,19 +43,19 @@ def load_preset(method: str, config_type: type[T], preset: str) -> T:
     if base := own.pop("extends", None):
         if base not in presets:
             raise unknown_name(f"preset of '{method}'", base, presets)
-        own = _over(presets[base], own)
+        own = merged(presets[base], own)
     try:
         return msgspec.convert(own, type=config_type)
     except msgspec.ValidationError as error:
         raise UserError(f"presets/{method}.toml: [{preset}] does not fit {config_type.__name__}: {error}.") from error
 
 
-def _over(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """Deep-merge two nested mappings; the second wins."""
+def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Deep-merge two nested mappings; the second wins. Unknown names are kept, so that decoding refuses them."""
     made = dict(base)
-    for key, value in own.items():
+    for key, value in changes.items():
         nested = isinstance(value, dict) and isinstance(base.get(key), dict)
-        made[key] = _over(base[key], value) if nested else value
+        made[key] = merged(base[key], value) if nested else value
     return made
 
 

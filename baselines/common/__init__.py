@@ -1,1 +1,1 @@
-"""Share what Gaussian competitors have in common: the training loop, its settings, the scene frame, saved files."""
+"""Share what Gaussian competitors have in common: the training loop, its settings, the scene's frame of reference."""

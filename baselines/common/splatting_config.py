@@ -1,4 +1,4 @@
-"""Settings that every Gaussian competitor has; a light module, read before the method is loaded."""
+"""Settings of all Gaussian competitors; without torch, since flags read it before the method is loaded."""
 
 import msgspec
 
@@ -30,11 +30,11 @@ class ImageLoss(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     silhouette: Weight = 0.0
     """BCE + Dice of the matte."""
     random_background: bool = True
-    """One random colour a step behind render and target, white otherwise."""
+    """Put one random colour a step behind render and target, else white."""
 
 
 class Resets(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Opacity resets: every Gaussian has to earn its opacity again, so that floaters are pruned."""
+    """Opacity resets: opacities are lowered from time to time, so that floaters are pruned."""
 
     every: Weight = 0.0
     """Fraction of the iterations between resets; 0 for none."""
@@ -45,14 +45,14 @@ class Resets(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class SplatConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Settings that every Gaussian competitor has; "fraction" means a share of `iterations`."""
+    """Settings of all Gaussian competitors; "fraction" means a share of `iterations`."""
 
     image_size: Size = 512
-    """Longest image side it trains at; larger clips are reduced."""
+    """Longest training image side, pixels; larger clips are reduced."""
     iterations: Whole = 20_000
     """Steps."""
     steps_per_frame: Whole = 0
-    """At least so many steps for every frame of the clip; 0 leaves it at `iterations`."""
+    """Least steps for every frame of the clip; 0 leaves it at `iterations`."""
     checkpoint_every: Count = 500
     """Steps between checkpoints, where a work folder is given."""
     canonical: Canonical = Canonical()

@@ -1,4 +1,4 @@
-"""The volume that all input cameras look at: a frame of reference for a method that has no prior."""
+"""Compute the volume that all input cameras look at: the frame of reference of a method without a prior."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,34 +11,30 @@ from rewild4d.transforms import camera_in_object, mirror_camera, similarity
 from rewild4d.types import Camera, Clip, Prior
 
 SCENE_HALF = 3.0
-"""Half the side of the cube that the volume becomes: an animal that fills the frame is then about as long as in the
-object frame."""
+"""Half the side of the scene's cube: an animal that fills the frame is about as long as in the object frame."""
 PULL = 1e-3
-"""Pull to the world's origin, as a share of a view's: it only decides where the views do not (one fixed camera)."""
+"""Weight of the world's origin against one view's: it decides only the depth that the views leave open."""
 DRAWS = 8
 """Points drawn for each that is kept."""
 
 
 def scene_frame(clip: Clip, prior: Prior) -> Prior:
-    """Make a "prior" whose root stands still: the shared volume's frame, with the clip's cameras in it.
+    """Express the clip's cameras in the frame of the shared volume.
 
     Args:
-        clip: its cameras decide; the prior's are taken for frames without one.
+        clip: gives the cameras; for frames without one the prior's are used.
         prior: gives nothing else.
 
     Returns:
-        The prior with other cameras and one similarity for all its times; its shape and poses mean nothing there.
+        The prior with these cameras and one similarity for all times; its shape and poses are not to be used.
     """
-    rows = match_times(clip, prior)
-    cameras = {}
-    for frame, row in zip(clip.frames, rows, strict=True):
-        known = frame.camera or camera_in_object(
-            prior.cameras[row], torch.linalg.inv(prior.object_to_world[row].double())
-        )
-        cameras[row] = known
+    cameras = {
+        row: frame.camera or camera_in_object(prior.cameras[row], torch.linalg.inv(prior.object_to_world[row].double()))
+        for frame, row in zip(clip.frames, match_times(clip, prior), strict=True)
+    }
     center, half = common_volume(list(cameras.values()))
     scene_to_world = similarity(half / SCENE_HALF, torch.eye(3, dtype=torch.float64), center)
-    # Rows that the clip does not use keep any camera: nothing asks for them.
+    # Cameras of rows that the clip does not use are never read.
     inside = tuple(
         camera_in_object(cameras[row], scene_to_world) if row in cameras else camera
         for row, camera in enumerate(prior.cameras)
@@ -52,9 +48,9 @@ def scene_frame(clip: Clip, prior: Prior) -> Prior:
 
 
 def common_volume(cameras: Sequence[Camera]) -> tuple[Tensor, float]:
-    """Return the point nearest to all lines of sight through the image centres, and half the side of a cube around it.
+    """Compute the cube around the point that is nearest to all optical axes through the image centres.
 
-    The cube is as wide as the longer side of the narrowest view there.
+    It is as wide as the longer side of the narrowest view at that point.
 
     Args:
         cameras: in the world.
@@ -64,8 +60,8 @@ def common_volume(cameras: Sequence[Camera]) -> tuple[Tensor, float]:
     """
     matrix, right = torch.zeros(3, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     for camera in cameras:
-        line = _sight(camera)
-        across = torch.eye(3, dtype=torch.float64) - line[:, None] * line
+        axis = _viewing_direction(camera)
+        across = torch.eye(3, dtype=torch.float64) - axis[:, None] * axis
         matrix, right = matrix + across, right + across @ camera.center.double()
     center = torch.linalg.solve(matrix + PULL * len(cameras) * torch.eye(3, dtype=torch.float64), right)
     halves = []
@@ -77,15 +73,12 @@ def common_volume(cameras: Sequence[Camera]) -> tuple[Tensor, float]:
 
 
 def random_points(count: int, cameras: Sequence[Camera], generator: torch.Generator) -> Tensor:
-    """Uniform points of the scene's cube that lie in every image; where there are too few, those in most images.
+    """Draw uniform points of the scene's cube that lie in every image, or in most where too few do, [count, 3].
 
     Args:
-        count: how many.
+        count: number of points.
         cameras: in the scene's frame.
-        generator: the only source of chance.
-
-    Returns:
-        [count, 3].
+        generator: the only source of randomness.
     """
     points = SCENE_HALF * (2 * torch.rand(DRAWS * count, 3, generator=generator) - 1)
     seen = torch.zeros(len(points))
@@ -96,8 +89,8 @@ def random_points(count: int, cameras: Sequence[Camera], generator: torch.Genera
     return points[seen.argsort(descending=True, stable=True)[:count]]
 
 
-def _sight(camera: Camera) -> Tensor:
-    """Return the unit direction through the middle of the image, in the world, [3]."""
+def _viewing_direction(camera: Camera) -> Tensor:
+    """Return the unit direction through the image centre, in the world, [3]."""
     middle = torch.tensor((camera.width / 2, camera.height / 2, 1.0), dtype=torch.float64)
     local = torch.linalg.solve(camera.intrinsics.double(), middle)
     return torch.nn.functional.normalize(camera.world_to_camera[:3, :3].double().T @ local, dim=0)

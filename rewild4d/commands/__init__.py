@@ -1,1 +1,1 @@
-"""One file a command: flags in, callables called, results printed."""
+"""Commands, a file each: parse flags, call functions, print results."""

@@ -1,4 +1,4 @@
-"""`bench`: time the rasterizer or a training step on this machine, print a table and leave the data."""
+"""`bench`: time the rasterizer or a training step on this machine; print a table and write the data."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rewild4d.commands.shared import require_writable_file
+from rewild4d.commands.shared import call_subcommand, require_writable_file
 from rewild4d.config import load_preset, parse_flags
-from rewild4d.errors import UserError, unknown_name
+from rewild4d.errors import UserError
 from rewild4d.ours.config import Config
 
 if TYPE_CHECKING:
@@ -18,11 +18,10 @@ if TYPE_CHECKING:
 
     from rewild4d.benchmarks.results import Row
 
+USAGE = "usage: rewild4d-bench bench rasterizer|step [options]      (bench rasterizer --help lists its options)"
 RASTERIZER = """Time the rasterizer, forward and with backward, against peers from PyPI that run on the same device and
-against the least time that the arithmetic itself would take here. Contenders take turns within one run."""
-
-STEP = """Time one training step of `ours` with every loss acting, show where its time goes, and how fast
-what it fits is rendered."""
+against a lower bound, the time of the arithmetic alone on this machine. Rounds of all contenders alternate."""
+STEP = """Time one training step of `ours` with every loss, its parts, and the rendering of the result."""
 
 
 @dataclass(frozen=True)
@@ -30,13 +29,13 @@ class RasterizerOptions:
     """Flags of `bench rasterizer`.
 
     Attributes:
-        gaussians: how many the scenes have.
+        gaussians: number of Gaussians of each scene.
         sizes: sides of the square images in pixels; every number of Gaussians is timed at every size.
         repeats: rounds of measurement for each scene.
         device: cpu, or cuda: the Triton backend against gsplat's kernels.
         peers: time the peers too.
         probes: measure peak memory too, and on the CPU start-up times (there in processes of their own).
-        threads: that compute; torch's own number where it is left out.
+        threads: number of threads; torch's default where it is left out.
         out: file for the data; results/speed/rasterizer-<processor>-<day>.json where it is left out.
         json: print the data as JSON, and nothing else, to standard output.
     """
@@ -57,14 +56,14 @@ class StepOptions:
     """Flags of `bench step`.
 
     Attributes:
-        gaussians: how many the model has.
+        gaussians: number of Gaussians of the model.
         sizes: sides of the square frames in pixels; clips are rendered at the largest.
         repeats: rounds of measurement.
-        preset: of `ours`; its image size and number of Gaussians are those above.
+        preset: of `ours`; image size and number of Gaussians are those above.
         device: cpu or cuda.
         probes: measure peak memory too (on the CPU), in processes of their own.
         by_kernel: time the step with each fused kernel switched off too, at presets quick and paper (on the CPU).
-        threads: that compute; torch's own number where it is left out.
+        threads: number of threads; torch's default where it is left out.
         out: file for the data; results/speed/step-<processor>-<day>.json where it is left out.
         json: print the data as JSON, and nothing else, to standard output.
     """
@@ -82,19 +81,11 @@ class StepOptions:
 
 
 def main(arguments: list[str]) -> int:
-    if arguments[:1] in (["-h"], ["--help"]) or not arguments:
-        print("usage: rewild4d-bench bench rasterizer|step [options]      (bench rasterizer --help tells its options)")
-        return 0 if arguments else 2
-    benchmarks: dict[str, Callable[[list[str]], int]] = {"rasterizer": _rasterizer, "step": _step}
-    if arguments[0] not in benchmarks:
-        raise unknown_name("benchmark", arguments[0], benchmarks)
-    return benchmarks[arguments[0]](arguments)
+    return call_subcommand(arguments, USAGE, "benchmark", {"rasterizer": _rasterizer, "step": _step})
 
 
 def _rasterizer(arguments: list[str]) -> int:
-    options = parse_flags(
-        RasterizerOptions, arguments[1:], prog="rewild4d-bench bench rasterizer", description=RASTERIZER
-    )
+    options = parse_flags(RasterizerOptions, arguments, prog="rewild4d-bench bench rasterizer", description=RASTERIZER)
     _check(options, options.gaussians)
     from rewild4d.benchmarks.peers import CUDA_PEERS, PEERS, installed
     from rewild4d.benchmarks.raster_bench import bench_rasterizer
@@ -106,15 +97,15 @@ def _rasterizer(arguments: list[str]) -> int:
     device = pick_device(options.device)
     peers = (CUDA_PEERS if device.type == "cuda" else PEERS) if options.peers else ()
     return _report(
-        arguments, options, settings, installed(peers), device,
+        ["rasterizer", *arguments], options, settings, installed(peers), device,
         lambda: bench_rasterizer(options.gaussians, options.sizes, options.repeats, peers, options.probes, device),
     )  # fmt: skip
 
 
 def _step(arguments: list[str]) -> int:
-    options = parse_flags(StepOptions, arguments[1:], prog="rewild4d-bench bench step", description=STEP)
+    options = parse_flags(StepOptions, arguments, prog="rewild4d-bench bench step", description=STEP)
     _check(options, (options.gaussians,))
-    load_preset("ours", Config, options.preset)  # an unknown preset is said before anything is measured
+    load_preset("ours", Config, options.preset)  # fail on an unknown preset before anything is measured
     from rewild4d.benchmarks.step_bench import bench_step
     from rewild4d.machine import pick_device
 
@@ -124,7 +115,7 @@ def _step(arguments: list[str]) -> int:
     }  # fmt: skip
     device = pick_device(options.device)
     return _report(
-        arguments, options, settings, {}, device,
+        ["step", *arguments], options, settings, {}, device,
         lambda: bench_step(
             options.gaussians, options.sizes, options.repeats, options.preset, options.probes, device, options.by_kernel
         ),
@@ -142,7 +133,7 @@ def _check(options: RasterizerOptions | StepOptions, gaussians: Sequence[int]) -
 
 
 def _report(
-    arguments: list[str],
+    command: list[str],
     options: RasterizerOptions | StepOptions,
     settings: dict[str, int | str | list[int]],
     peers: dict[str, str],
@@ -157,11 +148,11 @@ def _report(
 
     if device.type == "cuda" and pick_rasterizer("auto", device) != "triton":
         raise UserError(f"--device {device}: expected Triton, which is what is timed on a GPU; pip install triton.")
-    path = options.out or default_path(arguments[0], device)
+    path = options.out or default_path(command[0], device)
     require_writable_file(path)
     with threads(options.threads) as count:
         result = Result(
-            benchmark=arguments[0], command=["bench", *arguments], threads=count, settings=settings, peers=peers,
+            benchmark=command[0], command=["bench", *command], threads=count, settings=settings, peers=peers,
             rows=measure(), machine=this_machine(device),
         )  # fmt: skip
     write_result(result, path)

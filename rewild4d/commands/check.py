@@ -1,4 +1,4 @@
-"""`check`: a data set's folder, or a method's contract."""
+"""`check`: verify a data set's folder, or a method's contract."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +10,8 @@ from rewild4d.config import parse_flags
 from rewild4d.contracts import Finding
 from rewild4d.errors import UserError
 
-DESCRIPTION = """Verify a data set's folder (every fault named, not only the first), or that a method keeps its
-contract: same seed same result, save and load same pixels, resume, a clear error on an empty mask."""
+DESCRIPTION = """Verify a data set's folder and list every fault, or verify that a method keeps its contract: the same
+result from the same seed, the same pixels after saving and loading, resuming, a clear error on an empty mask."""
 SIGNS = {"ok": "ok     ", "warning": "warning", "error": "ERROR  "}
 
 
@@ -20,9 +20,9 @@ class CheckChoice:
     """Flags that only `check` has.
 
     Attributes:
-        dataset: whose layout to verify.
-        case: which videos to look at, names or patterns; the first few where it is left out.
-        sheets: folder for contact sheets: pictures of the masks over their frames.
+        dataset: data set to verify.
+        case: names or patterns of the videos to check; the first few where it is left out.
+        sheets: folder for contact sheets, pictures of the masks over their frames.
         method: verify this method instead.
         preset: settings to verify the method with.
     """
@@ -66,7 +66,7 @@ def _check_data(dataset: str, options: Options) -> list[Finding]:
 
 
 def report(findings: list[Finding]) -> int:
-    """Print the findings; 2 where one is an error."""
+    """Print the findings; return 2 where one is an error, else 0."""
     for finding in findings:
         print(f"{SIGNS[finding.level]} {finding.path}: {finding.message}")
     errors = sum(finding.level == "error" for finding in findings)

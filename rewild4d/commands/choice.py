@@ -1,4 +1,4 @@
-"""What the command line makes of a named table: another protocol with its data set, the cases that the data has."""
+"""Apply the command line to a named table: another protocol with its data set, the cases that the data has."""
 
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
@@ -13,7 +13,7 @@ from rewild4d.running import planning
 
 
 def chosen(name: str, spec: Spec, choice: planning.Choice) -> Spec:
-    """The table after the command line's changes; a protocol of another data set brings all cases of that data set.
+    """Apply the command line's changes to a table; a protocol of another data set selects all cases of that data set.
 
     Raises:
         UserError: a preset that no row has, or as `planning.with_choice`.

@@ -1,4 +1,4 @@
-"""`evaluate`: score a saved reconstruction again, by the protocol it was fitted for."""
+"""`evaluate`: score saved reconstructions again, by the protocol that they were fitted for."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ class EvaluateChoice:
 
     Attributes:
         runs: folders of single runs, each with a record.json and a reconstruction.
-        data: where the data is now, if it was moved since.
+        data: folder of the data, where it has moved since the fit.
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]]

@@ -1,4 +1,4 @@
-"""`export`: a saved reconstruction in files that other programs open."""
+"""`export`: write a saved reconstruction as files for other programs."""
 
 import sys
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ from rewild4d.io import KINDS
 from rewild4d.registry import load_method
 
 DESCRIPTION = """Write a run's reconstruction as files for other programs: Gaussians of every frame (ply), an animated
-skinned mesh (glb), cameras (OpenCV axes, JSON) and films (mp4). Of a video that is every frame which shows the animal,
-the held-out ones too."""
+skinned mesh (glb), cameras (OpenCV axes, JSON) and films (mp4). Of a video, all frames that show the animal are
+written, held-out ones too."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Options:
         run: folder of one run, with a record.json and a reconstruction.
         out: folder for the files.
         what: some of ply, glb, cameras and mp4, with commas.
-        data: where the data is now, if it was moved since.
+        data: folder of the data, where it has moved since the fit.
         device: auto, cpu or cuda.
         rasterizer: what renders the films: auto, numba (CPU), triton or gsplat (CUDA), or reference.
     """

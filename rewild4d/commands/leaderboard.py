@@ -1,22 +1,23 @@
-"""`leaderboard`: records of a folder as data for a repository, and as a static page."""
+"""`leaderboard`: collect records for a repository, and build a static page from them."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rewild4d.commands.shared import check_timeout, require_writable
+from rewild4d.commands.shared import call_subcommand, check_timeout, require_writable
 from rewild4d.config import parse_flags
-from rewild4d.errors import UserError, unknown_name
+from rewild4d.errors import UserError
 from rewild4d.leaderboard.specs import load_specs
 
 if TYPE_CHECKING:
     from rewild4d.leaderboard.layout import Table
     from rewild4d.leaderboard.records import RunRecord
 
+USAGE = "usage: rewild4d-bench leaderboard build|collect --runs DIR --out DIR      (... build --help lists options)"
 BUILD = """Make a static page from records alone: a sortable table per protocol, the named tables that have records, and
 a page per run with its settings, provenance, curves over time and pictures. Every folder of runs is a part of its own,
 and its cases are averaged with no others. It opens from the disk."""
@@ -34,7 +35,7 @@ class BuildOptions:
 
     Attributes:
         runs: folders of runs (what `run --out` or `leaderboard collect --out` named), pictures beside the records.
-        out: the page's folder: new, empty, or an earlier page, which is replaced.
+        out: folder of the page: new, empty, or an earlier page, which is replaced.
         preset: of the runs in the named tables; each table's own where it is left out.
         timeout: seconds that ffmpeg may take to read one film.
     """
@@ -50,11 +51,11 @@ class CollectOptions:
     """Flags of `leaderboard collect`.
 
     Attributes:
-        out: the folder: new, empty, or an earlier collection, which is replaced.
+        out: folder of the collection: new, empty, or an earlier collection, which is replaced.
         runs: folders of runs (what `run --out` named).
         title: heading of this part of the page; the name of the folder where it is left out.
-        pictures: of which data: open (a licence that lets them be passed on), all or none.
-        limit_mb: most that all files may take.
+        pictures: keep those of open data (their licence allows redistribution), all or none.
+        limit_mb: largest size of all files together, MB.
         timeout: seconds that ffmpeg may take to read one film and to make it smaller.
     """
 
@@ -67,13 +68,7 @@ class CollectOptions:
 
 
 def main(arguments: list[str]) -> int:
-    if arguments[:1] in (["-h"], ["--help"]) or not arguments:
-        print("usage: rewild4d-bench leaderboard build|collect --runs DIR --out DIR      (... build --help tells more)")
-        return 0 if arguments else 2
-    commands = {"build": build, "collect": collect_runs}
-    if arguments[0] not in commands:
-        raise unknown_name("leaderboard command", arguments[0], commands)
-    return commands[arguments[0]](arguments[1:])
+    return call_subcommand(arguments, USAGE, "leaderboard command", {"build": build, "collect": collect_runs})
 
 
 def build(arguments: list[str]) -> int:
@@ -87,8 +82,9 @@ def build(arguments: list[str]) -> int:
     for folder in options.runs:
         found = find_records(folder)
         parts.append(Part(title_of(folder), found, _named([record for _, record in found], options.preset)))
-    _require_records(options.runs, [part for part in parts if part.found])
-    print(build_site([part for part in parts if part.found], options.out.absolute(), timeout=options.timeout))
+    parts = [part for part in parts if part.found]
+    _require_records(options.runs, parts)
+    print(build_site(parts, options.out.absolute(), timeout=options.timeout))
     return 0
 
 
@@ -106,8 +102,8 @@ def collect_runs(arguments: list[str]) -> int:
         found, out, title=options.title or out.name, pictures=options.pictures, limit=options.limit_mb * 1e6,
         timeout=options.timeout,
     )  # fmt: skip
-    for remark in made.remarks:
-        print(remark, file=sys.stderr)
+    for note in made.remarks:
+        print(note, file=sys.stderr)
     print(f"{made.runs} runs, {made.pictured} of them with pictures, {made.size / 1e6:.1f} MB: {options.out}")
     return 0
 
@@ -118,8 +114,8 @@ def _require_records(folders: tuple[Path, ...], found: Sequence[object]) -> None
 
 
 def _named(records: list[RunRecord], preset: str) -> list[tuple[Table, ...]]:
-    """The named tables that compare something, each with the differences to `REFERENCE`: two rows that are no floors
-    have records under every condition, and not the same ones."""
+    """Make the named tables in which two rows other than lower bounds have different records under every condition,
+    each with the differences to `REFERENCE`."""
     from rewild4d.commands.choice import chosen
     from rewild4d.leaderboard.tables import difference_table, named_table
     from rewild4d.running import planning
@@ -127,11 +123,11 @@ def _named(records: list[RunRecord], preset: str) -> list[tuple[Table, ...]]:
     tables: list[tuple[Table, ...]] = []
     for name, spec in load_specs().items():
         full = chosen(name, spec, planning.Choice(preset=preset))
-        rows, remarks = planning.entrants(name, full, records)
+        rows, notes = planning.entrants(name, full, records)
         whole = [row for row in rows[: len(full.rows)] if all(row.records)]
         if len({frozenset(record.run_id for under in row.records for record in under) for row in whole}) < 2:
             continue
-        frame = replace(planning.frame(name, full), remarks=tuple(remarks))
+        frame = planning.frame(name, full, notes)
         table = named_table(frame, rows, planning.reported(full))
         compared = any(row.label == REFERENCE for row in whole)
         tables.append((table, difference_table(frame, rows, REFERENCE)) if compared else (table,))

@@ -4,11 +4,13 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from rewild4d.commands.shared import call_subcommand
 from rewild4d.config import parse_flags
-from rewild4d.errors import UserError, unknown_name
+from rewild4d.errors import UserError
 
 LONGEST_SIDE = 8192
-"""Of an image in pixels."""
+"""Longest side of an image, pixels."""
+USAGE = "usage: rewild4d-bench make artemis --rig FILE.glb --clip NAME --out DIR [--views 36] [--frames 24]"
 DESCRIPTION = """Render a skinned, animated glTF from a ring of cameras and write it as an Artemis folder: images,
 mattes, cameras, bones and the voxel volume with its skinning weights."""
 
@@ -22,7 +24,7 @@ class Options:
         clip: name of the animation.
         out: the animal's new folder.
         views: cameras around the animal.
-        frames: moments, evenly over the clip.
+        frames: times, evenly spaced over the clip.
         size: width x height in pixels.
     """
 
@@ -35,12 +37,11 @@ class Options:
 
 
 def main(arguments: list[str]) -> int:
-    if arguments[:1] in (["-h"], ["--help"]) or not arguments:
-        print("usage: rewild4d-bench make artemis --rig FILE.glb --clip NAME --out DIR [--views 36] [--frames 24]")
-        return 0 if arguments else 2
-    if arguments[0] != "artemis":
-        raise unknown_name("kind of data set to make", arguments[0], ["artemis"])
-    options = parse_flags(Options, arguments[1:], prog="rewild4d-bench make artemis", description=DESCRIPTION)
+    return call_subcommand(arguments, USAGE, "kind of data set to make", {"artemis": _make_artemis})
+
+
+def _make_artemis(arguments: list[str]) -> int:
+    options = parse_flags(Options, arguments, prog="rewild4d-bench make artemis", description=DESCRIPTION)
     width, height = parse_size(options.size)
     for flag, value in (("--views", options.views), ("--frames", options.frames)):
         if value < 1:
@@ -62,7 +63,7 @@ def parse_size(text: str) -> tuple[int, int]:
     """Return the width and height of "640x360".
 
     Raises:
-        UserError: anything else, or a side that is too short or too long.
+        UserError: another form, or a side of less than 16 or more than `LONGEST_SIDE` pixels.
     """
     match = re.fullmatch(r"(\d{1,6})x(\d{1,6})", text)
     if match is None or not all(16 <= int(side) <= LONGEST_SIDE for side in match.groups()):

@@ -1,4 +1,4 @@
-"""`masks`: masks of the animal for a video that has none."""
+"""`masks`: make masks of the animal for a video without masks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """Make masks of the animal. --tool program runs any command that reads a folder of frames and writes a
 folder of masks; --tool grounded-sam2 uses Grounding DINO and SAM 2 (pip install -e '.[masks]'; their weights are on
-Hugging Face); --tool rough is GrabCut from a box: it works offline and is rough, as its name says."""
+Hugging Face); --tool rough is GrabCut from a box, offline and inexact."""
 TOOLS = ("rough", "program", "grounded-sam2")
 
 
@@ -35,13 +35,13 @@ class Options:
         dataset: online, or aptv2, whose boxes are used.
         data: the data set's folder.
         case: names or patterns of cases; all where it is left out.
-        start: seconds from where on frames are used.
-        end: seconds up to which they are used.
-        fps: how many of them a second.
+        start: time of the first frame that is used, seconds.
+        end: time of the last frame that is used, seconds.
+        fps: frames per second that are used.
         box: around the animal, in pixels: left,top,width,height in the first frame; more of them as frame:left,...
         command: for program: a command line with {frames} and {masks} (and {boxes}) in it.
         timeout: for program: seconds that it may take; then it is killed with all that it started.
-        text: for grounded-sam2: what the animal is called.
+        text: for grounded-sam2: name of the animal, such as "dog".
         detector: for grounded-sam2: name or folder of a Grounding DINO model.
         segmenter: for grounded-sam2: name or folder of a SAM 2 model.
         device: auto, cpu or cuda.
@@ -91,7 +91,7 @@ def main(arguments: list[str]) -> int:
         print(f"{folder}: {len(paths)} masks by '{options.tool}', {empty} of them without the animal")
         if older := set(list_images(folder)) - set(paths):
             print(f"{folder}: it holds {len(older)} other masks, which readers take too: remove them?", file=sys.stderr)
-    print("look at them before you use them: rewild4d-bench check with --masks draws a contact sheet", file=sys.stderr)
+    print("check the masks before use: rewild4d-bench check with --masks draws a contact sheet", file=sys.stderr)
     return 0
 
 
@@ -99,7 +99,7 @@ def make_maker(options: Options, device: torch.device) -> MaskMaker:
     """Return the maker that `--tool` names.
 
     Raises:
-        UserError: an unknown one, or one that lacks a command or a package.
+        UserError: an unknown tool, or one that lacks a command or a package.
     """
     from rewild4d.datasets.masking.grabcut import rough_masks
     from rewild4d.datasets.masking.grounded_sam import grounded_masks

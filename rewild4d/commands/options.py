@@ -10,17 +10,17 @@ from rewild4d.contracts import Parts
 
 @dataclass(frozen=True, kw_only=True)
 class DataFlags:
-    """Flags that say which data is read.
+    """Flags of the data.
 
     Attributes:
         data: one animal's folder or a folder of animals; the built-in animals where it is left out.
         video: the same as --data, for a video file or a folder of frames (--dataset online).
-        masks: of the animal: a folder or, for online, a video; in place of the data set's own where it has some.
-        parts: of masks in several parts: all, or main, the one that goes on from the frame before; where left out,
-            main if many masks took in a second animal that stands apart (auto).
-        start: first second of the video that is used.
-        end: last second of the video that is used.
-        fps: frames per second that are used; of a folder of frames the rate at which it was taken.
+        masks: of the animal: a folder or, for online, a video; instead of the data set's own.
+        parts: of masks in several parts: all, or main, the one that continues the frame before; where left out (auto),
+            main if many masks hold a second animal apart from the first.
+        start: time of the first frame that is used, seconds.
+        end: time of the last frame that is used, seconds.
+        fps: frames per second that are used; of a folder of frames, the rate of its recording.
     """
 
     data: Path | None = None
@@ -34,7 +34,7 @@ class DataFlags:
 
 @dataclass(frozen=True, kw_only=True)
 class ComputeFlags:
-    """Flags that say what computes.
+    """Flags of devices and kernels.
 
     Attributes:
         device: auto, cpu or cuda.
@@ -56,8 +56,8 @@ class RunFlags(ComputeFlags, DataFlags):
 
     Attributes:
         jobs: runs at a time (a case, a method and a seed each); 0 is one for each processor core (one in all on a GPU).
-        threads: of torch in each run; other numbers than 1 may change the last digits. Our own kernels take idle cores
-            unasked, which changes nothing but the time.
+        threads: of torch in each run; other numbers than 1 may change the last digits. Fused kernels use idle cores
+            too, without changing results.
         out: folder for runs.
     """
 

@@ -1,4 +1,4 @@
-"""`list`: methods, data sets, protocols, presets and tables."""
+"""`list`: print methods, data sets, protocols, presets and tables."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ def main(arguments: list[str]) -> int:
     parse_flags(Options, arguments, prog="rewild4d-bench list", description="List all that can be named in a run.")
     print("methods")
     for name in names("methods"):
-        print(f"  {name:<12} {_said(_method, name)}")
+        print(f"  {name:<12} {_described(_method, name)}")
         if presets := ", ".join(preset_names(name)):
             print(f"  {'':<12} presets: {presets}")
     print("data sets")
     for name in names("datasets"):
         made = "; built-in animals are made where --data is left out" if name in BUILTIN else ""
-        print(f"  {name:<12} {_said(dataset_title, name)}{made}")
+        print(f"  {name:<12} {_described(dataset_title, name)}{made}")
     print("protocols")
     protocols = load_protocols()
     for name, protocol in protocols.items():
@@ -37,8 +37,8 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def _said(describe: Callable[[str], str], name: str) -> str:
-    """Return a line on what a name stands for; a package that cannot be imported must not hide the others."""
+def _described(describe: Callable[[str], str], name: str) -> str:
+    """Describe a name, or say that its package cannot be imported."""
     try:
         return describe(name)
     except UserError as error:

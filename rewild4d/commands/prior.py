@@ -1,4 +1,4 @@
-"""`prior fit` and `prior import`: a posed template for real footage, as an npz and as pictures to judge it by."""
+"""`prior fit` and `prior import`: a posed template for real footage, as an npz and as overlays to check it by."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rewild4d.commands.shared import require_writable_file
+from rewild4d.commands.shared import call_subcommand, require_writable_file
 from rewild4d.config import parse_flags
 from rewild4d.contracts import Parts, Selection
-from rewild4d.errors import UserError, unknown_name
+from rewild4d.errors import UserError
 from rewild4d.priors.config import FOOTAGE, Use
 
 if TYPE_CHECKING:
@@ -19,11 +19,12 @@ if TYPE_CHECKING:
 
 USAGE = """usage: rewild4d-bench prior fit --frames DIR --masks DIR --out prior.npz [--keypoints FILE --mapping NAME]
        rewild4d-bench prior import --files DIR --out prior.npz"""
-DESCRIPTION = """Fit the quadruped template to masked frames whose cameras nobody knows; write the prior and an overlay
+DESCRIPTION = """Fit the quadruped template to masked frames of unknown cameras; write the prior and an overlay
 (<out>.png and <out>.mp4): mask green, template magenta, agreement grey, left legs orange, right legs blue, head red."""
-IMPORT = """Read what 3D-Fauna's test run wrote (<step>_<frame>_mesh.obj, _pose.txt, _arti_params.txt) as a prior."""
+IMPORT = """Import the output of a test run of 3D-Fauna, <step>_<frame>_mesh.obj, _pose.txt, _arti_params.txt, as a
+prior."""
 WHOLE = Selection(cameras="unknown", size=256, framing="crop", split=5)
-"""What a reader is asked with for its cases; frames are taken whole and none is held out."""
+"""Selection that names the cases of a reader; frames are used whole and none is held out."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class FitOptions:
         parts: as for `run`.
         out: the npz to write.
         keypoints: BADJA or COCO-like .json, DeepLabCut or SLEAP .csv.
-        mapping: which keypoint is which point of the template: aptv2, badja, superanimal-quadruped or a .toml file.
+        mapping: from names of keypoints to points of the template: aptv2, badja, superanimal-quadruped or a .toml file.
         use: frames whose keypoints the fit sees: all; every other one (the rest is scored); none (all are scored).
         fps: frames per second as for `run`: DAVIS has 24, other folders 25 where it is left out, videos their own.
         seed: of the fit.
@@ -61,7 +62,7 @@ class ImportOptions:
         files: 3D-Fauna's result folder.
         out: the npz to write.
         flip: result folder of the horizontally flipped images; mirror images of the others where it is left out.
-        boxes: folder of <frame>_box.txt, which say where the crops lie in the frames; without it cameras are for crops.
+        boxes: folder of <frame>_box.txt, the crops' boxes in the frames; without it cameras are those of the crops.
         size: side of the crops in pixels.
         fps: frames per second.
     """
@@ -75,22 +76,11 @@ class ImportOptions:
 
 
 def main(arguments: list[str]) -> int:
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(USAGE)
-        return 0 if arguments else 2
-    if arguments[0] not in ("fit", "import"):
-        raise unknown_name("kind of prior command", arguments[0], ["fit", "import"])
-    prog = f"rewild4d-bench prior {arguments[0]}"
-    if arguments[0] == "import":
-        chosen = parse_flags(ImportOptions, arguments[1:], prog=prog, description=IMPORT)
-        _import(chosen)
-        return 0
-    options = parse_flags(FitOptions, arguments[1:], prog=prog, description=DESCRIPTION)
-    _fit(options)
-    return 0
+    return call_subcommand(arguments, USAGE, "kind of prior command", {"fit": _fit, "import": _import})
 
 
-def _import(options: ImportOptions) -> None:
+def _import(arguments: list[str]) -> int:
+    options = parse_flags(ImportOptions, arguments, prog="rewild4d-bench prior import", description=IMPORT)
     from rewild4d.priors.fauna import read_fauna
     from rewild4d.priors.fauna_files import LARGEST
     from rewild4d.priors.io import save_prior
@@ -101,10 +91,11 @@ def _import(options: ImportOptions) -> None:
         raise UserError(f"--size: expected 1 to {LARGEST} pixels, got {options.size}.")
     prior = read_fauna(options.files, flip=options.flip, boxes=options.boxes, size=options.size, fps=options.fps)
     save_prior(prior, options.out)
-    _tell(prior, [options.out])
+    return _report(prior, [options.out])
 
 
-def _fit(options: FitOptions) -> None:
+def _fit(arguments: list[str]) -> int:
+    options = parse_flags(FitOptions, arguments, prog="rewild4d-bench prior fit", description=DESCRIPTION)
     if (options.keypoints is None) != (options.mapping is None):
         raise UserError("--keypoints and --mapping: expected both or neither.")
     from rewild4d.datasets.video.online import Online
@@ -129,14 +120,14 @@ def _fit(options: FitOptions) -> None:
     given, scored = split_marks(_marks(options, clip, mapping), options.use)
     require_writable_file(options.out)
     progress = Progress(f"prior: {options.frames}")
-    said = Evidence(given, clip.travel)
-    prior = fit_footage(clip, config=FOOTAGE, seed=options.seed, log=progress, said=said)
+    evidence = Evidence(given, clip.travel)
+    prior = fit_footage(clip, config=FOOTAGE, seed=options.seed, log=progress, said=evidence)
     progress.close()
     if scored is not None:
         prior = seal(replace(prior, quality=prior.quality | joint_scores(prior, clip.frames, scored)))
     pictures = save_overlay(clip, prior, options.out)
     save_prior(resized(prior, *video.size), options.out)
-    _tell(prior, [options.out, *pictures])
+    return _report(prior, [options.out, *pictures])
 
 
 def _marks(options: FitOptions, clip: Clip, mapping: dict[str, str]) -> Marks:
@@ -153,7 +144,7 @@ def _marks(options: FitOptions, clip: Clip, mapping: dict[str, str]) -> Marks:
     return result
 
 
-def _tell(prior: Prior, written: list[Path]) -> None:
+def _report(prior: Prior, written: list[Path]) -> int:
     from rewild4d.priors.judge import doubts
     from rewild4d.priors.steady import without_hops
 
@@ -166,3 +157,4 @@ def _tell(prior: Prior, written: list[Path]) -> None:
         print(f"warning: {doubt}; look at the overlay", file=sys.stderr)
     for path in written:
         print(path)
+    return 0

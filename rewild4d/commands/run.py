@@ -1,4 +1,4 @@
-"""`run`: fit a method on a data set and score it on views it never saw."""
+"""`run`: fit a method on a data set and score it on held-out views."""
 
 from __future__ import annotations
 
@@ -8,15 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rewild4d.commands.options import RunFlags
-from rewild4d.commands.shared import (
-    check_numbers,
-    check_seeds,
-    choose_prior,
-    exit_code,
-    floor_entry,
-    open_dataset,
-    require_writable,
-)
+from rewild4d.commands.shared import check_numbers, choose_prior, exit_code, lower_bounds, open_dataset, plan_fields
 from rewild4d.config import load_preset, parse_flags
 from rewild4d.errors import UserError
 from rewild4d.evaluation.protocol import find_protocol
@@ -29,7 +21,7 @@ if TYPE_CHECKING:
     from rewild4d.leaderboard.records import RunRecord
     from rewild4d.running.runner import Plan
 
-DESCRIPTION = """Fit a method on every case of a data set and score it on the views that it never saw.
+DESCRIPTION = """Fit a method on every case of a data set and score it on held-out views.
 Finished runs are skipped and a killed one resumes. Without --data the built-in animals are made on first use.
 `run --table NAME` runs all that a table needs instead; its flags: `run --table NAME --help`."""
 
@@ -40,19 +32,19 @@ class RunChoice:
 
     Attributes:
         method: which method (see `list`).
-        dataset: which data set's layout (see `list`).
+        dataset: which data set (see `list`).
         case: names or patterns of cases ("wolf/Run", "wolf/*"); all (of real videos: quadrupeds) where it is left out.
         protocol: what is held out and measured (see `list`); the data set's default where it is left out.
-        preset: size of the effort: quick, standard or paper; of `ours` also beyond, standard with what is better than
-            the paper's rules where cameras are known.
+        preset: settings and length of the fit: quick, standard or paper; of `ours` also beyond, which is standard with
+            terms that the paper does not have, for known cameras.
         seeds: one run for each.
-        prior: "template" (fitted to the clip), "coarse:<noise>" (from the truth plus noise: for studies), "rig" (the
-            data set's own shape and skeleton: a bound) or a file (of real videos: what `prior fit` or `prior import`
-            wrote).
+        prior: "template" (fitted to the clip), "coarse:<noise>" (from the truth plus noise, for studies), "rig" (the
+            data set's own shape and skeleton, an upper bound) or a file (of a real video, by `prior fit` or `prior
+            import`).
         keypoints: of a real video (davis, online): BADJA or COCO-like .json, DeepLabCut or SLEAP .csv.
-        mapping: which keypoint is which point of the template: aptv2, badja, superanimal-quadruped or a .toml file.
+        mapping: from names of keypoints to points of the template: aptv2, badja, superanimal-quadruped or a .toml file.
         use_keypoints: frames whose keypoints the prior's fit sees: all; half (the rest is scored); none (all are
-            scored). Where it is left out: all of aptv2's and of a file's, none of BADJA's beside davis.
+            scored). Where it is left out: all of aptv2 and of a file, none of BADJA beside davis.
     """
 
     method: str = "ours"
@@ -106,27 +98,18 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
     """
     require_name("datasets", options.dataset)
     protocol = find_protocol(options.dataset, options.protocol)
-    check_numbers(options.jobs, options.threads)
+    check_numbers(options)
     if not options.seeds:
         raise UserError("--seeds: expected at least one number, got none.")
-    check_seeds(options.seeds)
-    from rewild4d.kernels.switch import choose_kernels
-    from rewild4d.machine import pick_device
-    from rewild4d.rasterizer import pick_rasterizer
     from rewild4d.running.runner import Entry, Plan, choose_cases
-    from rewild4d.running.workers import usable_cores
 
-    choose_kernels(options.kernels)
-    device = pick_device(options.device)
-    rasterizer = pick_rasterizer(options.rasterizer, device)
-    require_writable(options.out)
+    chosen = plan_fields(options)
     root, reader = open_dataset(options.dataset, options.data, options)
     names = reader.cases(protocol.selection)
     preferred = getattr(reader, "default_cases", None)
     cases = choose_cases(names, options.case or (preferred(protocol.selection) if preferred else ()))
     if require := getattr(load_method(options.method), "require", None):
         require(config, cases)
-    floors = [floor_entry(name) for name in protocol.floors if name != options.method]
     entry = Entry(options.method, options.preset, config, tuple(dict.fromkeys(options.seeds)))
     prior = choose_prior(options.prior, options.preset, reader, options)
     return Plan(
@@ -135,18 +118,14 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
         root=root,
         cases=cases,
         protocol=protocol,
-        entries=(*floors, entry),
+        entries=(*lower_bounds(protocol, (options.method,)), entry),
         prior=prior,
-        device=device,
-        out=options.out.absolute(),
-        jobs=options.jobs or usable_cores(device),
-        threads=options.threads,
-        rasterizer=rasterizer,
+        **chosen,
     )
 
 
 def _peek(arguments: list[str], flag: str) -> str | None:
-    """The value of a flag before the flags are parsed: the method and the preset decide which flags there are."""
+    """Return the value of a flag before flags are parsed: method and preset decide which flags there are."""
     for i, word in enumerate(arguments):
         if word == flag and i + 1 < len(arguments):
             return arguments[i + 1]
@@ -156,15 +135,12 @@ def _peek(arguments: list[str], flag: str) -> str | None:
 
 
 def _print_pictures(records: list[RunRecord], options: Options) -> None:
+    from rewild4d.running.runner import run_folder
+
     print()
     for record in records:
         if record.pictures and record.method == options.method:
-            folder = record_folder(options.out, record)
+            run = record.method, record.preset, record.seed, record.run_id
+            folder = run_folder(options.out, record.protocol["name"], record.case, *run)
             print(f"{record.case}, seed {record.seed}:", *(folder / name for name in record.pictures), sep="\n  ")
     print(f"\nrecords: {options.out}", file=sys.stderr)
-
-
-def record_folder(out: Path, record: RunRecord) -> Path:
-    """Return where the runner put a record."""
-    run = f"{record.method}-{record.preset}-seed{record.seed}-{record.run_id[:8]}"
-    return out / record.protocol["name"] / record.case.replace("/", "__") / run

@@ -4,21 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import msgspec
 
 from rewild4d.commands.options import RunFlags
-from rewild4d.commands.shared import (
-    check_numbers,
-    check_seeds,
-    choose_prior,
-    exit_code,
-    floor_entry,
-    open_dataset,
-    require_writable,
-)
+from rewild4d.commands.shared import check_numbers, choose_prior, exit_code, lower_bounds, open_dataset, plan_fields
 from rewild4d.config import parse_flags
 from rewild4d.contracts import DatasetReader
 from rewild4d.errors import UserError
@@ -40,10 +32,10 @@ class TableChoice:
     """Flags that only `run --table` has.
 
     Attributes:
-        table: which one.
-        case: names or patterns of cases ("wolf/Run", "wolf/*"); all that the table wants where it is left out.
-        protocol: instead of the table's, where it has one condition; one of another data set brings that data set.
-        preset: size of the effort: quick, standard or paper; the table's where it is left out.
+        table: name of the table (see `list`).
+        case: names or patterns of cases ("wolf/Run", "wolf/*"); all of the table where it is left out.
+        protocol: instead of the table's, where it has one condition; one of another data set selects that data set.
+        preset: settings and length of the fits: quick, standard or paper; the table's where it is left out.
         seeds: one run for each; the table's where they are left out.
         plan: print what would be run, and run nothing.
     """
@@ -63,8 +55,8 @@ class Options(RunFlags, TableChoice):
 
 def main(arguments: list[str]) -> int:
     """Run the command; 0 where every run has scores, 1 where one failed, 2 where a case cannot be read."""
-    place = arguments.index("--table") if "--table" in arguments else None
-    if place is not None and (place + 1 == len(arguments) or arguments[place + 1].startswith("--")):
+    index = arguments.index("--table") if "--table" in arguments else None
+    if index is not None and (index + 1 == len(arguments) or arguments[index + 1].startswith("--")):
         if "--help" not in arguments:
             raise UserError(f"--table: expected the name of a table, got none; available: {', '.join(load_specs())}.")
         arguments = ["--help"]
@@ -98,51 +90,40 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
     Raises:
         UserError: an unknown name, or a folder that is not there or cannot be written.
     """
-    check_numbers(options.jobs, options.threads)
-    check_seeds(options.seeds)
+    check_numbers(options)
     require_name("datasets", spec.dataset)
-    from rewild4d.kernels.switch import choose_kernels
-    from rewild4d.machine import pick_device
-    from rewild4d.rasterizer import pick_rasterizer
     from rewild4d.running import planning
     from rewild4d.running.runner import Plan
-    from rewild4d.running.workers import usable_cores
 
-    choose_kernels(options.kernels)
-    device = pick_device(options.device)
-    rasterizer = pick_rasterizer(options.rasterizer, device)
     protocols = {one.protocol: find_protocol(spec.dataset, one.protocol) for one in spec.conditions}
     entries = planning.entries(options.table, spec, tuple(dict.fromkeys(options.seeds or spec.seeds)))
-    require_writable(options.out)
+    chosen = plan_fields(options)
     root, reader = open_dataset(spec.dataset, options.data, options)
     plans = []
     for (name, prior), patterns in planning.cases_of_conditions(spec).items():
         protocol = protocols[name]
         cases = _cases(options, reader, protocol, patterns)
-        own = {entry.method for entry in entries}
-        floors = [floor_entry(floor) for floor in protocol.floors if floor not in own]
+        floors = lower_bounds(protocol, [entry.method for entry in entries])
         plans.append(
             Plan(
                 dataset=spec.dataset, reader=reader, root=root, cases=cases, protocol=protocol,
-                entries=(*floors, *entries), prior=choose_prior(prior, spec.preset, reader), device=device,
-                out=options.out.absolute(), jobs=options.jobs or usable_cores(device), threads=options.threads,
-                rasterizer=rasterizer,
+                entries=(*floors, *entries), prior=choose_prior(prior, spec.preset, reader), **chosen,
             )
         )  # fmt: skip
     return plans
 
 
 def _cases(options: Options, reader: DatasetReader, protocol: Protocol, patterns: Sequence[str]) -> tuple[str, ...]:
-    """Return what the table wants and the data has; where the table wants all, what `run` takes by itself."""
+    """Return the cases of the table that the data has; where the table names none, the default cases of the data."""
     from rewild4d.commands.choice import cases_of
     from rewild4d.running.runner import choose_cases
 
     preferred = getattr(reader, "default_cases", None)
     free = not patterns and not options.case
     names = preferred(protocol.selection) if preferred and free else reader.cases(protocol.selection)
-    found, remark = cases_of(options.table, names, patterns)
-    if remark:
-        print(remark, file=sys.stderr)
+    found, note = cases_of(options.table, names, patterns)
+    if note:
+        print(note, file=sys.stderr)
     return choose_cases(found, options.case)
 
 
@@ -150,13 +131,12 @@ def _table(options: Options, spec: Spec, records: list[RunRecord]) -> Table:
     from rewild4d.leaderboard.tables import named_table
     from rewild4d.running import planning
 
-    rows, remarks = planning.entrants(options.table, spec, records)
-    frame = replace(planning.frame(options.table, spec), remarks=tuple(remarks))
-    return named_table(frame, rows, planning.reported(spec))
+    rows, notes = planning.entrants(options.table, spec, records)
+    return named_table(planning.frame(options.table, spec, notes), rows, planning.reported(spec))
 
 
 def _print_plan(plan: Plan, labels: dict[str, str]) -> None:
-    """One line a run: whether it has a good record, its row, its folder."""
+    """Print a line for each run: whether it has a good record, its row, its folder."""
     from rewild4d.running.runner import list_jobs
 
     for job in list_jobs(plan):

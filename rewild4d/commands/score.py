@@ -1,7 +1,8 @@
-"""`score`: the metrics on anybody's results, without our methods."""
+"""`score`: compute metrics of any results, made by any program."""
 
 from __future__ import annotations
 
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -14,7 +15,6 @@ from rewild4d.files import write_text
 if TYPE_CHECKING:
     from rewild4d.evaluation.reports import Report
     from rewild4d.metrics.samples import Progress as ShowProgress
-    from rewild4d.progress import Progress
 
 DESCRIPTION = """Score a folder of images or clips, or a .ply file, against the truth. Images are matched by file name,
 clips (subfolders of frames, or videos) by their own; nothing is resized or cropped."""
@@ -33,9 +33,9 @@ class Options:
         pair: by name, or in sorted order where predictions and truths share no name: name or order.
         unpaired: the predictions are of other views than the truths: only KID, FVD and KVD.
         only: what to compute: psnr ssim lpips-alex lpips-vgg silhouette kid fvd; all where it is left out.
-        fps: of clips whose files do not say it, for the record.
-        up: axis that points up in both .ply files, for the alignment's starts: y or z; unknown where it is left out.
-        points: that are sampled on a mesh or on Gaussians in a .ply file, or drawn from a larger cloud.
+        fps: of clips whose files do not name it, for the record.
+        up: axis that points up in both .ply files, for the initial alignments: y or z; unknown where it is left out.
+        points: number of points that are sampled on a mesh or on Gaussians, or drawn from a larger cloud.
         device: auto, cpu or cuda.
         out: file for the scores as JSON, with every image's value, the machine and the versions.
         json: print the same JSON, and nothing else, to standard output.
@@ -71,7 +71,7 @@ def main(arguments: list[str]) -> int:
 
 
 def score(options: Options) -> Report:
-    """Check the flags and compare what they name.
+    """Check the flags and score the files that they name.
 
     Raises:
         UserError: a value out of range, a name that is unknown, or a path that cannot be used.
@@ -81,6 +81,7 @@ def score(options: Options) -> Report:
     from rewild4d.evaluation.networks import FAMILIES, load_networks
     from rewild4d.evaluation.pairing import Inputs
     from rewild4d.machine import pick_device
+    from rewild4d.progress import Progress
 
     device = pick_device(options.device)
     clouds = [path.suffix.lower() == ".ply" for path in (options.pred, options.truth)]
@@ -102,8 +103,14 @@ def score(options: Options) -> Report:
     families = options.only or FAMILIES
     if options.unpaired and not {"kid", "fvd"} & {*families}:
         raise UserError(f"--unpaired: expected kid or fvd among --only, got {' '.join(families)}.")
-    bar = _Bar()
-    try:
+    shown = ExitStack()
+
+    def begin(title: str) -> ShowProgress:
+        """Replace the progress bar by the next one."""
+        shown.close()
+        return shown.enter_context(closing(Progress(title)))
+
+    with shown:
         return score_pictures(
             Inputs(options.pred, options.truth, options.masks, options.pred_masks, options.pair == "order"),
             networks=load_networks(families, device),
@@ -112,26 +119,5 @@ def score(options: Options) -> Report:
             fps=options.fps,
             paired=not options.unpaired,
             device=device,
-            stage=bar.begin,
+            stage=begin,
         )
-    finally:
-        bar.close()
-
-
-class _Bar:
-    """One progress bar at a time on standard error."""
-
-    def __init__(self) -> None:
-        self.shown: Progress | None = None
-
-    def begin(self, title: str) -> ShowProgress:
-        from rewild4d.progress import Progress
-
-        self.close()
-        self.shown = Progress(title)
-        return self.shown
-
-    def close(self) -> None:
-        if self.shown is not None:
-            self.shown.close()
-            self.shown = None

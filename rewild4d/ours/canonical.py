@@ -1,6 +1,7 @@
 """Canonical Gaussians: their start from a surface, and their activated values."""
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor, nn
@@ -44,6 +45,11 @@ class Gaussians(nn.Module):
             self.register_parameter(name, nn.Parameter(values[name].detach().clone().float().contiguous()))
         self.max_log_scale = math.log(max_scale * OBJECT_DIAGONAL)
         self.register_buffer("blur", torch.zeros(()))
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Tensor], max_scale: float) -> "Gaussians":
+        """Restore the attributes from the state of a model whose attribute ``gaussians`` they were; not the blur."""
+        return cls({name: state[f"gaussians.{name}"] for name in NAMES}, max_scale)
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -101,8 +107,12 @@ class Gaussians(nn.Module):
     def splats(self) -> Splats:
         """Return the canonical Gaussians, activated, detached."""
         with torch.no_grad():
-            quats = normalize(self.quats, dim=-1)
-            return Splats(self.means, quats, self.scales(self.scales_log()), self.opacities(), self.splat_colors(quats))
+            return self.splats_at(self.means, self.quats, self.scales(self.scales_log()))
+
+    def splats_at(self, means: Tensor, quats: Tensor, scales: Tensor) -> Splats:
+        """Return posed Gaussians with the canonical opacities and colours; ``quats`` are normalised."""
+        quats = normalize(quats, dim=-1)
+        return Splats(means, quats, scales, self.opacities(), self.splat_colors(quats))
 
 
 def initial_gaussians(
@@ -132,12 +142,19 @@ def initial_gaussians(
         means = low + (high - low) * torch.rand(count, 3, generator=generator)
         quats = normalize(torch.randn(count, 4, generator=generator), dim=-1)
         scales = 0.5 * ((high - low).prod() / count) ** (1 / 3) * torch.ones(3)
-    colors = torch.zeros(count, (config.sh_degree + 1) ** 2, 3)
-    colors[:, 0] = 0.5
+    return attributes(means, quats, scales.log().expand(count, 3), 0.5, config)
+
+
+def attributes(
+    means: Tensor, quats: Tensor, log_scales: Tensor, rgb: Tensor | float, config: Canonical
+) -> dict[str, Tensor]:
+    """Return the five attributes of `Gaussians` by name, for centres [n, 3] of equal opacity and colours [n, 3]."""
+    colors = torch.zeros(len(means), (config.sh_degree + 1) ** 2, 3)
+    colors[:, 0] = rgb
     return {
         "means": means,
         "quats": quats,
-        "log_scales": scales.log().expand(count, 3),
-        "logit_opacities": torch.full((count,), math.log(config.opacity / (1 - config.opacity))),
+        "log_scales": log_scales,
+        "logit_opacities": torch.full((len(means),), math.log(config.opacity / (1 - config.opacity))),
         "colors": colors,
     }

@@ -1,17 +1,20 @@
-"""Checkpoints: the full state of a fit, written atomically, tied to its inputs."""
+"""Checkpoints, the full state of a fit tied to its inputs, and saved reconstructions; both are written atomically."""
 
 import logging
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import torch
 
-from rewild4d.files import digest, load_tensors, save_tensors
+from rewild4d.errors import UserError
+from rewild4d.files import atomic, digest, load_tensors, save_tensors
+from rewild4d.texts import read_json
 from rewild4d.types import Clip, Prior
 
 logger = logging.getLogger(__name__)
-NAME = "checkpoint.pt"
+NAME, CONFIG = "checkpoint.pt", "config.json"
+C = TypeVar("C", bound=msgspec.Struct)
 
 
 def fit_digest(config: msgspec.Struct, clip: Clip, prior: Prior, seed: int) -> str:
@@ -20,7 +23,7 @@ def fit_digest(config: msgspec.Struct, clip: Clip, prior: Prior, seed: int) -> s
 
 
 def save_checkpoint(folder: Path, identity: str, state: dict[str, Any]) -> None:
-    """Write the state to ``folder``/checkpoint.pt; a kill at any moment leaves the previous one."""
+    """Write the state to ``folder``/checkpoint.pt; a kill at any time leaves the previous one."""
     save_tensors({"digest": identity, "state": state}, folder / NAME)
 
 
@@ -33,3 +36,23 @@ def load_checkpoint(folder: Path | None, identity: str) -> dict[str, Any] | None
         logger.warning("%s: is of another configuration, clip, prior or seed; starting anew.", path)
         return None
     return content["state"]
+
+
+def save_fitted(folder: Path, name: str, state: dict[str, Any], config: msgspec.Struct) -> None:
+    """Write the state of a reconstruction to the file ``name`` of an existing folder, and its settings beside it."""
+    save_tensors(state, folder / name)
+    with atomic(folder / CONFIG) as path:
+        path.write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=2))
+
+
+def load_fitted(folder: Path, name: str, method: str, config_type: type[C]) -> tuple[dict[str, Any], C]:
+    """Read what `save_fitted` wrote for a method.
+
+    Raises:
+        UserError: a file is missing, or is not what `save_fitted` writes for this method.
+    """
+    for file in (name, CONFIG):
+        if not (folder / file).is_file():
+            raise UserError(f"{folder}: expected a reconstruction by '{method}', but it has no {file}.")
+    config = read_json(folder / CONFIG, f"a reconstruction by '{method}'", config_type)
+    return load_tensors(folder / name), config

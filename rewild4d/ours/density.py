@@ -1,7 +1,10 @@
 """Densification and pruning with a cap (METHOD section 6): clone small, split large, drop faint or huge Gaussians."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
+from torch.optim import Optimizer
 
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.config import Density
@@ -23,6 +26,14 @@ class DensityControl:
         self.config = config
         self.gradient, self.seen, self.radius = (torch.zeros(count, device=device) for _ in range(3))
 
+    def state(self) -> list[Tensor]:
+        """Return what `restore` takes."""
+        return [self.gradient, self.seen, self.radius]
+
+    def restore(self, state: Sequence[Tensor]) -> None:
+        """Continue from `state`; the number of Gaussians may differ from the present one."""
+        self.gradient, self.seen, self.radius = (part.to(self.gradient.device).clone() for part in state)
+
     def observe(self, info: RasterInfo, side: float, longest: int) -> None:
         """Add one view after its backward pass; ``side`` is the animal's box, ``longest`` the image's side, pixels."""
         assert info.means2d.grad is not None, "observe comes after backward"
@@ -33,8 +44,25 @@ class DensityControl:
         self.seen += drawn
         self.radius = torch.maximum(self.radius, radii / longest)
 
+    def round_if_due(
+        self, index: int, total: int, gaussians: Gaussians, optimizer: Optimizer, generator: torch.Generator
+    ) -> bool:
+        """Densify and prune after the iterations that the schedule names; tell whether it did.
+
+        Raises:
+            FloatingPointError: no Gaussian is left.
+        """
+        config = self.config
+        every = max(1, round(config.every * total))
+        if not config.start * total <= index < config.end * total or (index + 1) % every:
+            return False
+        self.round(gaussians, optimizer, generator)
+        if len(gaussians) == 0:
+            raise FloatingPointError(f"iteration {index}: no Gaussian is left; every opacity fell below the limit")
+        return True
+
     @torch.no_grad()
-    def round(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer, generator: torch.Generator) -> None:
+    def round(self, gaussians: Gaussians, optimizer: Optimizer, generator: torch.Generator) -> None:
         """Refine where the mean gradient is large, as many as the cap allows, then prune; reset the statistics."""
         config = self.config
         mean = self.gradient / self.seen.clamp_min(1)
@@ -61,7 +89,7 @@ class DensityControl:
 
 
 def replace_gaussians(
-    gaussians: Gaussians, optimizer: torch.optim.Optimizer, values: dict[str, Tensor], source: Tensor, kept: int
+    gaussians: Gaussians, optimizer: Optimizer, values: dict[str, Tensor], source: Tensor, kept: int
 ) -> None:
     """Replace the learnable tensors by ``values``, whose rows come from the old rows ``source``.
 

@@ -1,22 +1,19 @@
 """Training loop: warm-up, then the stage-aware losses of METHOD section 6."""
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from rewild4d.contracts import Log
 from rewild4d.kernels.threads import torch_on_one
-from rewild4d.ours.canonical import NAMES
-from rewild4d.ours.checkpoint import fit_digest, load_checkpoint, save_checkpoint
+from rewild4d.ours.checkpoint import fit_digest, load_checkpoint
 from rewild4d.ours.coloring import initial_colors
 from rewild4d.ours.config import Config
 from rewild4d.ours.deform import Posed
-from rewild4d.ours.density import DensityControl
-from rewild4d.ours.gradients import all_finite, clip_gradients
+from rewild4d.ours.gradients import all_finite, clip_gradients, require_finite
 from rewild4d.ours.losses.images import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.losses.regularizers import compact_loss, neighbours, rigid_loss, smooth_loss
 from rewild4d.ours.losses.skeleton import neighbour_keys, posture
@@ -24,64 +21,36 @@ from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.pose import blend_poses, pose_distance
 from rewild4d.ours.schedule import exponential, fade, ramp
 from rewild4d.ours.symmetry import Key, Supervision, Target
+from rewild4d.ours.training import GaussianTraining, run_steps
 from rewild4d.ours.warmup import WarmUp
 from rewild4d.rasterizer import RasterInfo, rasterize
 from rewild4d.types import Clip, Prior
 
-LOG_EVERY = 20
 
+class Training(GaussianTraining):
+    """The main stage; its groups are skinning, pose and deform."""
 
-class Training:
-    """The main stage.
-
-    Attributes:
-        model: all that learns.
-        gaussian_optimizer: one group per attribute, in the order of `canonical.NAMES`.
-        network_optimizer: groups skinning, pose, deform.
-    """
+    SAVED = ("gaussian_optimizer", "network_optimizer")
+    model: Model
+    config: Config
 
     def __init__(self, model: Model, supervision: Supervision, config: Config, generator: torch.Generator) -> None:
-        self.model, self.supervision, self.config, self.generator = model, supervision, config, generator
-        own, rates = model.gaussians, config.rates
-        # The rate of the means is set at every step.
-        fixed = {name: 0.0 if name == "means" else getattr(rates, name) for name in NAMES}
-        self.gaussian_optimizer = torch.optim.Adam(
-            [{"params": [getattr(own, name)], "lr": fixed[name]} for name in NAMES], eps=1e-15, fused=True
-        )
-        self.groups = {
+        groups = {
             "skinning": list(model.field.parameters()),
             "pose": list(model.network.parameters()),
             "deform": list(model.deform.parameters()),
         }
         model.field.logits.requires_grad_(config.skinning.learn)
-        self.network_optimizer = torch.optim.Adam(
-            [{"params": group} for group in self.groups.values()], eps=1e-8, fused=True
-        )
-        self.density = DensityControl(config.density, len(own), own.means.device)
-        self.near: Tensor | None = None
+        super().__init__(model, groups, config, supervision, generator)
 
-    def step(self, index: int) -> dict[str, float]:
-        """Take one step; return the figures for the log."""
-        progress = index / self.config.iterations
-        self._set_rates(progress)
+    def rate(self, name: str, progress: float) -> float:
+        rates = self.config.rates
+        return exponential(*getattr(rates, name), progress) * ramp(progress, 0.0, rates.rise)
+
+    def drawn_losses(self, index: int) -> tuple[dict[str, Tensor], RasterInfo | None, Target]:
         key = self.supervision.draw(self.generator, self.config.mirrored, self.config.cameras)
         target = self.supervision.target(key)
-        losses, info = self.losses(key, target, index)
-        values = torch.stack(list(losses.values()))
-        figures = dict(zip(losses, values.tolist(), strict=True))
-        for name, value in figures.items():
-            if not math.isfinite(value):
-                raise FloatingPointError(f"iteration {index}: loss '{name}' is not finite")
-        self.gaussian_optimizer.zero_grad(set_to_none=True)
-        self.network_optimizer.zero_grad(set_to_none=True)
-        values.sum().backward()
-        self._check_gradients(index)
-        if info is not None and progress < self.config.density.end:
-            self.density.observe(info, target.side, max(target.camera.width, target.camera.height))
-        self.gaussian_optimizer.step()
-        self.network_optimizer.step()
-        self._densify(index)
-        return {"loss": sum(figures.values()), "gaussians": len(self.model.gaussians)} | figures
+        return *self.losses(key, target, index), target
 
     def losses(self, key: Key, target: Target, index: int) -> tuple[dict[str, Tensor], RasterInfo | None]:
         """Compute all weighted losses of a view at an iteration, and the render info of the deformed branch."""
@@ -178,55 +147,11 @@ class Training:
             losses["steady"] = config.steady * (deformed.log_scales - posed.log_scales).square().mean()
         return losses
 
-    def _set_rates(self, progress: float) -> None:
-        rates = self.config.rates
-        self.gaussian_optimizer.param_groups[NAMES.index("means")]["lr"] = exponential(*rates.means, progress)
-        pairs = rates.skinning, rates.pose, rates.deform
-        for group, pair in zip(self.network_optimizer.param_groups, pairs, strict=True):
-            group["lr"] = exponential(*pair, progress) * ramp(progress, 0.0, rates.rise)
-
-    def _check_gradients(self, index: int) -> None:
-        """Clip the networks' gradients; raise where a gradient is not finite."""
+    def check_gradients(self, index: int) -> None:
+        """Clip the networks' gradients; raise a FloatingPointError where a gradient is not finite."""
         norms = [clip_gradients(self.groups[name], self.config.rates.clip) for name in ("pose", "deform")]
-        if all(map(math.isfinite, norms)) and all_finite(list(self.model.gaussians.parameters())):
-            return
-        for name, parameter in self.model.named_parameters():
-            if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
-                raise FloatingPointError(f"iteration {index}: the gradient of '{name}' is not finite")
-
-    def _densify(self, index: int) -> None:
-        config, total = self.config.density, self.config.iterations
-        every = max(1, round(config.every * total))
-        if config.start * total <= index < config.end * total and (index + 1) % every == 0:
-            self.density.round(self.model.gaussians, self.gaussian_optimizer, self.generator)
-            if len(self.model.gaussians) == 0:
-                raise FloatingPointError(f"iteration {index}: no Gaussian is left; every opacity fell below the limit")
-            self.near = None
-
-    def state(self) -> dict[str, Any]:
-        """Return all that a resumed run needs beside the generator."""
-        return {
-            "model": self.model.state_dict(),
-            "gaussian_optimizer": self.gaussian_optimizer.state_dict(),
-            "network_optimizer": self.network_optimizer.state_dict(),
-            "density": [self.density.gradient, self.density.seen, self.density.radius],
-            "near": self.near,
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state`; the number of Gaussians may differ from the present one."""
-        saved = {name: state["model"][f"gaussians.{name}"] for name in NAMES}
-        for group, name in zip(self.gaussian_optimizer.param_groups, NAMES, strict=True):
-            parameter = nn.Parameter(saved[name].to(self.model.pivots.device).clone())
-            setattr(self.model.gaussians, name, parameter)
-            group["params"] = [parameter]
-        self.model.load_state_dict(state["model"])
-        self.gaussian_optimizer.load_state_dict(state["gaussian_optimizer"])
-        self.network_optimizer.load_state_dict(state["network_optimizer"])
-        device = self.model.pivots.device
-        density = (part.to(device).clone() for part in state["density"])
-        self.density.gradient, self.density.seen, self.density.radius = density
-        self.near = state["near"]
+        if not all(map(math.isfinite, norms)) or not all_finite(list(self.model.gaussians.parameters())):
+            require_finite(self.model, index)
 
 
 def train(
@@ -250,16 +175,17 @@ def train(
         main.restore(saved["main"])
         warmup.optimizer.load_state_dict(saved["warmup"])
         generator.set_state(saved["generator"])
+
+    def step(index: int) -> dict[str, float]:
+        if index == warmup.total:
+            model.gaussians.colors.data[:, 0] = initial_colors(model, supervision)
+        return warmup.step(index) if index < warmup.total else main.step(index - warmup.total)
+
+    def state() -> dict[str, Any]:
+        optimizer = warmup.optimizer.state_dict()
+        return {"main": main.state(), "warmup": optimizer, "generator": generator.get_state()}
+
     with torch_on_one():
-        for index in range(start, total):
-            if index == warmup.total:
-                model.gaussians.colors.data[:, 0] = initial_colors(model, supervision)
-            figures = warmup.step(index) if index < warmup.total else main.step(index - warmup.total)
-            done = index + 1
-            if index % LOG_EVERY == 0 or done == total:
-                log(done, total, figures)
-            if workdir is not None and done % config.checkpoint_every == 0 and done < total:
-                state = {"step": done, "main": main.state(), "warmup": warmup.optimizer.state_dict()}
-                save_checkpoint(workdir, identity, state | {"generator": generator.get_state()})
+        run_steps(step, range(start, total), config.checkpoint_every, identity, state, log, workdir)
     model.gaussians.blur.fill_(supervision.missing_blur())
     return model

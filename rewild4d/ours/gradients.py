@@ -32,6 +32,13 @@ def all_finite(parameters: list[nn.Parameter]) -> bool:
     return bool(_flat(gradients).isfinite().all())  # one look: each would wait for a GPU
 
 
+def require_finite(model: nn.Module, index: int) -> None:
+    """Raise a FloatingPointError that names the iteration and the first parameter whose gradient is not finite."""
+    for name, parameter in model.named_parameters():
+        if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
+            raise FloatingPointError(f"iteration {index}: the gradient of '{name}' is not finite")
+
+
 def _norm(gradients: list[Tensor]) -> float:
     flat = _flat(gradients)
     return float(flat.dot(flat).sqrt())

@@ -9,9 +9,9 @@ from rewild4d.contracts import Log, MethodInfo
 from rewild4d.ours import INFO
 from rewild4d.ours.config import Config as OursConfig
 from rewild4d.ours.fit import train
-from rewild4d.ours.reconstruction import OursReconstruction, from_fit, load_reconstruction
+from rewild4d.ours.motion import Root
+from rewild4d.ours.reconstruction import OursReconstruction, load_reconstruction
 from rewild4d.ours.schedule import for_clip_of_ours
-from rewild4d.ours.symmetry import match_times
 from rewild4d.types import Clip, Prior
 
 
@@ -34,9 +34,9 @@ class Ours:
     ) -> OursReconstruction:
         """Reconstruct from the clip and the prior; see contracts.Method."""
         config = for_clip_of_ours(config, len(clip.frames), filmed=clip.guessed_cameras)
-        rows = match_times(clip, prior)
+        root = Root.of(clip, prior)
         model = train(clip, prior, config, seed, device, log, workdir)
-        return from_fit(model, config, clip, prior, rows)
+        return OursReconstruction(model, config, root)
 
     def load(self, folder: Path, device: torch.device) -> OursReconstruction:
         """Read a saved reconstruction."""

@@ -1,14 +1,74 @@
 """Root motion and input cameras between the frames of a clip."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from rewild4d.ours.symmetry import match_times
 from rewild4d.priors.motion import blend_similarities
-from rewild4d.transforms import between_intrinsics
-from rewild4d.types import Camera
+from rewild4d.transforms import between_intrinsics, transform_splats
+from rewild4d.types import Camera, Clip, Prior, Splats
+
+
+@dataclass(frozen=True)
+class Root:
+    """Transform from a method's frame of reference to the world at each frame of a clip, and the input cameras.
+
+    Attributes:
+        times: of the clip's frames in seconds, float64, [T].
+        object_to_world: similarity at each frame, float64, [T, 4, 4].
+        cameras: the input cameras in the world, or None where the clip has none.
+    """
+
+    times: Tensor
+    object_to_world: Tensor
+    cameras: tuple[Camera | None, ...]
+
+    @classmethod
+    def of(cls, clip: Clip, prior: Prior) -> "Root":
+        """Return the prior's root at the clip's frames."""
+        rows = match_times(clip, prior)
+        times = torch.tensor(clip.times, dtype=torch.float64)
+        return cls(times, prior.object_to_world[rows].double(), tuple(frame.camera for frame in clip.frames))
+
+    def position(self, time: float) -> float:
+        """Return `frame_position` of a time in seconds."""
+        return frame_position(self.times, time)
+
+    def in_world(self, splats: Splats, position: float) -> Splats:
+        """Transform Gaussians at a position from the method's frame to the world."""
+        matrix = interpolate_similarity(self.object_to_world, position)
+        return transform_splats(splats, matrix.to(splats.means.device))
+
+    def camera(self, time: float) -> Camera | None:
+        """Return the input camera at a time, in the world; between frames it interpolates."""
+        return camera_between(self.cameras, self.position(time))
+
+    def with_frame(self, row: int, time: float) -> "Root":
+        """Insert an interpolated frame at index ``row``."""
+        between = interpolate_similarity(self.object_to_world, self.position(time))
+        return Root(
+            torch.cat((self.times[:row], self.times.new_tensor((time,)), self.times[row:])),
+            torch.cat((self.object_to_world[:row], between[None], self.object_to_world[row:])),
+            (*self.cameras[:row], self.camera(time), *self.cameras[row:]),
+        )
+
+    def state(self) -> dict[str, Any]:
+        """Return what `from_state` takes: tensors and numbers."""
+        cameras = [
+            None if camera is None else (camera.world_to_camera, camera.intrinsics, camera.width, camera.height)
+            for camera in self.cameras
+        ]
+        return {"times": self.times, "object_to_world": self.object_to_world, "cameras": cameras}
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> "Root":
+        """Restore from `state`."""
+        cameras = tuple(None if values is None else Camera(*values) for values in state["cameras"])
+        return cls(state["times"], state["object_to_world"], cameras)
 
 
 def frame_position(times: Tensor, time: float) -> float:

@@ -4,84 +4,67 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import torch
 from torch import Tensor, nn
 
 from rewild4d.errors import UserError
-from rewild4d.files import atomic, load_tensors, save_tensors
-from rewild4d.ours.canonical import NAMES, Gaussians
+from rewild4d.ours.canonical import Gaussians
+from rewild4d.ours.checkpoint import load_fitted, save_fitted
 from rewild4d.ours.config import Config
 from rewild4d.ours.losses.regularizers import relative_angles
 from rewild4d.ours.model import Model
-from rewild4d.ours.motion import camera_between, frame_position, interpolate_similarity
+from rewild4d.ours.motion import Root, interpolate_similarity
 from rewild4d.ours.pose import Pose
 from rewild4d.ours.schedule import ramp
 from rewild4d.ours.skinning import SkinningField
 from rewild4d.ours.symmetry import Key
 from rewild4d.states import Shape, read_as, require_skeleton, require_tensors
-from rewild4d.texts import read_json
-from rewild4d.transforms import transform_splats
-from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Prior, Splats
+from rewild4d.types import OBJECT_DIAGONAL, Camera, Splats
 
-STATE, CONFIG = "ours.pt", "config.json"
+STATE = "ours.pt"
 
 
 class OursReconstruction:
-    """A trained model with the root motion and the cameras of its clip.
+    """A trained model with the root motion and the cameras of its clip (contracts.Articulated).
 
     Attributes:
         model: in the object frame.
         config: of the training.
-        times: of the clip's frames in seconds, float64, [T].
-        object_to_world: similarity at each frame, float64, [T, 4, 4].
-        cameras: of the frames, in the world.
+        root: object_to_world and input cameras of the clip's frames.
     """
 
-    def __init__(
-        self, model: Model, config: Config, times: Tensor, object_to_world: Tensor, cameras: tuple[Camera | None, ...]
-    ) -> None:
-        self.model, self.config = model.eval().requires_grad_(False), config
-        self.times, self.object_to_world, self.cameras = times, object_to_world, cameras
+    def __init__(self, model: Model, config: Config, root: Root) -> None:
+        self.model, self.config, self.root = model.eval().requires_grad_(False), config, root
         self.weights = model.field.sample(model.field.probabilities(), model.gaussians.means)
+        self.pivots, self.parents = model.pivots, model.parents
 
     @torch.no_grad()
     def at(self, time: float) -> Splats:
         """Return the Gaussians at a time in seconds in the world; networks and root interpolate between frames."""
-        position = frame_position(self.times, time)
+        position = self.root.position(time)
         pose = self._pose(torch.tensor([position]))
         strength = ramp(1.0, self.config.deform.ramp_start, self.config.deform.ramp_end)
         _, moved = self.model.moved(pose, self.weights, strength)
         own = self.model.gaussians
         quats = nn.functional.normalize(moved.quats, dim=-1)
         posed = Splats(moved.means, quats, own.scales(moved.log_scales), own.opacities(), own.rgb()[:, None])
-        world = transform_splats(posed, interpolate_similarity(self.object_to_world, position).to(quats.device))
+        world = self.root.in_world(posed, position)
         return replace(world, colors=own.splat_colors(world.quats))
 
     def camera(self, time: float) -> Camera | None:
         """Return the input camera at a time, in the world frame; between frames it interpolates."""
-        return camera_between(self.cameras, frame_position(self.times, time))
+        return self.root.camera(time)
 
     def canonical(self) -> Splats:
         """Return the Gaussians at rest, in the object frame; `weights` [n, J] belong to the same rows."""
         return self.model.gaussians.splats()
 
-    @property
-    def pivots(self) -> Tensor:
-        """Inner end of each bone at rest, [J, 3]."""
-        return self.model.pivots
-
-    @property
-    def parents(self) -> Tensor:
-        """Parent of each bone, -1 for a root, [J]."""
-        return self.model.parents
-
     @torch.no_grad()
     def articulation(self, time: float) -> tuple[Tensor, Tensor]:
         """Return rest -> posed transforms, [J, 4, 4], without the deformation, and object_to_world, [4, 4]."""
-        position = frame_position(self.times, time)
+        position = self.root.position(time)
         pose = self._pose(torch.tensor([position]))
-        return self.model.transforms(pose)[0], interpolate_similarity(self.object_to_world, position)
+        return self.model.transforms(pose)[0], interpolate_similarity(self.root.object_to_world, position)
 
     @torch.no_grad()
     def diagnostics(self) -> dict[str, float | list[float]]:
@@ -90,8 +73,8 @@ class OursReconstruction:
         These are angles against the parent in degrees and shifts over the rest diagonal (mean and standard deviation
         over the frames, a list over the joints), the number of Gaussians and their mean opacity.
         """
-        pose = self._pose(torch.arange(len(self.times), dtype=torch.float32))
-        angles = relative_angles(pose.quats, self.model.parents)
+        pose = self._pose(torch.arange(len(self.root.times), dtype=torch.float32))
+        angles = relative_angles(pose.quats, self.parents)
         shifts = pose.shifts.norm(dim=-1) / OBJECT_DIAGONAL
         figures: dict[str, float | list[float]] = {}
         for name, values in (("angle", angles), ("shift", shifts)):
@@ -102,18 +85,12 @@ class OursReconstruction:
 
     def save(self, folder: Path) -> None:
         """Write the state and the config into an existing, empty folder."""
-        state = {
-            "model": self.model.state_dict(),
-            "times": self.times,
-            "object_to_world": self.object_to_world,
-            "cameras": [_camera_state(camera) for camera in self.cameras],
-        }
-        save_tensors(state, folder / STATE)
-        with atomic(folder / CONFIG) as path:
-            path.write_bytes(msgspec.json.format(msgspec.json.encode(self.config), indent=2))
+        cameras = [_camera_state(camera) for camera in self.root.cameras]
+        state = {"model": self.model.state_dict(), **self.root.state(), "cameras": cameras}
+        save_fitted(folder, STATE, state, self.config)
 
     def _pose(self, positions: Tensor) -> Pose:
-        times = (positions.float() + 1) / len(self.times)
+        times = (positions.float() + 1) / len(self.root.times)
         return self.model.pose(times, [Key(1, 1, 0)] * len(positions))
 
 
@@ -124,24 +101,13 @@ def _camera_state(camera: Camera | None) -> dict[str, Tensor | list[int]] | None
     return {"world_to_camera": camera.world_to_camera, "intrinsics": camera.intrinsics, "size": size}
 
 
-def from_fit(model: Model, config: Config, clip: Clip, prior: Prior, rows: list[int]) -> OursReconstruction:
-    """Build the reconstruction of a clip; ``rows`` are the prior's rows of its frames."""
-    times = torch.tensor(clip.times, dtype=torch.float64)
-    cameras = tuple(frame.camera for frame in clip.frames)
-    return OursReconstruction(model, config, times, prior.object_to_world[rows].double(), cameras)
-
-
 def load_reconstruction(folder: Path, device: torch.device) -> OursReconstruction:
     """Read a reconstruction that `OursReconstruction.save` wrote.
 
     Raises:
         UserError: a file is missing or cannot be read.
     """
-    for name in (STATE, CONFIG):
-        if not (folder / name).is_file():
-            raise UserError(f"{folder}: expected a reconstruction by 'ours', but it has no {name}.")
-    config = read_json(folder / CONFIG, "a reconstruction by 'ours'", Config)
-    state = load_tensors(folder / STATE)
+    state, config = load_fitted(folder, STATE, "ours", Config)
     with read_as(folder, "ours"):
         return _from_state(folder / STATE, state, config, device)
 
@@ -156,7 +122,7 @@ def _from_state(path: Path, state: dict[str, Any], config: Config, device: torch
     require_tensors(path, state, {"times": ("T",), "object_to_world": ("T", 4, 4)}, sizes)
     require_skeleton(path, saved["parents"], saved["mirror"])
     require_skeleton(path, saved["parents"], saved["field.mirror"])
-    gaussians = Gaussians({name: saved[f"gaussians.{name}"] for name in NAMES}, config.canonical.max_scale)
+    gaussians = Gaussians.from_state(saved, config.canonical.max_scale)
     logits, origin, pitch, mirror = (saved[f"field.{name}"] for name in ("logits", "origin", "pitch", "mirror"))
     field = SkinningField(logits, origin, pitch, mirror, config.skinning.tied)
     if field.resolution < 2 or field.resolution**3 != len(logits):
@@ -172,7 +138,7 @@ def _from_state(path: Path, state: dict[str, Any], config: Config, device: torch
         require_tensors(path, item, {"world_to_camera": (4, 4), "intrinsics": (3, 3)}, {})
     if len(cameras) != sizes["T"] or not all(isinstance(c.width + c.height, int) for c in cameras if c is not None):
         raise UserError(f"{path}: expected a camera of {sizes['T']} frames each, got {len(cameras)} or other sizes.")
-    return OursReconstruction(model.to(device), config, state["times"], state["object_to_world"], cameras)
+    return OursReconstruction(model.to(device), config, Root(state["times"], state["object_to_world"], cameras))
 
 
 def _shapes(config: Config) -> dict[str, Shape]:

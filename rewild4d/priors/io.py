@@ -154,8 +154,6 @@ def _validated(path: Path, raw: Mapping[str, np.ndarray]) -> tuple[dict[str, Ten
     return arrays, flipped
 
 
-
-
 def _quality(path: Path, text: str) -> dict[str, float]:
     try:
         found = {str(name): float(value) for name, value in parse_json(text, path, "'quality'").items()}

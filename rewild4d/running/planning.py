@@ -1,13 +1,13 @@
 """Find what a table's file needs to run, and which records are its rows."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any
 
 import msgspec
 
-from rewild4d.config import load_preset, preset_names
+from rewild4d.config import load_preset, merged, preset_names
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.evaluation.protocol import load_protocols
 from rewild4d.leaderboard.records import RunRecord
@@ -77,7 +77,7 @@ def row_entry(table: str, row: Line, spec: Spec, seeds: tuple[int, ...]) -> Entr
     preset = (row.preset or spec.preset) if preset_names(row.method) else "default"
     base = msgspec.to_builtins(load_preset(row.method, config_type, preset))
     try:
-        config = msgspec.convert(_merged(base, row.settings), type=config_type)
+        config = msgspec.convert(merged(base, row.settings), type=config_type)
     except msgspec.ValidationError as error:
         raise UserError(
             f"table '{table}', row '{row.label}': the settings do not fit '{row.method}': {error}."
@@ -105,13 +105,13 @@ def cases_of_conditions(spec: Spec) -> dict[tuple[str, str], tuple[str, ...]]:
     return found
 
 
-def frame(name: str, spec: Spec) -> Frame:
-    """Return titles and columns of a table."""
+def frame(name: str, spec: Spec, notes: Sequence[str] = ()) -> Frame:
+    """Return titles, columns and notes of a table."""
     several = len(spec.conditions) > 1
     titles = tuple(one.title or one.protocol if several else "" for one in spec.conditions)
     where = ", ".join(dict.fromkeys(f"`{one.protocol}`" for one in spec.conditions))
     caption = " ".join([*spec.description.split(), f"Preset {spec.preset}; {where}."])
-    return Frame(name, spec.title, caption, titles, spec.scores)
+    return Frame(name, spec.title, caption, titles, spec.scores, tuple(notes))
 
 
 def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[Entrant], list[str]]:
@@ -134,7 +134,7 @@ def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[
         )
         rows.append(Entrant(row.label, own, "", notes))
     shown = {row.method for row in spec.rows}
-    # A floor has no rows of its own: it stands beside the cases that the rows were run on.
+    # Lower bounds are shown for the cases of the other rows.
     cases = [{r.case for row in rows for r in row.records[index]} for index in range(len(under))]
     floors = dict.fromkeys(r.method for found in under for r in found if is_floor(r) and r.method not in shown)
     for floor in floors:
@@ -175,7 +175,7 @@ def _missing(spec: Spec, cases: Sequence[Collection[str]]) -> list[str]:
 
 
 def _beside_equals(record: RunRecord) -> RunRecord:
-    """Drop the mark of a prior made from the truth: all rows of a condition have the same prior."""
+    """Drop the mark of a prior made from the truth, which all rows of a condition have."""
     return msgspec.structs.replace(record, marks=[mark for mark in record.marks if mark != FROM_TRUTH])
 
 
@@ -185,11 +185,3 @@ def _equals(settings: Any, wanted: msgspec.Struct) -> bool:
         return msgspec.convert(settings, type=type(wanted)) == wanted
     except msgspec.ValidationError:
         return False
-
-
-def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Deep-merge two nested mappings; the second wins. An unknown name is kept, so that decoding refuses it."""
-    merged = dict(base)
-    for name, value in changes.items():
-        merged[name] = _merged(merged.get(name, {}), value) if isinstance(value, dict) else value
-    return merged

@@ -30,8 +30,8 @@ def prior_of(prior: Prior | None) -> dict[str, Any]:
     """Describe the prior."""
     if prior is None:
         return {"name": "none"}
-    said = {"name": prior.name, "provenance": prior.provenance, "digest": prior.digest, "quality": prior.quality}
-    return said | ({"notes": list(prior.notes)} if prior.notes else {})
+    found = {"name": prior.name, "provenance": prior.provenance, "digest": prior.digest, "quality": prior.quality}
+    return found | ({"notes": list(prior.notes)} if prior.notes else {})
 
 
 def left_out(clip: Clip, shown: Clip | None) -> dict[str, list[int]]:

@@ -1,7 +1,5 @@
 """Read saved runs: their data, and new scores by the protocol that they were fitted for."""
 
-import time
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,21 +9,16 @@ import torch
 from rewild4d.contracts import DatasetReader
 from rewild4d.errors import UserError
 from rewild4d.evaluation.coverage import coverage
-from rewild4d.evaluation.measuring import evaluate
-from rewild4d.evaluation.placing import scale_of
 from rewild4d.evaluation.protocol import find_protocol
-from rewild4d.evaluation.refining import ready_to_score
 from rewild4d.leaderboard.records import FILE, RunRecord, Timing, read_record, write_record
 from rewild4d.machine import code_of, machine, peak_memory_mib, pick_device
-from rewild4d.progress import Progress
 from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_dataset, load_method
 from rewild4d.running import provenance
 from rewild4d.running.runner import STAMP, fit_seconds
+from rewild4d.running.scoring import score
 from rewild4d.running.workers import share_cores, this_process
 from rewild4d.texts import parse_json
-from rewild4d.visualize.original_view import original_frames
-from rewild4d.visualize.run_pictures import save_pictures
 
 
 def reader_of(run: Path, record: RunRecord, data: Path | None) -> DatasetReader:
@@ -81,21 +74,14 @@ def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: s
             root = data or record.data["root"]
             raise UserError(f"{root}: the {name} of {record.case} is not the one that {folder} was fitted to.")
     reconstruction = load_method(record.method).load(saved, device)
-    begin = time.perf_counter()
-    shown = provenance.shown_clip(clip, record.prior)
-    with closing(Progress(f"{record.case}: refine on held-out frames")) as log:
-        reconstruction, clip, truth = ready_to_score(reconstruction, clip, truth, shown, log)
-    with closing(Progress(f"{record.case}: evaluate")) as log:
-        found = evaluate(reconstruction, clip, truth, protocol, log, device)
-    seconds = time.perf_counter() - begin
-    whole = original_frames(reader, clip, protocol.selection)
-    pictures = save_pictures(reconstruction, clip, truth, folder, whole, scale_of(found.alignments))
-    described = {"digest": protocol.digest, **msgspec.to_builtins(protocol)}
+    fields, seconds = score(
+        reconstruction, clip, truth, provenance.shown_clip(clip, record.prior), protocol=protocol, method=record.method,
+        prior=record.prior.get("choice", ""), reader=reader, folder=folder, device=device, title=record.case,
+    )  # fmt: skip
     renewed = msgspec.structs.replace(
-        record, status="ok", error="", **found.keep(folder), coverage=coverage(clip, truth), pictures=pictures,
-        diagnostics=provenance.diagnostics(reconstruction, shown, protocol.background), protocol=described,
-        marks=provenance.marks(record.method, record.prior.get("choice", ""), reconstruction),
-        code=code_of(record.method), machine=machine(device, rasterizer), timing=_timing(record, spent, seconds),
+        record, **fields, coverage=coverage(clip, truth), timing=_timing(record, spent, seconds),
+        protocol={"digest": protocol.digest, **msgspec.to_builtins(protocol)},
+        code=code_of(record.method), machine=machine(device, rasterizer),
     )  # fmt: skip
     return read_record(write_record(renewed, folder))
 

@@ -21,11 +21,8 @@ import torch
 from rewild4d.contracts import DatasetReader, Reconstruction
 from rewild4d.errors import UserError, reason, unknown_name
 from rewild4d.evaluation.coverage import coverage
-from rewild4d.evaluation.measuring import evaluate
 from rewild4d.evaluation.networks import may_be_scored_now
-from rewild4d.evaluation.placing import scale_of
 from rewild4d.evaluation.protocol import Protocol
-from rewild4d.evaluation.refining import ready_to_score
 from rewild4d.files import held, remove_leftovers, write_text
 from rewild4d.kernels.switch import chosen_kernels
 from rewild4d.leaderboard.records import FILE, SCHEMA, RunRecord, Timing, make_run_id, read_record, write_record
@@ -36,11 +33,10 @@ from rewild4d.progress import Progress
 from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_method
 from rewild4d.running import provenance
+from rewild4d.running.scoring import score
 from rewild4d.running.workers import Workers, share_cores, this_process
 from rewild4d.texts import read_json
 from rewild4d.types import Case, Clip, Prior, Truth
-from rewild4d.visualize.original_view import original_frames
-from rewild4d.visualize.run_pictures import save_pictures
 
 STAMP = "fit.json"
 """Duration of the fit, written last, beside a saved reconstruction."""
@@ -105,7 +101,7 @@ def execute(plan: Plan) -> list[RunRecord]:
     plan.out.mkdir(parents=True, exist_ok=True)
     parts = [(name, entry, seed) for name in plan.cases for entry in plan.entries for seed in entry.seeds]
     floors = [entry.method in plan.protocol.floors for _, entry, _ in parts]
-    # A floor is done at once, unless sets of novel views are scored: those take minutes of every row.
+    # Lower bounds take no time, unless sets of novel views are scored, which takes minutes for every row.
     long = len(parts) if plan.protocol.novel else floors.count(False)
     jobs = min(plan.jobs, max(len(plan.cases), long))
     threads = share_cores(plan.threads, min(jobs, floors.count(False)), plan.device)
@@ -119,7 +115,7 @@ def execute(plan: Plan) -> list[RunRecord]:
     with Workers(jobs, threads, plan.rasterizer) as workers:
         # Every fit of a case starts from its prior, so the priors come first.
         workers.map(_prepare, [(plan, name) for name in plan.cases], lambda *_: None)
-        # Fits first: the floors fill the time that they leave.
+        # Fits come first; lower bounds are short and fill the gaps.
         order = sorted(range(len(parts)), key=floors.__getitem__)
         made = workers.map(_run_part, [(plan, *parts[i]) for i in order], _lost_part)
         return [record for _, record in sorted(zip(order, made, strict=True), key=itemgetter(0))]
@@ -187,8 +183,7 @@ def _run_case(plan: Plan, name: str) -> list[RunRecord]:
 
 def _jobs(plan: Plan, name: str, clip: Clip, truth: Truth) -> list["Job"]:
     prior_id = plan.prior.identity(clip, truth)
-    folder = plan.out / plan.protocol.name / name.replace("/", "__")
-    return [Job(plan, entry, seed, clip, truth, prior_id, folder) for entry in plan.entries for seed in entry.seeds]
+    return [Job(plan, name, entry, seed, clip, truth, prior_id) for entry in plan.entries for seed in entry.seeds]
 
 
 def _prior(plan: Plan, clip: Clip, truth: Truth) -> Prior:
@@ -200,14 +195,15 @@ def _prior(plan: Plan, clip: Clip, truth: Truth) -> Prior:
 class Job:
     """One method on one case with one seed."""
 
-    def __init__(self, plan: Plan, entry: Entry, seed: int, clip: Clip, truth: Truth, prior_id: str, folder: Path):
+    def __init__(self, plan: Plan, name: str, entry: Entry, seed: int, clip: Clip, truth: Truth, prior_id: str):
         self.plan, self.entry, self.seed, self.clip, self.truth = plan, entry, seed, clip, truth
         self.run_id = make_run_id(
             method=entry.method, config=entry.config, clip=clip.digest, truth=truth.digest, prior=prior_id,
             protocol=plan.protocol.digest, seed=seed, code=code_of(entry.method), device=plan.device.type,
             rasterizer=plan.rasterizer, **chosen_kernels(), **provenance.inputs(entry.method, entry.config, clip.name),
         )  # fmt: skip
-        self.folder = folder / f"{entry.method}-{entry.preset}-seed{seed}-{self.run_id[:8]}"
+        run = entry.method, entry.preset, seed, self.run_id
+        self.folder = run_folder(plan.out, plan.protocol.name, name, *run)
         self.title = f"{clip.name}: {entry.method}"
         self.started = datetime.now(UTC).isoformat(timespec="seconds")
 
@@ -232,24 +228,14 @@ class Job:
     def _run(self, case: Case, seen: dict[str, float]) -> RunRecord:
         try:
             reconstruction, fit_seconds = self._fit(case)
-            begin = time.perf_counter()
             whole = with_cameras(self.clip, case.prior)  # also the frames that the fit was not shown
-            with contextlib.closing(Progress(f"{self.title}: refine on held-out frames")) as log:
-                reconstruction, clip, truth = ready_to_score(reconstruction, whole, case.truth, case.clip, log)
-            with contextlib.closing(Progress(f"{self.title}: evaluate")) as log:
-                found = evaluate(reconstruction, clip, truth, self.plan.protocol, log, self.plan.device)
-            seconds = time.perf_counter() - begin
-            pictures = save_pictures(
-                reconstruction, clip, truth, self.folder,
-                original_frames(self.plan.reader, clip, self.plan.protocol.selection), scale_of(found.alignments),
+            fields, seconds = score(
+                reconstruction, whole, case.truth, case.clip, protocol=self.plan.protocol, method=self.entry.method,
+                prior=self.plan.prior.name, reader=self.plan.reader, folder=self.folder, device=self.plan.device,
+                title=self.title,
             )  # fmt: skip
-            record = self._record(
-                case, "ok", "", **found.keep(self.folder), coverage=seen, pictures=pictures,
-                diagnostics=provenance.diagnostics(reconstruction, case.clip, self.plan.protocol.background),
-                marks=provenance.marks(self.entry.method, self.plan.prior.name, reconstruction),
-                timing=self._timing(fit_seconds, seconds),
-            )  # fmt: skip
-            path = write_record(record, self.folder)
+            timing = self._timing(fit_seconds, seconds)
+            path = write_record(self._record(case, **fields, coverage=seen, timing=timing), self.folder)
         except UserError as error:
             return self.fail(str(error), case)
         except Exception as error:  # a bug or a diverged fit: the record keeps the message, the terminal the traceback
@@ -263,7 +249,7 @@ class Job:
         print(f"{self.title}: failed: {message}", file=sys.stderr)
         if self._is_good():
             return self.record()
-        record = self._record(case, "failed", message, timing=self._timing(0.0, 0.0))
+        record = self._record(case, status="failed", error=message, timing=self._timing(0.0, 0.0))
         return read_record(write_record(record, self.folder))
 
     def _fit(self, case: Case) -> tuple[Reconstruction, float]:
@@ -294,11 +280,11 @@ class Job:
     def _timing(self, fit: float, evaluation: float) -> Timing:
         return Timing(self.started, round(fit, 2), round(evaluation, 2), round(peak_memory_mib(), 1))
 
-    def _record(self, case: Case | None, status: str, error: str, **found: Any) -> RunRecord:
+    def _record(self, case: Case | None, **found: Any) -> RunRecord:
         plan = self.plan
         fields: dict[str, Any] = {
             "schema": SCHEMA, "run_id": self.run_id, "method": self.entry.method, "dataset": plan.dataset,
-            "case": self.clip.name, "seed": self.seed, "preset": self.entry.preset, "status": status, "error": error,
+            "case": self.clip.name, "seed": self.seed, "preset": self.entry.preset,
             "scores": {}, "coverage": {}, "items": [], "pictures": [], "diagnostics": {},
             "config": msgspec.to_builtins(self.entry.config),
             "data": {"root": str(plan.root), "licence": self.clip.licence, "clip": self.clip.digest,
@@ -312,6 +298,11 @@ class Job:
             "code": code_of(self.entry.method), "machine": machine(plan.device, plan.rasterizer),
         }  # fmt: skip
         return RunRecord(**{**fields, **found})
+
+
+def run_folder(out: Path, protocol: str, case: str, method: str, preset: str, seed: int, run_id: str) -> Path:
+    """Return the folder of a run below the folder of all runs."""
+    return out / protocol / case.replace("/", "__") / f"{method}-{preset}-seed{seed}-{run_id[:8]}"
 
 
 def fit_seconds(folder: Path) -> float:

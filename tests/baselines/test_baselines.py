@@ -10,7 +10,6 @@ import pytest
 import torch
 from dying import Killed, kill_late
 
-from rewild4d.baselines.common.saved import Root
 from rewild4d.baselines.common.splatting import reset_opacities, surface_gaussians
 from rewild4d.baselines.common.volume import SCENE_HALF, common_volume, random_points, scene_frame
 from rewild4d.baselines.d3dgs import D3dgs, D3dgsConfig, D3dgsStar, D3dgsStarConfig, random_gaussians
@@ -22,6 +21,7 @@ from rewild4d.errors import UserError
 from rewild4d.kernels.halves import available
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.config import Canonical
+from rewild4d.ours.motion import Root
 from rewild4d.registry import load_method
 from rewild4d.running.conformance import check_method, tiny_case
 from rewild4d.transforms import camera_in_object

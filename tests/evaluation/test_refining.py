@@ -142,9 +142,7 @@ def test_a_run_says_that_the_row_has_seen_the_test_image(tmp_path: Path, monkeyp
     monkeypatch.setattr("rewild4d.running.rescoring.find_protocol", lambda *_: PROTOCOL)
     again = score_again(folder, tmp_path / "clip")
     assert again.scores == star.scores and again.marks == star.marks
-    monkeypatch.setattr(
-        "rewild4d.running.rescoring.ready_to_score", lambda *given: (given[0], *add_cameras(*given[:4]))
-    )
+    monkeypatch.setattr("rewild4d.running.scoring.ready_to_score", lambda *given: (given[0], *add_cameras(*given[:4])))
     unrefined = score_again(folder, tmp_path / "clip")
     assert SEEN not in unrefined.marks
     seen, unseen = again.scores["psnr"].value, unrefined.scores["psnr"].value

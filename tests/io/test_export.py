@@ -24,7 +24,8 @@ from rewild4d.io.skinned_glb import SEEN, influences, squares, write_glb
 from rewild4d.leaderboard.records import write_record
 from rewild4d.ours.config import Canonical, Config, Deform, Skinning
 from rewild4d.ours.model import build_model
-from rewild4d.ours.reconstruction import OursReconstruction, from_fit
+from rewild4d.ours.motion import Root
+from rewild4d.ours.reconstruction import OursReconstruction
 from rewild4d.running.conformance import tiny_case
 from rewild4d.transforms import skin_points
 from rewild4d.types import Case, Crop, Frame, Splats
@@ -54,7 +55,7 @@ def ours(case: Case) -> OursReconstruction:
     model = build_model(CONFIG, case.prior, generator)
     with torch.no_grad():
         model.network.head.weight.normal_(0, 0.15, generator=generator)
-    return from_fit(model, CONFIG, case.clip, case.prior, list(range(5)))
+    return OursReconstruction(model, CONFIG, Root.of(case.clip, case.prior))
 
 
 @pytest.mark.parametrize("name", ["prior_only", "ours"])

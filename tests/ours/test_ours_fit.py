@@ -18,6 +18,7 @@ from rewild4d.ours.config import Canonical, Config, PriorUse, WarmUp
 from rewild4d.ours.fit import Training, train
 from rewild4d.ours.method import Ours
 from rewild4d.ours.model import build_model
+from rewild4d.ours.motion import Root
 from rewild4d.ours.reconstruction import OursReconstruction
 from rewild4d.ours.schedule import for_clip
 from rewild4d.ours.symmetry import SIGNS, Key, Supervision
@@ -158,9 +159,8 @@ def test_harmonics_mean_the_same_in_training_and_in_the_world(toy: tuple[Clip, P
     training = start(toy, msgspec.structs.replace(TINY, canonical=Canonical(samples=50, sh_degree=2)))
     own = training.model.gaussians
     torch.nn.init.normal_(own.colors, mean=0.5, generator=torch.Generator().manual_seed(0))
-    made = OursReconstruction(
-        training.model, training.config, torch.tensor(clip.times).double(), root.repeat(FRAMES, 1, 1), (None,) * FRAMES
-    )
+    motion = Root(torch.tensor(clip.times).double(), root.repeat(FRAMES, 1, 1), (None,) * FRAMES)
+    made = OursReconstruction(training.model, training.config, motion)
     eye = torch.tensor((3.0, 2.0, -6.0), dtype=torch.float64)
     pose = training.model.pose(torch.tensor([2 / FRAMES]), [Key(1, 1, 1)])
     _, posed = training.model.moved(pose, made.weights, 1.0)

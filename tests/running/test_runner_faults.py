@@ -146,7 +146,7 @@ def test_evaluate_makes_a_failed_record_whole(plan: runner.Plan, monkeypatch: py
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(runner, "evaluate", full)
+        patch.setattr("rewild4d.running.scoring.evaluate", full)
         (failed,) = runner.execute(plan)
     assert failed.status == "failed"
     monkeypatch.setattr("rewild4d.running.rescoring.load_dataset", lambda _: lambda _: plan.reader)
@@ -157,7 +157,7 @@ def test_evaluate_makes_a_failed_record_whole(plan: runner.Plan, monkeypatch: py
         time.sleep(0.02)  # the record counts hundredths of a second, and this case takes less
         return evaluate(*given)
 
-    monkeypatch.setattr("rewild4d.running.rescoring.evaluate", slow)
+    monkeypatch.setattr("rewild4d.running.scoring.evaluate", slow)
     folder = only_job(plan).folder
     renewed = score_again(folder)
     assert renewed.marks == ["upper bound: it was told"] and renewed.diagnostics["gaussians"] == 500.0

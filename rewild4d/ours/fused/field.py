@@ -24,7 +24,7 @@ FIELD = Kernel(
 )
 RESIDUAL_FIELD = Kernel(
     "skinning field of GART",
-    "5d431183bbb7",
+    "0a3d84b08dde",
     "rewild4d.baselines.gart_skinning:ResidualField.forward",
     "rewild4d.baselines.gart_skinning:ResidualField._variation",
     "rewild4d.ours.losses.regularizers:tv_loss",

@@ -1,0 +1,146 @@
+"""Train Gaussians step by step: what the fits of `ours` and of its Gaussian competitors have in common."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Adam
+
+from rewild4d.contracts import Log
+from rewild4d.ours.canonical import NAMES, Gaussians
+from rewild4d.ours.checkpoint import save_checkpoint
+from rewild4d.ours.density import DensityControl
+from rewild4d.ours.gradients import all_finite, require_finite
+from rewild4d.ours.schedule import exponential
+from rewild4d.ours.symmetry import Supervision, Target
+from rewild4d.rasterizer import RasterInfo
+
+LOG_EVERY = 20
+
+
+class GaussianTraining(ABC):
+    """One fit; a method defines its losses and the learning rates of its other parameters.
+
+    Attributes:
+        model: all that learns; its attribute ``gaussians`` are the canonical Gaussians.
+        groups: parameters beside the Gaussians', by name.
+        config: of the method; read are `iterations`, `rates` and `density`.
+        supervision: the clip's images and cameras.
+        generator: the only source of randomness.
+        optimizer: one group per attribute, in the order of `canonical.NAMES`.
+        others: one group for each of `groups`.
+        near: neighbours of each Gaussian, for methods that compare them; None where they are to be searched, [n, k].
+    """
+
+    SAVED: ClassVar[tuple[str, str]] = ("optimizer", "others")
+    """Names of the two optimizers in checkpoints."""
+
+    def __init__(
+        self,
+        model: nn.Module,
+        groups: Mapping[str, list[nn.Parameter]],
+        config: Any,
+        supervision: Supervision,
+        generator: torch.Generator,
+    ) -> None:
+        self.model, self.groups, self.config = model, dict(groups), config
+        self.supervision, self.generator = supervision, generator
+        own = self.gaussians
+        # The rate of the means is set at every step.
+        rates = {name: 0.0 if name == "means" else getattr(config.rates, name) for name in NAMES}
+        fixed = [{"params": [getattr(own, name)], "lr": rates[name]} for name in NAMES]
+        self.optimizer = Adam(fixed, eps=1e-15, fused=True)
+        self.others = Adam([{"params": group} for group in groups.values()], eps=1e-8, fused=True)
+        self.density = DensityControl(config.density, len(own), own.means.device)
+        self.near: Tensor | None = None
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The canonical Gaussians."""
+        gaussians = self.model.gaussians
+        assert isinstance(gaussians, Gaussians)
+        return gaussians
+
+    @abstractmethod
+    def drawn_losses(self, index: int) -> tuple[dict[str, Tensor], RasterInfo | None, Target]:
+        """Draw a view; return its weighted losses, its render info (None where nothing was rendered) and the view."""
+
+    @abstractmethod
+    def rate(self, name: str, progress: float) -> float:
+        """Return the learning rate of one of `groups`."""
+
+    def step(self, index: int) -> dict[str, float]:
+        """Take one step; return the figures for the log."""
+        config, progress = self.config, index / self.config.iterations
+        self.optimizer.param_groups[NAMES.index("means")]["lr"] = exponential(*config.rates.means, progress)
+        for name, group in zip(self.groups, self.others.param_groups, strict=True):
+            group["lr"] = self.rate(name, progress)
+        losses, info, target = self.drawn_losses(index)
+        values = torch.stack(list(losses.values()))
+        figures = dict(zip(losses, values.tolist(), strict=True))
+        for name, value in figures.items():
+            if not math.isfinite(value):
+                raise FloatingPointError(f"iteration {index}: loss '{name}' is not finite")
+        self.optimizer.zero_grad(set_to_none=True)
+        self.others.zero_grad(set_to_none=True)
+        values.sum().backward()
+        self.check_gradients(index)
+        if info is not None and progress < config.density.end:
+            self.density.observe(info, target.side, max(target.camera.width, target.camera.height))
+        self.optimizer.step()
+        self.others.step()
+        if self.density.round_if_due(index, config.iterations, self.gaussians, self.optimizer, self.generator):
+            self.near = None
+        return {"loss": sum(figures.values()), "gaussians": len(self.gaussians)} | figures
+
+    def check_gradients(self, index: int) -> None:
+        """Raise a FloatingPointError where a gradient is not finite."""
+        if not all_finite(list(self.model.parameters())):
+            require_finite(self.model, index)
+
+    def state(self) -> dict[str, Any]:
+        """Return what a resumed fit needs beside the generator."""
+        optimizers = zip(self.SAVED, (self.optimizer.state_dict(), self.others.state_dict()), strict=True)
+        others = {"density": self.density.state(), "near": self.near}
+        return {"model": self.model.state_dict(), **dict(optimizers), **others}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state`; the number of Gaussians may differ from the present one."""
+        own = self.gaussians
+        for group, name in zip(self.optimizer.param_groups, NAMES, strict=True):
+            parameter = nn.Parameter(state["model"][f"gaussians.{name}"].to(own.means.device).clone())
+            setattr(own, name, parameter)
+            group["params"] = [parameter]
+        self.model.load_state_dict(state["model"])
+        for name, optimizer in zip(self.SAVED, (self.optimizer, self.others), strict=True):
+            optimizer.load_state_dict(state[name])
+        self.density.restore(state["density"])
+        # A new search would find neighbours of the present positions, not of those at the last change.
+        self.near = state.get("near")
+
+
+def run_steps(
+    step: Callable[[int], Mapping[str, float]], steps: range, every: int, identity: str,
+    state: Callable[[], dict[str, Any]], log: Log, workdir: Path | None,
+) -> None:  # fmt: skip
+    """Take steps and log them.
+
+    Args:
+        step: takes one step, returns the figures for the log.
+        steps: indices that are left to take.
+        every: steps between checkpoints.
+        identity: of the fit, from `fit_digest`.
+        state: returns what a checkpoint holds beside the number of steps.
+        log: called every `LOG_EVERY` steps and at the end.
+        workdir: folder for checkpoints; None for none.
+    """
+    for index in steps:
+        figures, done = step(index), index + 1
+        if index % LOG_EVERY == 0 or done == steps.stop:
+            log(done, steps.stop, figures)
+        if workdir is not None and done % every == 0 and done < steps.stop:
+            save_checkpoint(workdir, identity, {"step": done} | state())
