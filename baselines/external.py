@@ -35,10 +35,10 @@ from rewild4d.baselines.external_reading import Moment, moved_discs, painted, re
 from rewild4d.contracts import Log, MethodInfo
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import digest, load_tensors, save_tensors, write_text
+from rewild4d.foreign.texts import read_json
 from rewild4d.io.meshes import Discs
 from rewild4d.ours.motion import camera_between, frame_position
 from rewild4d.priors.motion import pose_at
-from rewild4d.texts import read_json
 from rewild4d.transforms import skin_points, split_similarity, transform_splats
 from rewild4d.types import Camera, Clip, Frame, Prior, Splats
 

@@ -5,8 +5,8 @@ from typing import Literal
 import msgspec
 
 from rewild4d.contracts import MethodInfo
+from rewild4d.foreign.programs import TIMEOUT
 from rewild4d.ours.config import Count, Positive
-from rewild4d.programs import TIMEOUT
 
 INFO = MethodInfo(title="anybody's program, by files", paper="that of the program", licence="that of the program")
 

@@ -19,8 +19,8 @@ from torch.nn.functional import interpolate
 from rewild4d.baselines.external_profiles import Profile
 from rewild4d.errors import UserError
 from rewild4d.files import command_words, digest, write_text
+from rewild4d.foreign.programs import run_foreign
 from rewild4d.priors.io import save_prior
-from rewild4d.programs import run_foreign
 from rewild4d.types import Clip, Frame, Prior
 
 CROP = 256

@@ -11,9 +11,9 @@ from torch.nn.functional import grid_sample, normalize
 
 from rewild4d.baselines.external_gltf import read_animation
 from rewild4d.errors import UserError
+from rewild4d.foreign.reading import require_file
 from rewild4d.io.meshes import Discs, Mesh, discs, read_mesh
 from rewild4d.io.ply import holds_gaussians, read_splats
-from rewild4d.reading import require_file
 from rewild4d.transforms import split_similarity
 from rewild4d.types import Camera, Frame, Splats
 

@@ -27,9 +27,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from rewild4d.errors import UserError
+from rewild4d.foreign.reading import arrays_of
 from rewild4d.priors.io import seal
 from rewild4d.priors.kinematics import depth_levels
-from rewild4d.reading import arrays_of
 from rewild4d.transforms import mirror_points, mirror_transforms, nearest_rotation, rigid, skin_points
 from rewild4d.types import OBJECT_DIAGONAL, Prior
 

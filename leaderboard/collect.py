@@ -13,13 +13,13 @@ from PIL import Image
 
 from rewild4d.errors import UserError
 from rewild4d.files import regular_inside, replaced_folder
+from rewild4d.foreign.texts import read_json
 from rewild4d.leaderboard.curves import MOMENT, moments
 from rewild4d.leaderboard.media import TIMEOUT, open_picture, publish, recode
 from rewild4d.leaderboard.privacy import without_paths
 from rewild4d.leaderboard.records import FILE, RunRecord
 from rewild4d.leaderboard.variants import by_protocol, grouped, latest, variants
 from rewild4d.metrics.score import Score
-from rewild4d.texts import read_json
 
 MARKER = "collection.json"
 """Lies in every collected folder: its title and what was done to the records."""

@@ -15,7 +15,7 @@ from PIL import Image
 
 from rewild4d.errors import UserError
 from rewild4d.files import regular_inside
-from rewild4d.programs import run_foreign
+from rewild4d.foreign.programs import run_foreign
 
 PICTURES, FILMS = {".png": "PNG", ".webp": "WEBP"}, (".mp4",)
 """Suffixes of what is published, and the formats that they stand for."""

@@ -10,8 +10,8 @@ import msgspec
 
 from rewild4d.errors import UserError, reason
 from rewild4d.files import digest, regular_inside, write_text
+from rewild4d.foreign.texts import read_json
 from rewild4d.metrics.score import Distance, Score
-from rewild4d.texts import read_json
 
 SCHEMA = 1
 FILE = "record.json"

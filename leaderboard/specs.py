@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from rewild4d.errors import unknown_name
-from rewild4d.texts import parse_json, parse_toml
+from rewild4d.foreign.texts import parse_json, parse_toml
 
 T = TypeVar("T")
 

@@ -16,11 +16,11 @@ import torch
 
 from rewild4d.errors import UserError, reason, shown
 from rewild4d.files import atomic, digest
+from rewild4d.foreign.reading import read_arrays
 from rewild4d.metrics.distribution import kid
 from rewild4d.metrics.names import KINDS
 from rewild4d.metrics.samples import Conditions, Distance, Features
 from rewild4d.metrics.video import feature_distances
-from rewild4d.reading import read_arrays
 
 FILE = "features.npz"
 _SIDES = ("prediction", "truth")

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.texts import read_toml
+from rewild4d.foreign.texts import read_toml
 
 T = TypeVar("T")
 PRESETS = ("default", "quick", "standard", "paper")

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import platformdirs
 
 from rewild4d.errors import UserError
-from rewild4d.reading import require_room, require_there, unpacked_size
+from rewild4d.foreign.reading import require_room, require_there, unpacked_size
 
 if TYPE_CHECKING:
     import numpy as np

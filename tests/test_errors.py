@@ -7,8 +7,8 @@ import pytest
 from rewild4d.datasets.artemis import files
 from rewild4d.errors import MOST_CHARACTERS, UserError, reason, shortened, shown, unknown_name
 from rewild4d.evaluation.protocol import Protocol
+from rewild4d.foreign.texts import parse_json, parse_toml, read_json, read_text, read_toml
 from rewild4d.priors.landmarks import load_mapping
-from rewild4d.texts import parse_json, parse_toml, read_json, read_text, read_toml
 
 
 def test_a_long_message_keeps_its_path_and_loses_its_middle() -> None:

@@ -109,7 +109,7 @@ def test_imports_are_absolute_and_run_one_way() -> None:
         "rewild4d.datasets.rigs.reader",
         "rewild4d.errors",
         "rewild4d.files",
-        "rewild4d.reading",
+        "rewild4d.foreign.reading",
     )
     for file in sources():
         relative = str(file.relative_to(ROOT))

@@ -13,7 +13,7 @@ import numpy as np
 
 from rewild4d.datasets.images import ImagePair
 from rewild4d.errors import UserError, shown
-from rewild4d.reading import read_array
+from rewild4d.foreign.reading import read_array
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 PARENTS_FILES = ("bone_parents.npy", "bones_parents.npy")

@@ -19,7 +19,7 @@ from rewild4d.datasets.keypoints.individuals import Instance, Looks, choose
 from rewild4d.datasets.keypoints.keypoints import BADJA_SIZE, OfFrames, badja_joints, bounded, not_used
 from rewild4d.datasets.keypoints.tables import Animals, read_table, stem_of
 from rewild4d.errors import UserError, reason, shown
-from rewild4d.texts import decoded, parse_json, read_bytes
+from rewild4d.foreign.texts import decoded, parse_json, read_bytes
 from rewild4d.types import Keypoints
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -166,8 +166,8 @@ def _area(entry: Entry, points: Sequence[tuple[str, float, float, float]]) -> fl
     """Return the area of an annotation's box, or of its points where it has no box."""
     if "bbox" not in entry:
         found = [point for point in points if all(map(math.isfinite, point[1:]))]
-        sides = ([point[axis] for point in found] or [0.0] for axis in (1, 2))
-        return math.prod(max(side) - min(side) for side in sides)
+        columns, rows = [x for _, x, _, _ in found] or [0.0], [y for _, _, y, _ in found] or [0.0]
+        return (max(columns) - min(columns)) * (max(rows) - min(rows))
     _, _, width, height = entries.box_of(entry)
     if not (width > 0 and height > 0):
         raise Unusable("have an empty bbox", entries.shown(entry, "bbox"))

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rewild4d.datasets.keypoints.entries import Entry, LeftOut, Unusable, numbers, short, shown
 from rewild4d.errors import UserError
-from rewild4d.texts import read_json
+from rewild4d.foreign.texts import read_json
 from rewild4d.types import Crop, Keypoints
 
 BADJA = {

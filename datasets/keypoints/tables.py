@@ -54,7 +54,7 @@ def _sleap(rows: Sequence[Sequence[str]], stems: Sequence[str], separator: str) 
         points = [
             (node, cell(f"{node}.x") + 0.5, cell(f"{node}.y") + 0.5, cell(f"{node}.score", 1.0)) for node in nodes
         ]
-        scores = [score for *place, score in points if all(map(math.isfinite, place[1:]))]
+        scores = [score for _, x, y, score in points if math.isfinite(x) and math.isfinite(y)]
         mean = sum(scores) / len(scores) if scores else 0.0
         animal = Instance(row.get("track", "").strip(), cell("instance.score", mean), tuple(points))
         frame = row.get("frame_idx", "").strip()

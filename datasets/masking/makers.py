@@ -16,7 +16,7 @@ import numpy as np
 from rewild4d.datasets.masking.masks import list_images, match_masks, open_masks
 from rewild4d.errors import UserError
 from rewild4d.files import atomic, command_words
-from rewild4d.programs import TIMEOUT, run_foreign
+from rewild4d.foreign.programs import TIMEOUT, run_foreign
 
 Box = tuple[float, float, float, float]
 """Left, top, width, height in pixels."""

@@ -14,7 +14,7 @@ from rewild4d.datasets.keypoints.entries import Entry, LeftOut, Unusable, short,
 from rewild4d.datasets.keypoints.keypoints import APT, coco_keypoints
 from rewild4d.datasets.masking.masks import last_number
 from rewild4d.errors import UserError
-from rewild4d.texts import read_json
+from rewild4d.foreign.texts import read_json
 from rewild4d.types import Keypoints
 
 NAMES = {"howling-monkey": "howling monkey", "raccon": "raccoon", "hourse": "horse"}

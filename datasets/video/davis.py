@@ -23,7 +23,7 @@ from rewild4d.datasets.video.parts import with_parts
 from rewild4d.datasets.video.reader import VideoDataset
 from rewild4d.datasets.video.wild import Masks, Moment, Video, files_identity
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.texts import read_toml
+from rewild4d.foreign.texts import read_toml
 from rewild4d.types import Keypoints
 
 FPS = 24.0

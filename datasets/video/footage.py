@@ -20,7 +20,7 @@ from rewild4d.datasets.images import read_picture
 from rewild4d.datasets.video.video_file import read_video, video_facts
 from rewild4d.errors import UserError
 from rewild4d.files import natural
-from rewild4d.reading import read_array
+from rewild4d.foreign.reading import read_array
 
 IMAGES = (".png", ".jpg", ".jpeg", ".npy")
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")

@@ -176,8 +176,9 @@ class Online(VideoDataset):
         rate = self.fps or FOLDER_FPS
         size = image_size(files[0])
         has_alpha = any(alpha is not None and bool((alpha < 255).any()) for alpha in map(read_transparency, files))
-        notes = () if self.fps else (f"a folder of frames has no frame rate: {FOLDER_FPS:g} a second assumed (--fps)",)
-        return Material(files, tuple(i / rate for i in range(len(files))), size, has_alpha, notes)
+        assumed = f"a folder of frames has no frame rate: {FOLDER_FPS:g} a second assumed (--fps)"
+        times = tuple(i / rate for i in range(len(files)))
+        return Material(files, times, size, has_alpha, () if self.fps else (assumed,))
 
     @cached_property
     def _chosen(self) -> tuple[list[int], str]:

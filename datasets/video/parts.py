@@ -17,7 +17,7 @@ from rewild4d.datasets.masking.masks import NOISE
 from rewild4d.datasets.video.wild import Masks, Video
 from rewild4d.errors import unknown_name
 from rewild4d.files import atomic, cache_folder, digest
-from rewild4d.texts import read_json
+from rewild4d.foreign.texts import read_json
 
 NOTE = "of masks in several parts only the one that goes on from the frame before is taken"
 APART = 0.2

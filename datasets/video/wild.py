@@ -20,7 +20,7 @@ from rewild4d.datasets.video.crops import cut, follow, lost_share
 from rewild4d.datasets.video.travel import TravelMeter
 from rewild4d.errors import UserError
 from rewild4d.files import atomic, cache_folder, digest, file_state, write_text
-from rewild4d.texts import read_json
+from rewild4d.foreign.texts import read_json
 from rewild4d.types import Clip, Crop, Frame, Keypoints, Truth
 
 LEAST_FRAMES = 4

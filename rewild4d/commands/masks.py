@@ -11,7 +11,7 @@ from rewild4d.commands.shared import check_timeout, open_dataset, require_writab
 from rewild4d.config import parse_flags
 from rewild4d.datasets.masking import DETECTOR, SEGMENTER
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.programs import TIMEOUT
+from rewild4d.foreign.programs import TIMEOUT
 
 if TYPE_CHECKING:
     import torch

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import held, write_text
+from rewild4d.foreign.programs import run_foreign
 from rewild4d.metrics.weight_files import Found, import_weights, inspect
 from rewild4d.metrics.weights import FETCH, Archive, home, network, search_folders, table
-from rewild4d.programs import run_foreign
 
 USAGE = """usage: rewild4d-bench weights list                 each network's use, file and state
        rewild4d-bench weights fetch [NAME ...]     download what is missing (200 MB in all), check and convert it;

@@ -10,8 +10,8 @@ import msgspec
 from rewild4d.contracts import Selection
 from rewild4d.errors import UserError, reason, unknown_name
 from rewild4d.files import digest
+from rewild4d.foreign.texts import read_toml
 from rewild4d.metrics import names
-from rewild4d.texts import read_toml
 
 
 class NovelViews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

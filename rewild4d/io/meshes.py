@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from rewild4d.errors import UserError
+from rewild4d.foreign.reading import beside, picture_size, read_bytes, read_numbers
 from rewild4d.io.ply import LARGEST, ROUNDING, read_colored_mesh, require_at_most
 from rewild4d.priors.motion import quats_from_normals
-from rewild4d.reading import beside, picture_size, read_bytes, read_numbers
 from rewild4d.types import Splats
 
 THICKNESS = 0.3

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rewild4d.errors import UserError
-from rewild4d.reading import TEXT, read_bytes, require_room
+from rewild4d.foreign.reading import TEXT, read_bytes, require_room
 
 TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -82,11 +82,11 @@ def _header(path: Path, lines: list[str]) -> tuple[str, list[tuple[str, int, lis
         raise UserError(f"{path}: expected a line 'format' in the PLY header, got none.")
     if len({name for name, _, _ in elements}) < len(elements):
         raise UserError(f"{path}: expected elements with different names in the PLY header, got one name twice.")
-    for name, count, properties in elements:
-        if count and not properties:
-            raise UserError(f"{path}: expected properties of '{name[:40]}' in the PLY header, got none.")
+    for title, rows, properties in elements:
+        if rows and not properties:
+            raise UserError(f"{path}: expected properties of '{title[:40]}' in the PLY header, got none.")
         if len({item.name for item in properties}) < len(properties):
-            raise UserError(f"{path}: expected properties of '{name}' with different names, got one name twice.")
+            raise UserError(f"{path}: expected properties of '{title[:40]}' with different names, got one name twice.")
     return order, elements
 
 

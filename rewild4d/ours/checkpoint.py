@@ -9,7 +9,7 @@ import torch
 
 from rewild4d.errors import UserError
 from rewild4d.files import atomic, digest, load_tensors, save_tensors
-from rewild4d.texts import read_json
+from rewild4d.foreign.texts import read_json
 from rewild4d.types import Clip, Prior
 
 logger = logging.getLogger(__name__)

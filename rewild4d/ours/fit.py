@@ -45,7 +45,8 @@ class Training(GaussianTraining):
 
     def rate(self, name: str, progress: float) -> float:
         rates = self.config.rates
-        return exponential(*getattr(rates, name), progress) * ramp(progress, 0.0, rates.rise)
+        first, last = getattr(rates, name)
+        return exponential(first, last, progress) * ramp(progress, 0.0, rates.rise)
 
     def drawn_losses(self, index: int) -> tuple[dict[str, Tensor], RasterInfo | None, Target]:
         key = self.supervision.draw(self.generator, self.config.mirrored, self.config.cameras)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from rewild4d.errors import UserError
+from rewild4d.foreign.states import Shape, read_as, require_skeleton, require_tensors
 from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.checkpoint import load_fitted, save_fitted
 from rewild4d.ours.config import Config
@@ -18,7 +19,6 @@ from rewild4d.ours.pose import Pose
 from rewild4d.ours.schedule import ramp
 from rewild4d.ours.skinning import SkinningField
 from rewild4d.ours.symmetry import Key
-from rewild4d.states import Shape, read_as, require_skeleton, require_tensors
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Splats
 
 STATE = "ours.pt"
@@ -114,7 +114,8 @@ def load_reconstruction(folder: Path, device: torch.device) -> OursReconstructio
 
 def _from_state(path: Path, state: dict[str, Any], config: Config, device: torch.device) -> OursReconstruction:
     """Return the reconstruction that a state holds, after its shapes were looked at."""
-    saved, sizes = state["model"], {}
+    saved = state["model"]
+    sizes: dict[str, int] = {}
     require_tensors(path, saved, _shapes(config), sizes)
     parts = config.pose.anchor_size if config.deform.anchors else sizes["J"]
     inputs = parts + 3 * (1 + 2 * config.deform.frequencies) + 4 + 3

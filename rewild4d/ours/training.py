@@ -76,7 +76,8 @@ class GaussianTraining(ABC):
     def step(self, index: int) -> dict[str, float]:
         """Take one step; return the figures for the log."""
         config, progress = self.config, index / self.config.iterations
-        self.optimizer.param_groups[NAMES.index("means")]["lr"] = exponential(*config.rates.means, progress)
+        first, last = config.rates.means
+        self.optimizer.param_groups[NAMES.index("means")]["lr"] = exponential(first, last, progress)
         for name, group in zip(self.groups, self.others.param_groups, strict=True):
             group["lr"] = self.rate(name, progress)
         losses, info, target = self.drawn_losses(index)

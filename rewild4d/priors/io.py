@@ -34,8 +34,8 @@ from torch import Tensor
 
 from rewild4d.errors import UserError, shown
 from rewild4d.files import atomic, digest
-from rewild4d.reading import read_arrays
-from rewild4d.texts import parse_json
+from rewild4d.foreign.reading import read_arrays
+from rewild4d.foreign.texts import parse_json
 from rewild4d.transforms import mirror_camera, mirror_transforms
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Prior
 
@@ -129,7 +129,9 @@ def load_prior(path: Path) -> Prior:
         transforms_flip = flipped["transforms_flip"]
     else:
         transforms_flip = mirror_transforms(arrays["transforms"], arrays["mirror"])
-    shared = {key: arrays[key] for key in SHAPES if key not in ("world_to_camera", "intrinsics", "sizes")}
+    shared: dict[str, Any] = {
+        key: arrays[key] for key in SHAPES if key not in ("world_to_camera", "intrinsics", "sizes")
+    }
     text = {key: str(raw[key]) for key in ("name", "provenance", "quality") if key in raw}
     return seal(
         Prior(

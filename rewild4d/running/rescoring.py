@@ -10,6 +10,7 @@ from rewild4d.contracts import DatasetReader
 from rewild4d.errors import UserError
 from rewild4d.evaluation.coverage import coverage
 from rewild4d.evaluation.protocol import find_protocol
+from rewild4d.foreign.texts import parse_json
 from rewild4d.leaderboard.records import FILE, RunRecord, Timing, read_record, write_record
 from rewild4d.machine import code_of, machine, peak_memory_mib, pick_device
 from rewild4d.rasterizer import pick_rasterizer
@@ -18,7 +19,6 @@ from rewild4d.running import provenance
 from rewild4d.running.runner import STAMP, fit_seconds
 from rewild4d.running.scoring import score
 from rewild4d.running.workers import share_cores, this_process
-from rewild4d.texts import parse_json
 
 
 def reader_of(run: Path, record: RunRecord, data: Path | None) -> DatasetReader:

@@ -24,6 +24,7 @@ from rewild4d.evaluation.coverage import coverage
 from rewild4d.evaluation.networks import may_be_scored_now
 from rewild4d.evaluation.protocol import Protocol
 from rewild4d.files import held, remove_leftovers, write_text
+from rewild4d.foreign.texts import read_json
 from rewild4d.kernels.switch import chosen_kernels
 from rewild4d.leaderboard.records import FILE, SCHEMA, RunRecord, Timing, make_run_id, read_record, write_record
 from rewild4d.machine import code_of, machine, peak_memory_mib
@@ -35,7 +36,6 @@ from rewild4d.registry import load_method
 from rewild4d.running import provenance
 from rewild4d.running.scoring import score
 from rewild4d.running.workers import Workers, share_cores, this_process
-from rewild4d.texts import read_json
 from rewild4d.types import Case, Clip, Prior, Truth
 
 STAMP = "fit.json"

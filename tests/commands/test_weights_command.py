@@ -12,7 +12,7 @@ from processes import all_gone, is_alive, numbers_in
 from tiny_weights import Tiny, assert_loaded, make_tiny, status
 
 from rewild4d.commands import weights
-from rewild4d.programs import Ended
+from rewild4d.foreign.programs import Ended
 
 
 @pytest.fixture

@@ -34,3 +34,10 @@ def test_imports_go_down(folder: str) -> None:
         above = {other for other in imported(path) if other != room and FLOOR[other] >= max(2, FLOOR[room])}
         assert not above, f"{path.relative_to(ROOT)} ({room}) imports {', '.join(sorted(above))}"
     assert set(TOP) < set(FLOOR)
+
+
+def test_the_ground_is_small() -> None:
+    modules = [
+        path.name for path in (ROOT / "rewild4d").glob("*.py") if path.name not in ("__init__.py", "__main__.py")
+    ]
+    assert len(modules) <= 12, "a new module belongs into a room"

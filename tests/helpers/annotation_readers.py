@@ -13,9 +13,9 @@ from rewild4d.datasets.masking.masks import open_masks
 from rewild4d.datasets.video.apt_files import read_annotations
 from rewild4d.datasets.video.video_file import read_video, video_facts
 from rewild4d.evaluation.protocol import Protocol
+from rewild4d.foreign.texts import read_toml
 from rewild4d.leaderboard.specs import Spec
 from rewild4d.priors.landmarks import load_mapping
-from rewild4d.texts import read_toml
 
 STEMS, SIZE = ("0", "1", "2"), (96, 64)
 ROOM = Path(__file__).parents[2] / "leaderboard"

@@ -11,15 +11,15 @@ from pathlib import Path
 import pytest
 from processes import all_gone, is_alive, numbers_in
 
-from rewild4d import programs
 from rewild4d.errors import UserError
-from rewild4d.programs import BoundedLog, last_words, run_foreign
+from rewild4d.foreign import programs
+from rewild4d.foreign.programs import BoundedLog, last_words, run_foreign
 
 posix = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc here: processes cannot be looked up")
 PARENT = """
 import sys
 from pathlib import Path
-from rewild4d.programs import run_foreign
+from rewild4d.foreign.programs import run_foreign
 run_foreign(["sh", "-c", "sleep 60 & echo $! $$ > {0}.part; mv {0}.part {0}; wait"], timeout=60)
 """
 
@@ -106,7 +106,7 @@ def test_what_cannot_be_started_or_written_is_a_sentence(tmp_path: Path) -> None
     with pytest.raises(UserError, match="^--tool: expected a program that can be started, but '/no/such': No"):
         run_foreign(["/no/such"], timeout=5, flag="--tool")
     with pytest.raises(
-        UserError, match="^--command: expected a program that can be started, but 'a\\0b': embedded null"
+        UserError, match=r"^--command: expected a program that can be started, but 'a\\x00b': embedded null"
     ):
         run_foreign(["a\0b"], timeout=5)
     with pytest.raises(UserError, match="log: expected a file that can be written, but: No such file or directory"):
