@@ -19,7 +19,7 @@ import msgspec
 import torch
 
 from rewild4d.contracts import DatasetReader, Reconstruction
-from rewild4d.errors import UserError, reason, unknown_name
+from rewild4d.errors import UserError, bounded, reason, unknown_name
 from rewild4d.evaluation.coverage import coverage
 from rewild4d.evaluation.networks import may_be_scored_now
 from rewild4d.evaluation.protocol import Protocol
@@ -246,6 +246,7 @@ class Job:
 
     def fail(self, message: str, case: Case | None = None) -> RunRecord:
         """Record a failure, but never replace a good record."""
+        message = bounded(message)  # errors of other packages may hold a whole file
         print(f"{self.title}: failed: {message}", file=sys.stderr)
         if self._is_good():
             return self.record()
