@@ -60,7 +60,7 @@ def _parts(document: Document, index: int, times: Floats, world: Floats) -> list
     for primitive in document.tree.meshes[node.mesh].primitives:
         if primitive.mode not in (None, 4, 5, 6):
             continue
-        count = document.tree.accessors[primitive.attributes.POSITION].count
+        count = document.count(primitive.attributes.POSITION)
         rigid = np.zeros((count, 1), np.int64), np.ones((count, 1))
         bound = rigid if node.skin is None else influences(document, primitive, bones.shape[1])
         surface = read_surface(document, primitive, np.eye(4), *bound)

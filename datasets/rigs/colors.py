@@ -1,30 +1,26 @@
 """Colours of glTF materials: factors, textures under any wrap mode, linear light to sRGB."""
 
 import numpy as np
-import pygltflib
 from numpy.typing import NDArray
 
 from rewild4d.datasets.rigs.gltf import Document, Floats
+from rewild4d.datasets.rigs.gltf_file import Part
 
 MIRRORED, CLAMPED = 33648, 33071
 
 
-def base_color(material: pygltflib.Material) -> tuple[list[float] | None, pygltflib.TextureInfo | None]:
+def base_color(material: Part) -> tuple[list[float] | None, Part | None]:
     """Return the factor and texture of a material's colour; older programs write its diffuse colour in an extension."""
     older = (material.extensions or {}).get("KHR_materials_pbrSpecularGlossiness")
     if older is not None:  # whoever writes both means the plain block for readers that do not know it
         info = older.get("diffuseTexture")
-        texture = info and pygltflib.TextureInfo(
-            index=info["index"], texCoord=info.get("texCoord", 0), extensions=info.get("extensions", {})
-        )
+        texture = info and Part(info)
         return older.get("diffuseFactor"), texture
     pbr = material.pbrMetallicRoughness
     return (pbr.baseColorFactor, pbr.baseColorTexture) if pbr else (None, None)
 
 
-def base_texture(
-    document: Document, primitive: pygltflib.Primitive, info: pygltflib.TextureInfo
-) -> tuple[Floats, NDArray[np.uint8]]:
+def base_texture(document: Document, primitive: Part, info: Part) -> tuple[Floats, NDArray[np.uint8]]:
     """Return the texture coordinates and an image that may be repeated, whatever the file's wrap modes are."""
     extension = (info.extensions or {}).get("KHR_texture_transform", {})
     channel = extension.get("texCoord", info.texCoord or 0)

@@ -3,23 +3,17 @@
 Follows the glTF 2.0 specification (Khronos): accessors 3.6.2, animations 3.11 and appendix C, images 3.8.
 """
 
-import base64
-import binascii
-import json
-import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
-from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
-import cv2
 import numpy as np
-import pygltflib
 from numpy.typing import NDArray
 
-from rewild4d.errors import UserError
+from rewild4d.datasets.rigs.gltf_file import decoded, fetch, least_alpha, read_file
+from rewild4d.errors import UserError, reason, shown
 
 Floats = NDArray[np.float64]
 
@@ -32,10 +26,23 @@ TYPES: dict[int, type[Any]] = {
     5125: np.uint32,
     5126: np.float32,
 }
-MOST_VALUES = 100_000_000
-"""Of an accessor: a file that says more is damaged."""
+MOST_EMPTY = 1_000_000
+"""Numbers of an accessor without data, which is all zeros but for sparse ones."""
+MOST_REPEATED, MOST_PER_BYTE = 20_000_000, 8
+"""Numbers that may be read in all: so many, and this many for each byte of the file, since parts are read again."""
+MOST_LEVELS = 1000
+"""Of the node hierarchy: rigs have tens."""
 INTERPOLATIONS = (None, "LINEAR", "STEP", "CUBICSPLINE")
 READABLE_EXTENSIONS = {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"}
+
+
+PATHS = ("translation", "rotation", "scale")
+RESTING: tuple[tuple[Callable[[Any], Any], tuple[float, ...]], ...] = (
+    (attrgetter("translation"), (0.0, 0.0, 0.0)),
+    (lambda node: node.rotation if node.matrix is None else None, (0.0, 0.0, 0.0, 1.0)),
+    (attrgetter("scale"), (1.0, 1.0, 1.0)),
+)
+"""What each of `PATHS` is in a node, and where a node says nothing."""
 
 
 class Document:
@@ -47,16 +54,19 @@ class Document:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.tree = _parse(path)
+        self._file = read_file(path)
+        self.tree = self._file.tree
         unreadable = set(self.tree.extensionsRequired or []) - READABLE_EXTENSIONS
         unreadable = {name for name in unreadable if not name.startswith("KHR_materials_")}
         if unreadable:
             raise self.error(f"expected plain glTF, but the file requires {', '.join(sorted(unreadable))}")
         self._buffers: dict[int, bytes] = {}
+        self._values = 0
         self.parents = [-1] * len(self.tree.nodes)
         for index, node in enumerate(self.tree.nodes):
             for child in node.children or []:
                 self.parents[child] = index
+        self.depths = [0] * len(self.tree.nodes)
         self.order = self._topological_order()
 
     def error(self, sentence: str) -> UserError:
@@ -71,7 +81,19 @@ class Document:
                 break
         if len(order) != len(self.parents):
             raise self.error("expected a node hierarchy without cycles and with one parent per node")
+        for index in order:
+            self.depths[index] = self.depths[self.parents[index]] + 1 if self.parents[index] >= 0 else 0
+        if max(self.depths, default=0) >= MOST_LEVELS:
+            raise self.error(f"expected a node hierarchy of at most {MOST_LEVELS} levels, got {max(self.depths) + 1}")
         return order
+
+    def nearest_above(self, chosen: Container[int]) -> list[int]:
+        """Return the nearest ancestor of each node that is among the chosen ones, -1 where none is."""
+        found = [-1] * len(self.parents)
+        for index in self.order:
+            if (parent := self.parents[index]) >= 0:
+                found[index] = parent if parent in chosen else found[parent]
+        return found
 
     def scene_nodes(self) -> list[int]:
         """Return nodes of the default scene (all nodes where the file has no scene), parents first."""
@@ -90,26 +112,14 @@ class Document:
         """Return the bytes of one buffer: embedded, a data URI or a file beside this one."""
         if index not in self._buffers:
             uri = self.tree.buffers[index].uri
-            self._buffers[index] = (self.tree.binary_blob() or b"") if uri is None else self._fetch(uri)
+            self._buffers[index] = (self._file.blob or b"") if uri is None else fetch(self.path, uri)
         return self._buffers[index]
 
     def beside(self) -> Iterator[bytes]:
         """Yield bytes of the buffers and images that lie in files of their own, in the order of the file."""
         for entry in (*self.tree.buffers, *self.tree.images):
             if entry.uri is not None and not entry.uri.startswith("data:"):
-                yield self._fetch(entry.uri)
-
-    def _fetch(self, uri: str) -> bytes:
-        if uri.startswith("data:"):
-            try:
-                return base64.b64decode(uri.partition(",")[2])
-            except binascii.Error as error:
-                raise self.error(f"expected base64 in a data URI, but: {error}") from error
-        file = self.path.parent / unquote(uri)
-        try:
-            return file.read_bytes()
-        except OSError as error:
-            raise self.error(f"expected the file {file} beside it, but: {error.strerror}") from error
+                yield fetch(self.path, entry.uri)
 
     def _view(self, index: int, offset: int, count: int, width: int, dtype: type) -> NDArray[np.generic]:
         """Read count x width components from a buffer view, strided or packed."""
@@ -129,10 +139,11 @@ class Document:
         """Return the decoded accessor, [count, components]; normalised integers become floats in [0, 1] or [-1, 1]."""
         accessor = self.tree.accessors[index]
         if accessor.type not in COMPONENTS or accessor.componentType not in TYPES:
-            raise self.error(f"expected an accessor type that skins use, but accessor {index} is {accessor.type}")
+            raise self.error(
+                f"expected an accessor type that skins use, but accessor {index} is {shown(accessor.type)}"
+            )
         dtype, width = TYPES[accessor.componentType], COMPONENTS[accessor.type]
-        if not 0 <= (count := accessor.count) <= MOST_VALUES:
-            raise self.error(f"expected accessor {index} to hold up to {MOST_VALUES} values, but it says {count}")
+        self._expect(index, accessor.count, width, accessor.bufferView is None)
         if accessor.bufferView is None:
             values = np.zeros((accessor.count, width), dtype)
         else:
@@ -140,12 +151,29 @@ class Document:
         if accessor.sparse is not None:
             places, new = accessor.sparse.indices, accessor.sparse.values
             count, kind = accessor.sparse.count, TYPES[places.componentType]
+            self._expect(index, count, width, False)
             rows = self._view(places.bufferView, places.byteOffset, count, 1, kind)[:, 0].astype(np.int64)
             values = values.copy()
             values[rows] = self._view(new.bufferView, new.byteOffset, count, width, dtype)
         if accessor.normalized:
             return np.maximum(values.astype(np.float64) / np.iinfo(dtype).max, -1.0)
         return values
+
+    def count(self, index: int, times: int = 1) -> int:
+        """Return how many elements an accessor says it has, where so many (``times`` three numbers) can be read."""
+        count: int = self.tree.accessors[index].count
+        self._expect(index, count * times, 3, False)
+        return count
+
+    def _expect(self, index: int, count: int, width: int, empty: bool) -> None:
+        """Refuse an accessor that says more than a file holds, and a file that is read over and over."""
+        held = self._file.size + sum(map(len, self._buffers.values()))
+        most = MOST_EMPTY if empty else MOST_REPEATED + MOST_PER_BYTE * held
+        self._values += count * width
+        if not 0 <= count * width <= most or self._values > MOST_REPEATED + MOST_PER_BYTE * held:
+            raise self.error(
+                f"expected accessor {index} to hold what the file has room for, but it says {shown(count)}"
+            )
 
     def floats(self, index: int) -> Floats:
         """Return the decoded accessor as finite float64, [count, components]."""
@@ -156,35 +184,30 @@ class Document:
 
     def image(self, index: int) -> NDArray[np.uint8]:
         """Return the decoded image, sRGB uint8, [h, w, 3]."""
-        image = self.tree.images[index]
-        if image.bufferView is not None:
-            view = self.tree.bufferViews[image.bufferView]
-            start = view.byteOffset or 0
-            data = self.buffer(view.buffer)[start : start + view.byteLength]
-        else:
-            data = self._fetch(image.uri or "")
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-        if pixels is None:
-            raise self.error(f"expected a png, jpeg or webp texture, but image {index} cannot be decoded")
-        return np.ascontiguousarray(pixels[..., ::-1])
+        return decoded(self.path, self._image_data(index), index)
 
-    @cached_property
-    def _written(self) -> dict[str, Any]:
-        """The file's JSON as it stands there: pygltflib leaves out what it has no field for."""
-        data = self.path.read_bytes()
-        if data[:4] == b"glTF":
-            data = data[20 : 20 + struct.unpack_from("<I", data, 12)[0]]
-        found: dict[str, Any] = json.loads(data)
-        return found
+    def least_alpha(self, index: int) -> float:
+        """Return the least alpha of an image, in [0, 1]."""
+        self.image(index)
+        return least_alpha(self._image_data(index))
+
+    def _image_data(self, index: int) -> bytes:
+        image = self.tree.images[index]
+        if image.bufferView is None:
+            return fetch(self.path, image.uri)
+        view = self.tree.bufferViews[image.bufferView]
+        start = view.byteOffset or 0
+        return self.buffer(view.buffer)[start : start + view.byteLength]
 
     def node_weights(self, index: int) -> list[float] | None:
         """Return weights of the morph targets that a node gives instead of its mesh's; None where it gives none."""
-        weights: list[float] | None = self._written["nodes"][index].get("weights")
+        weights: list[float] | None = self.tree.nodes[index].weights
         return weights
 
     def clip_range(self, animation: int) -> tuple[float, float]:
         """Return the first and last key time of an animation in seconds."""
-        times = [self.floats(sampler.input) for sampler in self.tree.animations[animation].samplers]
+        inputs = {sampler.input: None for sampler in self.tree.animations[animation].samplers}
+        times = [self.floats(index) for index in inputs]
         if not times:
             return 0.0, 0.0
         return min(float(keys.min()) for keys in times), max(float(keys.max()) for keys in times)
@@ -200,16 +223,15 @@ class Document:
                     keys, values = self.floats(sampler.input)[:, 0], self.floats(sampler.output)
                     sampled = sample(keys, values, sampler.interpolation, times, channel.target.path == "rotation")
                     moved[channel.target.node, channel.target.path] = sampled
-        matrices = np.empty((len(times), len(self.tree.nodes), 4, 4))
-        for index, node in enumerate(self.tree.nodes):
+        nodes = self.tree.nodes
+        still = [np.array([values(node) or default for node in nodes]) for values, default in RESTING]
+        matrices = np.tile(compose(*still), (len(times), 1, 1, 1))
+        for index in {node for node, _ in moved}:
+            parts = (moved.get((index, name), rest[index][None]) for name, rest in zip(PATHS, still, strict=True))
+            matrices[:, index] = compose(*parts)
+        for index, node in enumerate(nodes):
             if node.matrix is not None:
                 matrices[:, index] = np.reshape(node.matrix, (4, 4)).T
-            else:
-                matrices[:, index] = compose(
-                    moved.get((index, "translation"), np.array([node.translation or (0.0, 0.0, 0.0)])),
-                    moved.get((index, "rotation"), np.array([node.rotation or (0.0, 0.0, 0.0, 1.0)])),
-                    moved.get((index, "scale"), np.array([node.scale or (1.0, 1.0, 1.0)])),
-                )
         return matrices
 
     def global_matrices(self, local: Floats) -> Floats:
@@ -219,21 +241,6 @@ class Document:
             if self.parents[index] >= 0:
                 matrices[:, index] = matrices[:, self.parents[index]] @ local[:, index]
         return matrices
-
-
-def _parse(path: Path) -> pygltflib.GLTF2:
-    try:
-        head = path.open("rb").read(4)
-    except OSError as error:
-        raise UserError(f"{path}: expected a .glb or .gltf file, but: {error.strerror}.") from error
-    try:
-        tree = pygltflib.GLTF2()
-        tree = tree.load_binary(str(path)) if head == b"glTF" else tree.load_json(str(path))
-    except (ValueError, KeyError, TypeError, AttributeError, OSError, RecursionError, struct.error) as error:
-        raise UserError(f"{path}: expected a .glb or .gltf file, but it cannot be parsed ({error}).") from error
-    if tree is None or tree.asset is None or not str(tree.asset.version or "").startswith("2"):
-        raise UserError(f"{path}: expected glTF version 2, but it is another format or version.")
-    return tree
 
 
 @contextmanager
@@ -246,8 +253,17 @@ def consistent(path: Path) -> Iterator[None]:
     try:
         with np.errstate(divide="ignore", invalid="ignore"):  # what comes of it is looked at
             yield
-    except (IndexError, KeyError, TypeError, ValueError, AttributeError) as error:  # a singular matrix is a ValueError
-        raise UserError(f"{path}: expected a consistent glTF, but what it says does not fit ({error}).") from error
+    except (
+        LookupError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        OverflowError,
+        MemoryError,
+    ) as error:  # a singular matrix: ValueError
+        raise UserError(
+            f"{path}: expected a consistent glTF, but what it says does not fit ({reason(error)})."
+        ) from error
 
 
 def sample(keys: Floats, values: Floats, interpolation: str | None, times: Floats, is_rotation: bool) -> Floats:

@@ -1,17 +1,17 @@
 """Morph targets of glTF meshes: displacements of the vertices, mixed by weights that may change over time."""
 
 import numpy as np
-import pygltflib
 
 from rewild4d.datasets.rigs.gltf import Document, Floats, sample
+from rewild4d.datasets.rigs.gltf_file import Part
 
 STILL = 1e-4
 """Of the mesh's size: morph targets that move vertices by less keep still."""
 
 
-def target_offsets(document: Document, primitive: pygltflib.Primitive) -> Floats:
+def target_offsets(document: Document, primitive: Part) -> Floats:
     """Return displacements of each morph target of a primitive, zero where it moves nothing, [targets, n, 3]."""
-    count = document.tree.accessors[primitive.attributes.POSITION].count
+    count = document.count(primitive.attributes.POSITION, len(primitive.targets or []))
     offsets = np.zeros((len(primitive.targets or []), count, 3))
     for row, target in enumerate(primitive.targets or []):
         accessor = target.get("POSITION") if isinstance(target, dict) else getattr(target, "POSITION", None)
@@ -35,9 +35,7 @@ def target_weights(document: Document, animation: int, node: int, targets: int, 
     return np.tile(np.array(still or [0.0] * targets)[:targets], (len(times), 1))
 
 
-def still_offsets(
-    document: Document, animation: int, node: int, primitive: pygltflib.Primitive, times: Floats
-) -> Floats | float:
+def still_offsets(document: Document, animation: int, node: int, primitive: Part, times: Floats) -> Floats | float:
     """Return what the morph targets of a primitive add to its vertices all through a clip, [n, 3]; 0 without any.
 
     Raises:

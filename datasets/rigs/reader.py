@@ -10,12 +10,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import pygltflib
 from numpy.typing import NDArray
 
 from rewild4d.datasets.rigs.animal import AnimatedAnimal, Surface
 from rewild4d.datasets.rigs.colors import base_color, base_texture, linear_to_srgb
 from rewild4d.datasets.rigs.gltf import Document, Floats, consistent
+from rewild4d.datasets.rigs.gltf_file import Part
 from rewild4d.datasets.rigs.morphs import still_offsets
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import digest
@@ -110,13 +110,13 @@ def _read_rig(path: Path, clip: str, shares: Floats) -> AnimatedAnimal:
 
 
 def _clip_names(document: Document) -> list[str]:
-    names: list[str] = []
+    names: dict[str, None] = {}  # in order
     for index, clip in enumerate(document.tree.animations):
         name = clip.name or f"clip_{index}"
         while name in names:
             name = f"{name}_{index}"
-        names.append(name)
-    return names
+        names[name] = None
+    return list(names)
 
 
 def _folder_name(name: str) -> str:
@@ -126,13 +126,18 @@ def _folder_name(name: str) -> str:
 
 @dataclass
 class _Skeleton:
-    """Bones as they are gathered from skins and attached parts: bone b is node nodes[b] with rest[b]."""
+    """Bones as they are gathered from skins and attached parts: bone b is node nodes[b] with rest[b].
+
+    The bones of a node are bones[node]; of a skin, what moves its mesh into the world and its bones are skins[skin].
+    """
 
     document: Document
     animation: int
     times: Floats
     nodes: list[int] = field(default_factory=list)
     rest: list[Floats] = field(default_factory=list)
+    bones: dict[int, list[int]] = field(default_factory=dict)
+    skins: dict[int, tuple[Floats, NDArray[np.int64]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.local = self.document.local_matrices(None, np.zeros(1))[0]
@@ -145,17 +150,19 @@ class _Skeleton:
 
         Two skins may bind one joint differently; then it becomes two bones, and the skinning stays exact.
         """
-        for bone, (known, matrix) in enumerate(zip(self.nodes, self.rest, strict=True)):
-            if known == node and np.allclose(matrix, rest, rtol=1e-4, atol=1e-5 * np.abs(rest[:3]).max()):
+        known = self.bones.setdefault(node, [])
+        for bone in known:
+            if np.allclose(self.rest[bone], rest, rtol=1e-4, atol=1e-5 * np.abs(rest[:3]).max()):
                 return bone
+        known.append(len(self.nodes))
         self.nodes.append(node)
         self.rest.append(rest)
-        return len(self.nodes) - 1
+        return known[-1]
 
     def parents(self) -> NDArray[np.int64]:
         """Return the nearest ancestor that is a bone, -1 for a root, [J]."""
-        first = {node: bone for bone, node in reversed(list(enumerate(self.nodes)))}
-        return np.array([next((first[n] for n in self.ancestors(node) if n in first), -1) for node in self.nodes])
+        above = self.document.nearest_above(self.bones)
+        return np.array([self.bones[above[node]][0] if above[node] >= 0 else -1 for node in self.nodes])
 
     def ancestors(self, node: int) -> list[int]:
         """Return ancestors of a node, the nearest first."""
@@ -166,8 +173,7 @@ class _Skeleton:
 
     def sorted(self, animal: AnimatedAnimal) -> AnimatedAnimal:
         """Return the same animal with parents before children (Artemis wants a root in row 0)."""
-        depth = {node: len(self.ancestors(node)) for node in self.nodes}
-        order = np.array(sorted(range(len(self.nodes)), key=lambda bone: depth[self.nodes[bone]]))
+        order = np.array(sorted(range(len(self.nodes)), key=lambda bone: self.document.depths[self.nodes[bone]]))
         rank = np.argsort(order)
         old = animal.parents[order]
         surfaces = tuple(replace(s, bone_indices=rank[s.bone_indices]) for s in animal.surfaces)
@@ -182,12 +188,16 @@ class _Skeleton:
 
 
 def _skinned_surfaces(document: Document, skeleton: _Skeleton, node: int) -> list[Surface]:
-    joints: list[int] = document.tree.skins[document.tree.nodes[node].skin].joints
-    inverse_bind = inverse_binds(document, document.tree.nodes[node].skin)
-    root = next(k for k, joint in enumerate(joints) if not set(skeleton.ancestors(joint)) & set(joints))
-    to_world = skeleton.default[joints[root]] @ inverse_bind[root]  # mesh space -> the rest pose in the world
-    bones = np.array([skeleton.add(j, to_world @ np.linalg.inv(m)) for j, m in zip(joints, inverse_bind, strict=True)])
-    return _bound_surfaces(document, skeleton, node, to_world, bones, is_skinned=True)
+    skin = document.tree.nodes[node].skin
+    if skin not in skeleton.skins:
+        joints: list[int] = document.tree.skins[skin].joints
+        inverse_bind = inverse_binds(document, skin)
+        above = document.nearest_above(set(joints))
+        root = next(k for k, joint in enumerate(joints) if above[joint] < 0)
+        to_world = skeleton.default[joints[root]] @ inverse_bind[root]  # mesh space -> the rest pose in the world
+        rest = to_world @ np.linalg.inv(inverse_bind)
+        skeleton.skins[skin] = to_world, np.array([skeleton.add(*each) for each in zip(joints, rest, strict=True)])
+    return _bound_surfaces(document, skeleton, node, *skeleton.skins[skin], is_skinned=True)
 
 
 def _bound_surfaces(
@@ -200,7 +210,7 @@ def _bound_surfaces(
             if is_skinned:
                 indices, weights = influences(document, primitive, len(bones))
             else:
-                count = document.tree.accessors[primitive.attributes.POSITION].count
+                count = document.count(primitive.attributes.POSITION)
                 indices, weights = np.zeros((count, 1), dtype=np.int64), np.ones((count, 1))
             offsets = still_offsets(document, skeleton.animation, node, primitive, skeleton.times)
             surfaces.append(read_surface(document, primitive, to_world, bones[indices], weights, offsets))
@@ -223,20 +233,20 @@ def inverse_binds(document: Document, skin: int) -> Floats:
 def _attached_surfaces(document: Document, skeleton: _Skeleton, node: int) -> list[Surface]:
     """Return the rigid parts that hang from a joint without a skin; parts that hang from none are scenery."""
     line = [node, *skeleton.ancestors(node)]
-    above = next((k for k, n in enumerate(line) if n in skeleton.nodes), None)
+    above = next((k for k, n in enumerate(line) if n in skeleton.bones), None)
     if above is None:
         return []
     between = np.eye(4)
     for link in reversed(line[:above]):
         between = between @ skeleton.local[link]
-    bone = skeleton.nodes.index(line[above])
+    bone = skeleton.bones[line[above]][0]
     to_world = skeleton.rest[bone] @ between
     if skeleton.animated & set(line[:above]):  # it moves against the joint, so it is a bone of its own
         bone = skeleton.add(node, to_world)
     return _bound_surfaces(document, skeleton, node, to_world, np.array([bone]), is_skinned=False)
 
 
-def influences(document: Document, primitive: pygltflib.Primitive, count: int) -> tuple[NDArray[np.int64], Floats]:
+def influences(document: Document, primitive: Part, count: int) -> tuple[NDArray[np.int64], Floats]:
     """Return the joint numbers within a skin of ``count`` joints and weights that sum to one, both [n, 4 k].
 
     Raises:
@@ -263,7 +273,7 @@ def influences(document: Document, primitive: pygltflib.Primitive, count: int) -
 
 def read_surface(
     document: Document,
-    primitive: pygltflib.Primitive,
+    primitive: Part,
     to_world: Floats,
     indices: NDArray[np.int64],
     weights: Floats,
@@ -288,7 +298,7 @@ def read_surface(
     )
 
 
-def _faces(document: Document, primitive: pygltflib.Primitive, count: int) -> NDArray[np.int64]:
+def _faces(document: Document, primitive: Part, count: int) -> NDArray[np.int64]:
     """Return triangles, [f, 3], of lists, strips and fans, indexed or not."""
     if primitive.indices is None:
         corners = np.arange(count)

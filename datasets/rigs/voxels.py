@@ -16,8 +16,8 @@ CELLS = 96
 INFLUENCES = 10
 """Bones per voxel at most, as in the original data (FORMATS, 1.6)."""
 
-CHUNK = 65536
-"""Voxels whose dense weight rows are held at a time."""
+CHUNK = 1 << 24
+"""Weights of voxels that are held at a time, a dense row of all bones each."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,9 @@ def _nearest_weights(
     faces, uv, _ = closest_points(triangles, points)
     ends = np.cumsum([len(surface.faces) for surface in surfaces])
     indices, weights = np.empty((len(points), keep), np.int64), np.empty((len(points), keep))
-    for start in range(0, len(points), CHUNK):
-        rows = slice(start, start + CHUNK)
+    step = max(1, CHUNK // bones)
+    for start in range(0, len(points), step):
+        rows = slice(start, start + step)
         dense = np.zeros((len(points[rows]), bones))
         owner = np.searchsorted(ends, faces[rows], side="right")
         for number, surface in enumerate(surfaces):

@@ -85,9 +85,17 @@ def test_numbers_of_an_obj_above_one_are_no_colours(tmp_path: Path) -> None:
 
 def gaussian(folder: Path, extra: dict[str, float], without: tuple[str, ...] = ()) -> Path:
     """One Gaussian with scales 1, 2 and 3 and an opacity of one half."""
-    values = {"x": 0, "y": 0, "z": 0, "f_dc_0": 0, "f_dc_1": 0, "f_dc_2": 0, "opacity": 0, "scale_0": 0,
-              "scale_1": math.log(2), "scale_2": math.log(3), "rot_0": 1, "rot_1": 0, "rot_2": 0,
-              "rot_3": 0}  # fmt: skip
+    places = {"x": 0, "y": 0, "z": 0, "f_dc_0": 0, "f_dc_1": 0, "f_dc_2": 0, "opacity": 0}
+    shape = {
+        "scale_0": 0,
+        "scale_1": math.log(2),
+        "scale_2": math.log(3),
+        "rot_0": 1,
+        "rot_1": 0,
+        "rot_2": 0,
+        "rot_3": 0,
+    }
+    values = {**places, **shape}
     values = {name: value for name, value in (values | extra).items() if name not in without}
     header = "".join(f"property float {name}\n" for name in values)
     body = struct.pack(f"<{len(values)}f", *values.values())
