@@ -23,6 +23,8 @@ from rewild4d.foreign.texts import decoded, parse_json, read_bytes
 from rewild4d.types import Keypoints
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
+SCORED = 0.3
+"""Confidence from which a point counts that a program wrote in place of COCO's 1 and 2: MMPose's own cut-off."""
 FORMS = "keypoints as BADJA, COCO, DeepLabCut or SLEAP write them"
 
 
@@ -84,11 +86,12 @@ def _read(path: Path, stems: Sequence[str], size: tuple[int, int], left: LeftOut
         )
     try:
         text = decoded(data)
-        if path.suffix.lower() == ".csv":
+        suffix, begin = path.suffix.lower(), text.lstrip()[:1]
+        if suffix == ".csv" or (suffix != ".json" and begin not in ("{", "[")):
             return read_table(text, stems)
         content = parse_json(text, path, FORMS)
         if not isinstance(content, list):
-            return _coco(content, left), 0.0
+            return _coco(content, left), SCORED
         if content and all(isinstance(entry, dict) and {"image_id", "keypoints"} <= {*entry} for entry in content):
             raise ValueError(
                 "a list of COCO results, which names neither images nor points: a file with images, annotations and "
@@ -157,7 +160,8 @@ def _annotated(images: Mapping[Any, Entry], kinds: Mapping[Any, Entry], entry: E
     names = [str(name) for name in kind["keypoints"]]
     values = entries.triples_of(entry, len(names))
     triples = zip(names, values[0::3], values[1::3], values[2::3], strict=True)
-    points = tuple((name, x + 0.5, y + 0.5, 1.0 if seen > 0 else math.nan) for name, x, y, seen in triples)
+    # 0, 1 and 2 say whether a point is there; programs that detect points write how sure they are
+    points = tuple((name, x + 0.5, y + 0.5, min(seen, 1.0) if seen > 0 else math.nan) for name, x, y, seen in triples)
     track = entry.get("track_id")
     return stem_of(image["file_name"]), Instance("" if track is None else shown(track), _area(entry, points), points)
 

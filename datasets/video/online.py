@@ -246,7 +246,8 @@ class Online(VideoDataset):
             masks, note = self._mask_match
             return partial(read_masks, masks, object_id, range(len(indices)), size), note
         if self._mask_place is None:
-            return self._alphas, "masks are the frames' alpha channel"
+            notes = "masks are the frames' alpha channel", self._alpha_meaning.note
+            return self._alphas, "; ".join(filter(None, notes))
         return self._video_masks(self._mask_place)
 
     def _video_masks(self, path: Path) -> tuple[Masks, str]:
@@ -271,7 +272,19 @@ class Online(VideoDataset):
             return read_images([self._material.files[i] for i in indices], self._material.size)
         return (frame[..., :3] for frame in _picked(read_video(self.root), indices))
 
+    @cached_property
+    def _alpha_meaning(self) -> Meaning:
+        census = Census(is_lossy=True)
+        for alpha in self._stored_alphas():
+            if alpha is not None:
+                census.add(alpha)
+        return census.meaning()
+
     def _alphas(self) -> Iterator[np.ndarray | None]:
+        meaning = self._alpha_meaning
+        return (None if alpha is None else meaning.mask(alpha, None) for alpha in self._stored_alphas())
+
+    def _stored_alphas(self) -> Iterator[np.ndarray | None]:
         indices = self._chosen[0]
         if self._material.files:
             chosen = [self._material.files[i] for i in indices]

@@ -19,6 +19,7 @@ import imageio_ffmpeg
 import numpy as np
 
 from rewild4d.errors import UserError
+from rewild4d.files import file_state
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".gif", ".mpg", ".mpeg", ".wmv", ".ts", ".3gp")
 _TIME = re.compile(r"showinfo.*\bn: *\d+ .*\bpts_time:(\S+)")
@@ -121,7 +122,7 @@ def _complaint(said: str) -> str:
 
 def _frames(path: Path, log: IO[str]) -> Iterator[np.ndarray]:
     """Decode; ffmpeg's words go to ``log``."""
-    decoder, square = _header(path)
+    decoder, square = _header(path, file_state(path))
     command = [
         imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-nostats", "-loglevel", "level+info",
         *decoder, "-i", f"file:{path}", "-map", "0:v:0", "-fps_mode", "passthrough",
@@ -149,10 +150,14 @@ def _pam(pipe: IO[bytes]) -> np.ndarray | None:
 
 
 @lru_cache(maxsize=8)
-def _header(path: Path) -> tuple[tuple[str, ...], str]:
+def _header(path: Path, state: str) -> tuple[tuple[str, ...], str]:
     """Return the decoder that the header asks for, and the filter that makes pixels square ("" where they are).
 
     ffmpeg's own VP8 and VP9 decoders drop the alpha channel; libvpx keeps it.
+
+    Args:
+        path: the video.
+        state: changes with the file.
 
     Raises:
         UserError: pixels of a shape that no camera has.

@@ -163,6 +163,17 @@ def test_coco_that_other_programs_write(change: dict[str, object], tmp_path: Pat
     assert noses(found) == [[30.5, 20.5], None, None] and found[0] is not None and not found[0].visible[1]
 
 
+def test_scores_in_place_of_cocos_visibility(tmp_path: Path) -> None:
+    found, told = read_keypoints(coco(tmp_path / "a.json", keypoints=[30, 20, 0.31, 50, 20, 0.29]), STEMS, SIZE)
+    assert noses(found) == [[30.5, 20.5], None, None] and found[0] is not None and not found[0].visible[1]
+    assert told == "1 of 2 keypoints kept, 1 have a score below 0.3"
+
+
+def test_a_table_of_another_ending_is_a_table(tmp_path: Path) -> None:
+    (tmp_path / "a.tsv").write_text("frame_idx\tnose.x\tnose.y\n0\t30\t20\n")
+    assert noses(read_keypoints(tmp_path / "a.tsv", STEMS, SIZE)[0]) == [[30.5, 20.5], None, None]
+
+
 @pytest.mark.parametrize(
     ("name", "data", "message"),
     [

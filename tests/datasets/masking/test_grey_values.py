@@ -133,6 +133,16 @@ def test_a_film_of_masks_reaches_its_white(white: int, tmp_path: Path) -> None:
     assert any("taken as the inside of the animal" in note for note in video.notes) == (white == 128)
 
 
+def test_frames_whose_animal_is_half_transparent(tmp_path: Path) -> None:
+    for i in range(5):
+        moving.save(tmp_path / "rgba" / f"{i}.png", np.dstack((moving.image(i), moving.mask(i) // 255 * 100)))
+    video = Online(tmp_path / "rgba").video("rgba")
+    found = list(video.masks())[3]
+    assert found is not None and (found == moving.mask(3)).all()
+    told = "masks are the frames' alpha channel; masks reach 100 of 255: taken as the inside of the animal"
+    assert told in video.notes
+
+
 def test_davis_of_grey_128(tmp_path: Path) -> None:
     reader = Davis(moving.davis(tmp_path, values=(0, 128), mode="L"))
     assert reader.cases(SELECTION) == ["camel"]
