@@ -20,6 +20,7 @@ from tqdm import tqdm
 from rewild4d.contracts import Selection
 from rewild4d.errors import UserError
 from rewild4d.files import atomic, cache_folder, digest, file_state
+from rewild4d.reading import picture_size, read_bytes
 from rewild4d.types import Camera
 
 BOX_ALPHA = 25
@@ -255,10 +256,8 @@ def expect_size(path: Path, image: np.ndarray, size: tuple[int, int] | None, oth
 
 
 def _decode(path: Path, mode: int, upright: bool = False) -> np.ndarray:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: expected an image that can be read, but: {error.strerror}.") from error
+    data = read_bytes(path, "an image that can be read")
+    picture_size(path, data)
     fault = _fault(data)
     # Cameras know nothing of EXIF, so an orientation tag must not rotate the image.
     mode = mode if upright else mode | cv2.IMREAD_IGNORE_ORIENTATION

@@ -17,6 +17,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from rewild4d.datasets.masking.meaning import Census, Meaning
 from rewild4d.errors import UserError
 from rewild4d.files import natural
+from rewild4d.reading import picture_size
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 LOSSY = (".jpg", ".jpeg", ".webp")
@@ -171,6 +172,7 @@ def read_transparency(file: Path) -> np.ndarray | None:
 @contextmanager
 def _opened(file: Path, what: str = "a mask image") -> Iterator[Image.Image]:
     """Return an image file, decoded in the block."""
+    picture_size(file, file)
     try:
         with Image.open(file) as image:
             yield image

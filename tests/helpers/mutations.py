@@ -3,6 +3,7 @@
 A zip (npz, pth) and a glb are also opened and put together again, so that damage gets past checksums and lengths.
 """
 
+import contextlib
 import io
 import random
 import re
@@ -73,9 +74,17 @@ def drive(name: str, reader: Reader, folder: Path, count: int) -> Findings:
     whole = path.read_bytes()
     reader.read(path)
     found = Findings()
-    _forget_peak()
-    before = _peak()
-    for number in range(count):
+    with measured() as grown:
+        _read_all(name, reader, path, whole, range(count), found)
+    path.write_bytes(whole)
+    found.memory = grown()
+    if found.memory > MOST_MEMORY:
+        found.faults.append(f"{found.memory / 2**30:.1f} GiB of memory")
+    return found
+
+
+def _read_all(name: str, reader: Reader, path: Path, whole: bytes, numbers: range, found: Findings) -> None:
+    for number in numbers:
         path.write_bytes(mutate(whole, random.Random(f"{name} {number}")))
         begin = time.perf_counter()
         try:
@@ -84,7 +93,7 @@ def drive(name: str, reader: Reader, folder: Path, count: int) -> Findings:
             found.values += 1
         except UserError as error:
             found.refused += 1
-            if len(said := str(error).replace(str(folder), "")) > LONGEST_MESSAGE or "\n" in said:
+            if len(said := str(error).replace(str(path), "")) > LONGEST_MESSAGE or "\n" in said:
                 found.faults.append(f"{number}: a message of {len(said)} characters: {said[:200]!r}")
         except _TooSlow:
             found.faults.append(f"{number}: no answer")
@@ -94,11 +103,15 @@ def drive(name: str, reader: Reader, folder: Path, count: int) -> Findings:
         found.slowest = max(found.slowest, seconds)
         if seconds > LONGEST_SECONDS:
             found.faults.append(f"{number}: {seconds:.1f} s")
-    path.write_bytes(whole)
-    found.memory = max(0, _peak() - before)
-    if found.memory > MOST_MEMORY:
-        found.faults.append(f"{found.memory / 2**30:.1f} GiB of memory")
-    return found
+
+
+@contextmanager
+def measured() -> Iterator[Callable[[], int]]:
+    """Give a function that returns by how many bytes the process grew at most since the block began."""
+    with contextlib.suppress(OSError):  # another system, or one that does not let us
+        Path("/proc/self/clear_refs").write_text("5")
+    before = _peak()
+    yield lambda: max(0, _peak() - before)
 
 
 def mutate(data: bytes, rng: random.Random) -> bytes:
@@ -253,15 +266,8 @@ def _limited(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def _forget_peak() -> None:
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:  # another system, or one that does not let us
-        return
-
-
 def _peak() -> int:
-    """Return the most memory that the process had since `_forget_peak`, in bytes; 0 where the system does not tell."""
+    """Return the most memory that the process has had since `measured` began, in bytes; 0 where nobody tells."""
     try:
         found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     except OSError:
