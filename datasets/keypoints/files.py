@@ -169,10 +169,10 @@ def _annotated(images: Mapping[Any, Entry], kinds: Mapping[Any, Entry], entry: E
 def _area(entry: Entry, points: Sequence[tuple[str, float, float, float]]) -> float:
     """Return the area of an annotation's box, or of its points where it has no box."""
     if "bbox" not in entry:
-        found = [point for point in points if all(map(math.isfinite, point[1:]))]
-        columns, rows = [x for _, x, _, _ in found] or [0.0], [y for _, _, y, _ in found] or [0.0]
-        return (max(columns) - min(columns)) * (max(rows) - min(rows))
-    _, _, width, height = entries.box_of(entry)
+        found = [(x, y) for _, x, y, seen in points if math.isfinite(x) and math.isfinite(y) and math.isfinite(seen)]
+        width, height = (max(side) - min(side) for side in zip(*found, strict=True)) if found else (0.0, 0.0)
+        return width * height
+    width, height = entries.box_of(entry)[2:]
     if not (width > 0 and height > 0):
         raise Unusable("have an empty bbox", entries.shown(entry, "bbox"))
     return width * height

@@ -59,3 +59,26 @@ def test_a_video_of_changing_rate_has_each_frame_once(score: Call, tmp_path: Pat
     )  # fmt: skip
     found = score("--pred", tmp_path / "p", "--truth", tmp_path / "t", "--only", "psnr")
     assert found["scores"]["psnr"]["count"] == 8 and min(found["scores"]["psnr"]["per_item"]) > 40
+
+
+def test_a_video_of_wide_pixels_is_what_people_see_and_told(score: Call, tmp_path: Path) -> None:
+    """Pixels of 2:1 show a frame of 32x16 as one of 64x16."""
+    for i in range(4):
+        write(tmp_path / "s" / f"{i:05d}.png", flat(20, 60, 90, size=(16, 32)))
+        write(tmp_path / "t" / "v" / f"{i:05d}.png", flat(20, 60, 90, size=(16, 64)))
+    (tmp_path / "p").mkdir()
+    moving.film(
+        tmp_path / "p" / "v.mp4",
+        tmp_path / "s",
+        "-vf",
+        "setsar=2/1",
+        "-c:v",
+        "libx264",
+        "-qp",
+        0,
+        "-pix_fmt",
+        "yuv444p",
+    )
+    found = score("--pred", tmp_path / "p", "--truth", tmp_path / "t", "--only", "psnr")
+    assert found["scores"]["psnr"]["value"] > 40
+    assert any("pixels made square: 32x16 stretched to 64x16" in note for note in found["notes"])
