@@ -244,6 +244,9 @@ class Online(VideoDataset):
         size, (indices, _) = self._material.size, self._chosen
         if self._mask_match:
             masks, note = self._mask_match
+            if masks.meaning.note and len(masks.ids) > 1:
+                taken = "all of them" if object_id is None else f"object {object_id}"
+                note = f"{note}, of which this case takes {taken} (--case)"
             return partial(read_masks, masks, object_id, range(len(indices)), size), note
         if self._mask_place is None:
             notes = "masks are the frames' alpha channel", self._alpha_meaning.note

@@ -25,7 +25,8 @@ SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".gif", ".mpg", ".m
 _TIME = re.compile(r"showinfo.*\bn: *\d+ .*\bpts_time:(\S+)")
 _FAULT = re.compile(r"\[(?:error|fatal)\] (.+)")
 _SHAPE = re.compile(r"showinfo.*\bn: *\d+ .*\bs:(\d+)x(\d+)")
-_ASPECT = re.compile(r"Stream #.*Video:.*\bSAR (\d+):(\d+)")
+_STREAM = re.compile(r"Stream #.*Video:.*")
+_ASPECT = re.compile(r"\bSAR (\d+):(\d+)")
 MOST_ASPECT = 10.0
 """Width over height of a pixel, or height over width, beyond which a header is wrong."""
 ASSUMED_FPS = 25.0
@@ -167,8 +168,10 @@ def _header(path: Path, state: str) -> tuple[tuple[str, ...], str]:
     decoder: tuple[str, ...] = ()
     if re.search(r"alpha_mode\s*: 1", said, re.IGNORECASE):
         decoder = ("-c:v", "libvpx-vp9" if "Video: vp9" in said else "libvpx")
-    aspect = re.search(_ASPECT, said)
-    across, down = (int(aspect[1]), int(aspect[2])) if aspect else (1, 1)
+    stream = re.search(_STREAM, said)
+    # where the container says another shape than the stream in it, both are there, and the container's counts
+    shapes = re.findall(_ASPECT, stream[0]) if stream else []
+    across, down = map(int, shapes[-1]) if shapes else (1, 1)
     if across == down or not across or not down:
         return decoder, ""
     if not 1 / MOST_ASPECT <= across / down <= MOST_ASPECT:

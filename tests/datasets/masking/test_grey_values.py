@@ -117,6 +117,9 @@ def test_a_video_says_what_its_masks_were_taken_for(tmp_path: Path) -> None:
     assert found is not None and (found == moving.mask(2)).all()
     reader = Online(frames, masks=tmp_path / "two")
     assert reader.cases(SELECTION) == ["f", "f@38", "f@75"]
+    told = "masks hold 2 values (38, 75): taken as numbers of objects, of which this case takes"
+    assert f"{told} object 75 (--case)" in reader.video("f@75").notes
+    assert f"{told} all of them (--case)" in reader.video("f").notes
     found = list(reader.video("f@75").masks())[0]
     assert found is not None and (found == np.where(INSIDE > 0, 0, OTHER)).all()
 

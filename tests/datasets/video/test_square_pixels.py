@@ -48,6 +48,14 @@ def test_a_turned_film_is_stretched_across_what_was_down(tmp_path: Path) -> None
     assert facts.stored == (HEIGHT, WIDTH) and (facts.width, facts.height) == (HEIGHT // 2, WIDTH)
 
 
+@pytest.mark.parametrize(("inner", "outer", "width"), [("1/1", "3:1", 2 * WIDTH), ("2/1", "3:2", WIDTH)])
+def test_what_the_container_says_counts(inner: str, outer: str, width: int, tmp_path: Path) -> None:
+    """96x64 pixels are a picture of 3:2 where they are square, of 3:1 where they are twice as wide as high."""
+    path = tmp_path / "b.mp4"
+    moving.ffmpeg("-i", film(tmp_path, inner), "-c", "copy", "-aspect", outer, path)
+    assert (video_facts(path).width, next(read_video(path)).shape[1]) == (width, width)
+
+
 def test_masks_of_either_shape_fit_and_the_record_is_told(tmp_path: Path) -> None:
     path = film(tmp_path, "2/1")
     moving.masks(tmp_path / "narrow", count=5)
