@@ -22,6 +22,7 @@ FAULTS: list[tuple[dict[str, object], str, str]] = [
     ({"keypoints": [1, 2]}, "have other keypoints than 51 numbers", "keypoints [1, 2]"),
     ({"track_id": None}, "have no whole number as track_id", "track_id null"),
     ({"track_id": 3.5}, "have no whole number as track_id", "track_id 3.5"),
+    ({"track_id": 1e300}, "have no whole number as track_id", "track_id 1e+300"),
 ]
 
 
@@ -114,10 +115,33 @@ def test_images_of_another_size_than_their_annotations_state(tmp_path: Path) -> 
         reader.unmasked("easy/29wolf/v1C1@3")
 
 
-def test_an_image_of_infinite_width(tmp_path: Path) -> None:
-    sentence = "12 of 12 annotations name an image without width and height .* has image_id 0 with width Infinity"
+@pytest.mark.parametrize(
+    ("width", "got"), [(float("inf"), "Infinity"), (1e300, r"1e\+300"), (0, "0"), (-96, "-96"), (float("nan"), "NaN")]
+)
+def test_an_image_of_no_possible_width(width: float, got: str, tmp_path: Path) -> None:
+    sentence = f"12 of 12 annotations name an image without width and height .* has image_id 0 with width {got} "
     with pytest.raises(UserError, match=sentence):
-        resized(tmp_path, float("inf"), 64).cases(SELECTION)
+        resized(tmp_path, width, 64).cases(SELECTION)
+
+
+@pytest.mark.parametrize("name", [f"clip/{300 * 'x'}.jpg", "../../clip/0.jpg", "clip/0\0.jpg"])
+def test_an_image_that_no_data_set_can_hold(name: str, tmp_path: Path) -> None:
+    """Such names would be asked of the file system, and a case's name is a folder of the results."""
+    file = moving.apt(tmp_path) / "annotations" / "train_annotations.json"
+    table = json.loads(file.read_text())
+    table["images"][4]["file_name"] = name
+    file.write_text(json.dumps(table))
+    told = "name an image that no data set can hold and are left out; the first (id 104) has file_name"
+    reader = AptV2(tmp_path)
+    assert reader.cases(SELECTION) == ["easy/29wolf/v1C1@3"]
+    assert any(told in finding.message for finding in reader.check())
+
+
+def test_keypoints_of_enormous_numbers_are_outside(tmp_path: Path) -> None:
+    points = [1e300, 30, 2] + [0, 0, 0] * 15 + [20, 30, 2]
+    clip, _ = AptV2(moving.apt(tmp_path, keypoints=points)).load("easy/29wolf/v1C1@3", SELECTION)
+    first = clip.frames[0].keypoints
+    assert first is not None and first.visible.sum() == 1 and first.points.isfinite().all()
 
 
 def test_keypoints_outside_the_frame_are_not_visible(tmp_path: Path) -> None:
