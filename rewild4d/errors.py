@@ -10,7 +10,7 @@ MOST_CHARACTERS = 400
 MOST_SHOWN = 60
 """Characters of one value in a message."""
 _MOST_PATH = 280
-"""Characters that the start of a message, its path, keeps whole."""
+"""Characters that the start of a message, its path, keeps whole however long the sentence is."""
 _MOST_NAMES = 200
 """Characters of a list of names."""
 
@@ -34,7 +34,7 @@ def bounded(message: str) -> str:
     path, colon, sentence = message.partition(": ")
     if not colon or len(path) > MOST_CHARACTERS:
         return shortened(message, MOST_CHARACTERS)
-    path = shortened(path, _MOST_PATH)
+    path = shortened(path, max(_MOST_PATH, MOST_CHARACTERS - len(colon) - len(sentence)))
     return path + colon + shortened(sentence, MOST_CHARACTERS - len(path) - len(colon))
 
 

@@ -25,6 +25,11 @@ def test_even_a_path_has_an_end() -> None:
     assert len(said) <= MOST_CHARACTERS
     said = str(UserError(f"{'x' * 390}: expected a number, got a word."))
     assert len(said) <= MOST_CHARACTERS and said.endswith("x: expected a number, got a word.")
+    path = 350 * "x"
+    said = str(UserError(f"{path}: expected a number, but {100 * 'y'}."))
+    assert len(said) <= MOST_CHARACTERS and said.count("x") == 1 + 280 - len("...(350 characters)...")
+    assert str(UserError(f"{path}: {60 * 'y'}")) != (said := str(UserError(f"{path}: {48 * 'y'}")))
+    assert said == f"{path}: {48 * 'y'}" and len(said) == MOST_CHARACTERS
 
 
 def test_control_characters_steer_no_terminal() -> None:
