@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.datasets.rigs.animal import Surface
+from rewild4d.datasets.rigs.colors import baked
 from rewild4d.datasets.rigs.gltf import Document, Floats, consistent
 from rewild4d.datasets.rigs.morphs import target_offsets, target_weights
 from rewild4d.datasets.rigs.reader import clips, influences, inverse_binds, read_surface
@@ -63,7 +64,7 @@ def _parts(document: Document, index: int, times: Floats, world: Floats) -> list
         count = document.count(primitive.attributes.POSITION)
         rigid = np.zeros((count, 1), np.int64), np.ones((count, 1))
         bound = rigid if node.skin is None else influences(document, primitive, bones.shape[1])
-        surface = read_surface(document, primitive, np.eye(4), *bound)
+        surface = baked(read_surface(document, primitive, np.eye(4), *bound))
         targets = target_offsets(document, primitive)
         offsets = np.einsum("tk,knd->tnd", target_weights(document, 0, index, len(targets), times), targets)
         shapes = (replace(surface, vertices=surface.vertices + each) for each in offsets)

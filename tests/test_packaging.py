@@ -104,7 +104,8 @@ def test_imports_are_absolute_and_run_one_way() -> None:
         "rewild4d.leaderboard.records",
         "rewild4d.types",
         "rewild4d.datasets.rigs.animal",  # what reads glTF files, for the files of others
-        "rewild4d.datasets.rigs.gltf",  # and its parts
+        "rewild4d.datasets.rigs.colors",  # and its parts
+        "rewild4d.datasets.rigs.gltf",
         "rewild4d.datasets.rigs.morphs",
         "rewild4d.datasets.rigs.reader",
         "rewild4d.errors",

@@ -11,6 +11,21 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
+class Glow:
+    """Light that a surface sends out, added to what it reflects.
+
+    Attributes:
+        color: linear light, multiplied with the texture where there is one, float64, [3].
+        uv: texture coordinates as `Surface.uv`; or None.
+        texture: sRGB, uint8, [h, w, 3]; or None.
+    """
+
+    color: NDArray[np.float64]
+    uv: NDArray[np.float64] | None = None
+    texture: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True)
 class Surface:
     """One triangle mesh with one material.
 
@@ -23,6 +38,8 @@ class Surface:
         uv: texture coordinates, (0, 0) = the texture's upper left corner, repeated outside [0, 1],
             float64, [n, 2]; or None.
         texture: sRGB, uint8, [h, w, 3]; or None.
+        lit: whether the studio's light shades it.
+        glow: light of its own; or None.
     """
 
     vertices: NDArray[np.float64]
@@ -32,6 +49,8 @@ class Surface:
     colors: NDArray[np.float64]
     uv: NDArray[np.float64] | None = None
     texture: NDArray[np.uint8] | None = None
+    lit: bool = True
+    glow: Glow | None = None
 
     def posed(self, transforms: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the world vertices under the skinning transforms [J, 4, 4] of one moment, [n, 3]."""

@@ -1,8 +1,8 @@
 """A skinned, animated glTF file as an `AnimatedAnimal`.
 
-Read: triangle primitives with skins, flat colours, vertex colours and base colour textures; unskinned meshes that hang
-from a joint, directly or through other nodes; node animation; morph targets that keep still. Not read: transparency,
-static scenery.
+Read: triangle primitives with skins, flat colours, vertex colours and base colour textures; light that materials send
+out; unskinned meshes that hang from a joint, directly or through other nodes; node animation; morph targets that keep
+still. Both sides of every face are drawn. Materials that one sees through are refused; static scenery is left out.
 """
 
 import re
@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rewild4d.datasets.rigs.animal import AnimatedAnimal, Surface
-from rewild4d.datasets.rigs.colors import base_color, base_texture, linear_to_srgb
+from rewild4d.datasets.rigs.colors import (
+    base_color,
+    base_texture,
+    glow_of,
+    linear_to_srgb,
+    require_opaque,
+    whole_range,
+)
 from rewild4d.datasets.rigs.gltf import Document, Floats, consistent
 from rewild4d.datasets.rigs.gltf_file import Part
 from rewild4d.datasets.rigs.morphs import still_offsets
@@ -285,7 +292,9 @@ def read_surface(
     factor, picture = base_color(material) if material else (None, None)
     color = np.tile(np.array(factor or (1.0, 1.0, 1.0, 1.0))[:3], (len(positions), 1))
     if primitive.attributes.COLOR_0 is not None:
-        color = color * document.floats(primitive.attributes.COLOR_0)[:, :3]
+        color = color * whole_range(document, primitive.attributes.COLOR_0)[:, :3]
+    if material is not None:
+        require_opaque(document, primitive, material)
     uv, texture = (None, None) if picture is None else base_texture(document, primitive, picture)
     return Surface(
         vertices=positions @ to_world[:3, :3].T + to_world[:3, 3],
@@ -295,6 +304,8 @@ def read_surface(
         colors=linear_to_srgb(color),
         uv=uv,
         texture=texture,
+        lit=material is None or "KHR_materials_unlit" not in (material.extensions or {}),
+        glow=glow_of(document, primitive, material) if material is not None else None,
     )
 
 

@@ -9,7 +9,8 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from rewild4d.datasets.rigs.animal import Surface
+from rewild4d.datasets.rigs.animal import Glow, Surface
+from rewild4d.datasets.rigs.colors import added, srgb_to_linear
 from rewild4d.datasets.rigs.voxels import barycentric
 from rewild4d.types import Camera
 
@@ -108,11 +109,17 @@ class Picture:
         geometry, primitive = answer["geomID"][where], answer["primID"][where]
         share = barycentric(np.stack((answer["u"][where], answer["v"][where]), axis=1))
         color = np.empty((len(where), 3), np.float32)
+        shade = self._shade(answer["Ng"][where], rays[where, 3:])[:, None]
         for number, surface in enumerate(self.surfaces):
             mine = np.flatnonzero(geometry == number)
             if len(mine):
-                color[mine] = _albedo(surface, surface.faces[primitive[mine]], share[mine])
-        return where, color * self._shade(answer["Ng"][where], rays[where, 3:])[:, None]
+                corners = surface.faces[primitive[mine]]
+                color[mine] = _albedo(surface, corners, share[mine])
+                if surface.lit:
+                    color[mine] *= shade[mine]
+                if surface.glow is not None:
+                    color[mine] = added(color[mine], _emitted(surface.glow, corners, share[mine]))
+        return where, color
 
     def _shade(self, normals: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the factor in [0.7, 1] from the flat normals, turned towards the viewer, [n]."""
@@ -133,6 +140,14 @@ def _albedo(surface: Surface, corners: NDArray[np.int64], share: NDArray[np.floa
     if surface.texture is None or surface.uv is None:
         return color
     return color * sample_texture(surface.texture, np.einsum("nk,nkc->nc", share, surface.uv[corners]))
+
+
+def _emitted(glow: Glow, corners: NDArray[np.int64], share: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the linear light that points of triangles send out, [n, 3]."""
+    if glow.texture is None or glow.uv is None:
+        return np.tile(glow.color, (len(corners), 1))
+    uv = np.einsum("nk,nkc->nc", share, glow.uv[corners])
+    return glow.color * srgb_to_linear(sample_texture(glow.texture, uv))
 
 
 def sample_texture(texture: NDArray[np.uint8], uv: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -61,10 +61,10 @@ def many_primitives(tree: dict[str, Any]) -> None:
 
 
 def seconds(path: Path) -> float:
-    begin = time.perf_counter()
+    begin = time.process_time()
     clips(path)
     load_rig(path, "Trot", 3)
-    return time.perf_counter() - begin
+    return time.process_time() - begin
 
 
 @pytest.mark.parametrize(
@@ -85,11 +85,11 @@ def seconds(path: Path) -> float:
 )  # fmt: skip
 def test_outsized_files_are_refused_soon(tmp_path: Path, change: Any, sentence: str) -> None:
     path = changed(tmp_path, change)
-    begin = time.perf_counter()
+    begin = time.process_time()
     with pytest.raises(UserError, match=sentence):
         clips(path)
         load_rig(path, "Trot", 3)
-    assert time.perf_counter() - begin < SOON
+    assert time.process_time() - begin < SOON
 
 
 def test_a_long_chain_of_bones_is_read_soon(tmp_path: Path) -> None:
@@ -123,11 +123,11 @@ def test_buffers_lie_in_the_folder_of_their_file(tmp_path: Path, uri: str) -> No
     tree = json.loads(path.read_bytes()[20 : 20 + length])
     tree["buffers"][0]["uri"] = uri
     (folder / "rig.gltf").write_text(json.dumps(tree))
-    begin = time.perf_counter()
+    begin = time.process_time()
     for read in (content, lambda path: load_rig(path, "Trot")):
         with pytest.raises(UserError, match="expected names of files in its own folder|it is a device or a pipe"):
             read(folder / "rig.gltf")
-    assert time.perf_counter() - begin < SOON
+    assert time.process_time() - begin < SOON
 
 
 def test_a_buffer_below_its_file_is_read(tmp_path: Path) -> None:
