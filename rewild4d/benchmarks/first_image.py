@@ -1,7 +1,7 @@
 """Import the rasterizer in a fresh process and render one image with gradients.
 
-`python -m rewild4d.benchmarks.first_image FILE` prints the times as JSON for `probes.py`; it imports no more than a
-user of the rasterizer does.
+`python -m rewild4d.benchmarks.first_image FILE` prints the times as JSON for `probes.py`; it imports only what a user
+of the rasterizer does.
 """
 
 import gc
@@ -20,7 +20,7 @@ def compiled_kernels() -> int:
     """Return how many of our kernels this process compiled because numba's cache lacked them."""
     from numba.core.dispatcher import Dispatcher
 
-    kernels = [each for each in gc.get_objects() if issubclass(type(each), Dispatcher)]  # proxies are left asleep
+    kernels = [each for each in gc.get_objects() if issubclass(type(each), Dispatcher)]  # resolves no lazy proxies
     ours = [each for each in kernels if each.py_func.__module__.startswith("rewild4d.")]
     return sum(sum(each.stats.cache_misses.values()) for each in ours)
 

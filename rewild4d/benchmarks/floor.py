@@ -1,4 +1,4 @@
-"""The arithmetic lower bound: the least time in which this machine can compute an image's blends.
+"""Arithmetic lower bound of the time that this machine needs for an image's blends.
 
     lower bound [s] = B F / R
 
@@ -19,20 +19,15 @@ from rewild4d.benchmarks.scenes import SplatScene
 from rewild4d.kernels.compiling import kernel
 from rewild4d.kernels.simd import LANES, fma, load, splat, store
 from rewild4d.kernels.threads import run, thread_count
-from rewild4d.rasterizer.conventions import FRUSTUM_MARGIN, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from rewild4d.rasterizer.conventions import EPS2D, FRUSTUM_MARGIN, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from rewild4d.transforms import quat_to_matrix
 
 FLOPS_FORWARD, FLOPS_BOTH = 40, 110
 """Operations of a useful blend: forward, and forward with backward."""
-
-EPS2D = 0.3
-"""Variance in square pixels that the rasterizer adds to every projected Gaussian."""
-
 CHAINS = (4, 8)
 """Independent chains of multiply-adds: 8 hide their latency in 32 registers (AVX-512, NEON), 4 fit into 16 (AVX2)."""
-
 ROUNDS = 1_000_000
-"""Links of each chain in one call: a millisecond or two."""
+"""Length of each chain in one call, which takes a millisecond or two."""
 
 
 def floor_ms(blends: int, flops: int, gflops: float) -> float:
@@ -43,8 +38,8 @@ def floor_ms(blends: int, flops: int, gflops: float) -> float:
 def multiply_adds(chains: int) -> None:
     """Do `multiply_adds_flops` operations on all threads."""
     start = np.linspace(0.1, 0.9, LANES, dtype=np.float32)
-    kernel = _four_chains if chains == 4 else _eight_chains
-    run(kernel, [(start, np.empty(LANES, np.float32), ROUNDS) for _ in range(thread_count())])
+    calls = [(start, np.empty(LANES, np.float32), ROUNDS) for _ in range(thread_count())]
+    run(_four_chains if chains == 4 else _eight_chains, calls)
 
 
 def multiply_adds_flops(chains: int) -> int:
@@ -54,7 +49,7 @@ def multiply_adds_flops(chains: int) -> int:
 
 @kernel
 def _four_chains(start: np.ndarray, end: np.ndarray, rounds: int) -> None:
-    """Run independent chains of multiply-adds; they start as data, so that nothing is folded."""
+    """Run independent chains of multiply-adds; their start is an argument, so that nothing is folded."""
     x, y = load(start, 0), splat(np.float32(0.5))
     a, b, c, d = x, x + y, x - y, x * y
     for _ in range(rounds):
@@ -96,8 +91,7 @@ def list_blends(scene: SplatScene) -> Blends:
 
 
 def _projected(scene: SplatScene) -> tuple[np.ndarray, ...]:
-    """Return, front to back, index [n], centre [n, 2], covariance (xx, xy, yy) [n, 3] and opacity [n], float64,
-    pixels."""
+    """Return index [n], centre [n, 2], covariance (xx, xy, yy) [n, 3], opacity [n], front to back, pixels, float64."""
     means, quats, scales, opacities, _ = (tensor.detach().double().numpy() for tensor in scene.gaussians)
     matrix, pinhole = scene.world_to_camera[0].double().numpy(), scene.intrinsics[0].double().numpy()
     local = means @ matrix[:3, :3].T + matrix[:3, 3]
@@ -116,15 +110,10 @@ def _projected(scene: SplatScene) -> tuple[np.ndarray, ...]:
 
 @kernel
 def _walk(
-    index: np.ndarray,
-    centers: np.ndarray,
-    covariances: np.ndarray,
-    opacities: np.ndarray,
-    size: int,
-    pixels: np.ndarray,
-    gaussians: np.ndarray,
-) -> int:
-    """Blend front to back, Gaussian by Gaussian over its rectangle; count the blends, list them if there is room."""
+    index: np.ndarray, centers: np.ndarray, covariances: np.ndarray, opacities: np.ndarray, size: int,
+    pixels: np.ndarray, gaussians: np.ndarray,
+) -> int:  # fmt: skip
+    """Blend front to back, Gaussian by Gaussian over its rectangle; count the blends, and list as many as have room."""
     left = np.ones((size, size))
     count = 0
     for k in range(len(index)):

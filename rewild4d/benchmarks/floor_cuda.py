@@ -1,4 +1,4 @@
-"""Operations a second of a GPU for floor.py: float32 fused multiply-adds on all of its processors."""
+"""Float32 fused multiply-adds on all processors of a GPU, for the lower bound of floor.py."""
 
 import torch
 import triton
@@ -7,15 +7,15 @@ import triton.language as tl
 LANES = tl.constexpr(256)
 CHAINS = 8
 ROUNDS = 20_000
-"""Links of each chain in one call: about a millisecond."""
+"""Length of each chain in one call, which takes about a millisecond."""
 PROGRAMS = 16
-"""Programs of one multiprocessor: as many threads as it holds."""
+"""Programs of one multiprocessor, which fill its threads."""
 WARPS = 4
 
 
 @triton.jit
 def _chains(end: tl.tensor, rounds: tl.tensor) -> None:
-    """Run eight independent chains of multiply-adds; they start as data, so that nothing is folded."""
+    """Run eight independent chains of multiply-adds; their start depends on the lane, so that nothing is folded."""
     index = tl.program_id(0) * LANES + tl.arange(0, LANES)
     x = 0.1 + index.to(tl.float32) / (LANES * tl.num_programs(0))
     y = 0.5 * x

@@ -1,38 +1,37 @@
-"""Rasterizers to compare with: packages of PyPI, and our own dense definition.
+"""Rasterizers to compare with: gsplat and our dense reference.
 
-On a GPU that is gsplat with its CUDA kernels. On a CPU, of the splat rasterizers on PyPI, only gsplat has parts that
-run: `gsplat.cuda._torch_impl`, the torch twin of its kernels. What it takes from CUDA is replaced in its favour: the
-list of useful (pixel, Gaussian) pairs is made beforehand and not timed, and two functions of nerfacc, which blend along
-that list, are written in torch.
+On a GPU gsplat runs its CUDA kernels. On a CPU, of all splat rasterizers on PyPI, only gsplat's torch implementation of
+them runs, `gsplat.cuda._torch_impl`. Its parts in CUDA are replaced in its favour: the list of useful (pixel, Gaussian)
+pairs is given and not timed, and two functions of nerfacc, which blend along that list, are written in torch.
 """
 
 import math
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module, metadata
-from types import ModuleType
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
 import torch
 from torch import Tensor
 
-from rewild4d.benchmarks.floor import EPS2D, list_blends
+from rewild4d.benchmarks.floor import list_blends
 from rewild4d.benchmarks.scenes import SplatScene
+from rewild4d.rasterizer.conventions import EPS2D
 
 Render = Callable[[tuple[Tensor, ...]], Tensor]
 """From a scene's five tensors to its image on black, [3, size, size], differentiable."""
-
 MOST_DENSE = 20_000_000
 """Gaussians times pixels beyond which the dense reference needs too much memory."""
-
 SAME_PSNR = 50.0
 """Least PSNR (dB) against our image for a peer to be timed."""
 
 
 class NotTimed(Exception):
-    """A peer cannot be timed here; the message says why."""
+    """A peer cannot be timed here; the message is the reason."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +47,9 @@ class Peer:
 def installed(peers: tuple[Peer, ...]) -> dict[str, str]:
     """Return the versions of the peers' installed packages."""
     versions = {}
-    for peer in peers:
-        if peer.package:
-            try:
-                versions[peer.package] = metadata.version(peer.package)
-            except metadata.PackageNotFoundError:
-                continue
+    for package in {peer.package: None for peer in peers if peer.package}:
+        with suppress(metadata.PackageNotFoundError):
+            versions[package] = metadata.version(package)
     return versions
 
 
@@ -86,6 +82,7 @@ def _gsplat_twin(scene: SplatScene) -> Render:
     blends = list_blends(scene)
     chosen, pixels = torch.from_numpy(blends.gaussians), torch.from_numpy(blends.pixels)
     images, size = torch.zeros_like(pixels), scene.size
+    nerfacc: Any = SimpleNamespace(render_weight_from_alpha=_weights, accumulate_along_rays=_accumulate)
 
     def render(gaussians: tuple[Tensor, ...]) -> Tensor:
         means, quats, scales, opacities, colors = gaussians
@@ -93,7 +90,7 @@ def _gsplat_twin(scene: SplatScene) -> Render:
         _, centers, _, conics, _ = twin._fully_fused_projection(
             means, covariances, scene.world_to_camera, scene.intrinsics, size, size, eps2d=EPS2D
         )
-        with patch.dict(sys.modules, nerfacc=_nerfacc()):
+        with patch.dict(sys.modules, nerfacc=nerfacc):
             image, _ = twin.accumulate(
                 centers, conics, opacities[None], colors[None], chosen, pixels, images, size, size
             )
@@ -102,16 +99,8 @@ def _gsplat_twin(scene: SplatScene) -> Render:
     return render
 
 
-def _nerfacc() -> ModuleType:
-    """Build the two functions of nerfacc that gsplat's twin blends with; nerfacc's own need CUDA."""
-    module: Any = ModuleType("nerfacc")
-    module.render_weight_from_alpha = _weights
-    module.accumulate_along_rays = _accumulate
-    return module
-
-
 def _weights(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
-    """Compute weight and transmittance of each entry; entries of a pixel are consecutive, front to back, [M] each."""
+    """Return weight and transmittance of each entry, [M]; those of a pixel are consecutive, front to back."""
     logs = torch.log1p(-alphas.double())  # summed over the whole image, so in double precision
     before = logs.cumsum(0) - logs
     counts = torch.bincount(ray_indices, minlength=n_rays)
@@ -121,7 +110,7 @@ def _weights(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, 
 
 
 def _accumulate(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_rays: int) -> Tensor:
-    """Sum per pixel, weighted, [n_rays, C]; the weights alone without values."""
+    """Return the weighted sum per pixel, or that of the weights without values, [n_rays, C]."""
     terms = weights[:, None] if values is None else weights[:, None] * values
     return terms.new_zeros(n_rays, terms.shape[1]).index_add(0, ray_indices, terms)
 
@@ -144,7 +133,6 @@ CUDA_PEERS = (
     Peer("dense torch reference", "", _dense_reference),
 )
 """Peers of the Triton backend, on a GPU."""
-
 PEERS = (
     Peer("gsplat's torch twin", "gsplat", _gsplat_twin, "its list of pairs is given and costs no time"),
     Peer("dense torch reference", "", _dense_reference),

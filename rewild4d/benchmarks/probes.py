@@ -1,4 +1,4 @@
-"""Measure what needs a fresh process: start-up times, kernels missing in the cache, peak memory.
+"""Measure start-up times, compiled kernels and peak memory in fresh processes.
 
 The memory probes run `python -m rewild4d.benchmarks.probes KIND ...`.
 """
@@ -20,8 +20,7 @@ from rewild4d.benchmarks.scenes import SplatScene, splat_scene, training
 from rewild4d.benchmarks.timing import progress
 
 START_COUNT, START_SIZE = 1000, 64
-"""Gaussians and image side of the start-up image: small, so that imports and compilation dominate."""
-
+"""Gaussians and image side of the start-up image; imports and compilation dominate."""
 STATUS = Path("/proc/self/status")
 
 
@@ -44,7 +43,7 @@ def raster_rows(count: int, size: int) -> list[Row]:
 def gpu_memory_row(scene: SplatScene) -> Row:
     """Measure the peak memory of forward and backward on the scene's GPU."""
     device = scene.intrinsics.device
-    forward_backward(scene)  # kernels are loaded, and torch has its workspaces
+    forward_backward(scene)  # loads kernels and allocates torch's workspaces
     torch.cuda.synchronize(device)
     torch.cuda.reset_peak_memory_stats(device)
     before = torch.cuda.memory_allocated(device)
@@ -78,7 +77,7 @@ def _memory_row(found: Mapping[str, float], count: int, size: int) -> Row:
     value, note = None, f"not measured: no {STATUS} here"
     if found:
         value = found["peak"] - found["before"]
-        note = f"above the {found['before']:.0f} MiB that the process held with its inputs"
+        note = f"above the {found['before']:.0f} MiB of the process with its inputs"
     return single_row(OURS, "peak memory", value, "MiB", count, size, note)
 
 
@@ -107,7 +106,7 @@ def forward_backward(scene: SplatScene) -> None:
 
 
 def _raster_memory(file: str) -> dict[str, float]:
-    forward_backward(splat_scene(64, 32))  # loads the machine code
+    forward_backward(splat_scene(64, 32))  # loads the kernels
     scene = SplatScene(*torch.load(file, weights_only=True))
     return _peak(lambda: forward_backward(scene))
 
@@ -123,14 +122,14 @@ def _step_memory(count: str, size: str, preset: str) -> dict[str, float]:
 
 
 def _peak(work: Callable[[], None]) -> dict[str, float]:
-    """Return the resident memory in MiB before some work and at its peak; empty where the system does not say."""
+    """Return the resident memory in MiB before some work and at its peak; empty on systems that do not tell."""
     if not STATUS.is_file():
         return {}
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")  # forget the peak of the imports
     before = _status_mib("VmRSS")
     work()
-    # Not ru_maxrss: after a fork that one starts at the parent's.
+    # ru_maxrss starts at the parent's after a fork
     return {"before": before, "peak": _status_mib("VmHWM")}
 
 

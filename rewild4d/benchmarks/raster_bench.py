@@ -6,16 +6,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from rewild4d.benchmarks import probes
-from rewild4d.benchmarks.floor import (
-    CHAINS,
-    FLOPS_BOTH,
-    FLOPS_FORWARD,
-    count_blends,
-    floor_ms,
-    multiply_adds,
-    multiply_adds_flops,
-)
+from rewild4d.benchmarks import floor, probes
 from rewild4d.benchmarks.peers import PEERS, SAME_PSNR, NotTimed, Peer, Render, psnr
 from rewild4d.benchmarks.results import BOTH, FLOOR, FORWARD, OURS, Row, single_row, timed_row
 from rewild4d.benchmarks.scenes import SplatScene, splat_scene
@@ -23,10 +14,8 @@ from rewild4d.benchmarks.timing import measure, per
 
 Contenders = dict[tuple[str, str], Callable[[], object]]
 """Calls to time, by subject and quantity."""
-
-TURN = 10
-"""Consecutive calls on a GPU, which works while the next call is prepared, before it is waited for."""
-
+QUEUED = 10
+"""Consecutive calls on a GPU before it is waited for, since it works while the next call is prepared."""
 CPU = torch.device("cpu")
 
 
@@ -59,24 +48,24 @@ def scene_rows(
 ) -> list[Row]:
     """Measure one scene, given on the CPU."""
     count, size = len(scene), scene.size
-    blends, placed = count_blends(scene), scene.to(device)
+    blends, placed = floor.count_blends(scene), scene.to(device)
     rows = [single_row("scene", "useful blends", blends, "1", count, size)]
     admitted = {peer: _admit(peer, placed) for peer in peers}
     contenders = _calls(OURS, lambda gaussians: placed.render(gaussians)[0], placed)
     for calls, _ in admitted.values():
         contenders |= calls
     arithmetic, flops = _arithmetic(device)
-    samples = measure({name: _turn(call, device) for name, call in (contenders | arithmetic).items()}, repeats, title)
+    samples = measure({name: _queued(call, device) for name, call in (contenders | arithmetic).items()}, repeats, title)
     if device.type == "cuda":
-        samples = {name: per(sample, TURN) for name, sample in samples.items()}
+        samples = {name: per(sample, QUEUED) for name, sample in samples.items()}
 
     def timed(subject: str, note: str = "") -> list[Row]:
         return [timed_row(*key, samples[key], count, size, note) for key in contenders if key[0] == subject]
 
     gflops = max(flops[key] / samples[key].median / 1e6 for key in arithmetic)
     rows.append(single_row(FLOOR, "multiply-adds", gflops, "GFLOP/s", count, size))
-    for quantity, each in ((FORWARD, FLOPS_FORWARD), (BOTH, FLOPS_BOTH)):
-        rows.append(single_row(FLOOR, quantity, floor_ms(blends, each, gflops), "ms", count, size))
+    for quantity, each in ((FORWARD, floor.FLOPS_FORWARD), (BOTH, floor.FLOPS_BOTH)):
+        rows.append(single_row(FLOOR, quantity, floor.floor_ms(blends, each, gflops), "ms", count, size))
     rows += timed(OURS)
     for peer, (_, found) in admitted.items():
         rows += [*found, *timed(peer.name, peer.note)]
@@ -90,29 +79,30 @@ def _arithmetic(device: torch.device) -> tuple[Contenders, dict[tuple[str, str],
 
         key = (FLOOR, str(floor_cuda.CHAINS))
         return {key: partial(floor_cuda.multiply_adds, device)}, {key: floor_cuda.multiply_adds_flops(device)}
-    keys = {chains: (FLOOR, str(chains)) for chains in CHAINS}
-    calls: Contenders = {key: partial(multiply_adds, chains) for chains, key in keys.items()}
-    return calls, {key: multiply_adds_flops(chains) for chains, key in keys.items()}
+    keys = {chains: (FLOOR, str(chains)) for chains in floor.CHAINS}
+    calls: Contenders = {key: partial(floor.multiply_adds, chains) for chains, key in keys.items()}
+    return calls, {key: floor.multiply_adds_flops(chains) for chains, key in keys.items()}
 
 
-def _turn(call: Callable[[], object], device: torch.device) -> Callable[[], object]:
-    """Return the timed unit: a call, or on a GPU `TURN` of them and the wait for the last."""
+def _queued(call: Callable[[], object], device: torch.device) -> Callable[[], object]:
+    """Return the timed unit: a call, or on a GPU `QUEUED` of them and the wait for the last."""
     if device.type != "cuda":
         return call
 
-    def turn() -> None:
-        for _ in range(TURN):
+    def queued() -> None:
+        for _ in range(QUEUED):
             call()
         torch.cuda.synchronize(device)
 
-    return turn
+    return queued
 
 
 def _admit(peer: Peer, scene: SplatScene) -> tuple[Contenders, list[Row]]:
     """Return the calls of a peer that renders our image, and rows with its PSNR or the reason why it is not timed."""
+    sizes = len(scene), scene.size
 
-    def row(quantity: str, value: float | None, unit: str, note: str = "") -> Row:
-        return single_row(peer.name, quantity, value, unit, len(scene), scene.size, note)
+    def untimed(reason: str) -> list[Row]:
+        return [single_row(peer.name, quantity, None, "ms", *sizes, reason) for quantity in (FORWARD, BOTH)]
 
     try:
         render = peer.prepare(scene)
@@ -121,13 +111,12 @@ def _admit(peer: Peer, scene: SplatScene) -> tuple[Contenders, list[Row]]:
     except Exception as error:
         if not (peer.package or isinstance(error, NotTimed)):
             raise
-        # Foreign code of another version may fail in any way: that is a line in the table, not the end of the run.
-        reason = str(error) if isinstance(error, NotTimed) else f"failed: {type(error).__name__}: {error}"
-        return {}, [row(quantity, None, "ms", reason) for quantity in (FORWARD, BOTH)]
-    parity = row("PSNR against rewild4d", min(alike, 200.0), "dB")  # equal images have no finite one
+        # foreign code of another version may fail in any way: a line in the table, not the end of the run
+        return {}, untimed(str(error) if isinstance(error, NotTimed) else f"failed: {type(error).__name__}: {error}")
+    # equal images have no finite PSNR
+    parity = single_row(peer.name, "PSNR against rewild4d", min(alike, 200.0), "dB", *sizes)
     if alike < SAME_PSNR:
-        reason = f"not timed: another image ({alike:.0f} dB)"
-        return {}, [parity, *(row(quantity, None, "ms", reason) for quantity in (FORWARD, BOTH))]
+        return {}, [parity, *untimed(f"not timed: another image ({alike:.0f} dB)")]
     return _calls(peer.name, render, scene), [parity]
 
 

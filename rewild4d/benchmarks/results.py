@@ -1,4 +1,4 @@
-"""Results of a benchmark as data: one row a number."""
+"""Results of a benchmark: a row for each number."""
 
 import re
 from datetime import UTC, datetime
@@ -19,7 +19,7 @@ FORWARD, BOTH = "forward", "forward+backward"
 
 
 def this_machine(device: torch.device | None = None) -> dict[str, str]:
-    """Describe the machine of a benchmark that uses the device's own backend; by default the CPU's."""
+    """Describe the machine of a benchmark on a device, by default the CPU."""
     device = device or torch.device("cpu")
     return machine(device, pick_rasterizer("auto", device))
 
@@ -59,7 +59,7 @@ class Result(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 def single_row(
     subject: str, quantity: str, value: float | None, unit: str, gaussians: int, size: int, note: str = ""
 ) -> Row:
-    """Return the row of a number that was measured once, or (None) not at all."""
+    """Return the row of a number that was measured once, or of None, which was not."""
     return Row(
         subject=subject, quantity=quantity, value=value, unit=unit, gaussians=gaussians, size=size,
         repeats=int(value is not None), note=note,
@@ -69,17 +69,9 @@ def single_row(
 def timed_row(subject: str, quantity: str, sample: Sample, gaussians: int, size: int, note: str = "") -> Row:
     """Return the row of a measured time."""
     return Row(
-        subject=subject,
-        quantity=quantity,
-        value=sample.median,
-        unit="ms",
-        gaussians=gaussians,
-        size=size,
-        repeats=sample.repeats,
-        minimum=sample.minimum,
-        spread=sample.spread,
-        note=note,
-    )
+        subject=subject, quantity=quantity, value=sample.median, unit="ms", gaussians=gaussians, size=size,
+        repeats=sample.repeats, minimum=sample.minimum, spread=sample.spread, note=note,
+    )  # fmt: skip
 
 
 def to_json(result: Result) -> str:
@@ -97,7 +89,7 @@ def write_result(result: Result, path: Path) -> None:
 
 
 def default_path(benchmark: str, device: torch.device | None = None) -> Path:
-    """Return the path of a result, named after benchmark, processor (or GPU) and day: the last run of a day stays."""
+    """Return the path of a result, named after benchmark, processor (or GPU) and day."""
     found = this_machine(device)
     processor = re.sub(r"[^a-z0-9]+", "-", found.get("gpu", found["processor"]).lower()).strip("-")
     return Path("results", "speed", f"{benchmark}-{processor}-{datetime.now(UTC):%Y-%m-%d}.json")

@@ -1,6 +1,6 @@
 """Scenes to time: an animal-like cloud of Gaussians, and a training step of `ours` on a clip of it.
 
-All of it is procedural and seeded, so that two machines time the same work.
+They are procedural and seeded, so that all machines time the same work.
 """
 
 import math
@@ -24,22 +24,17 @@ from rewild4d.types import Camera, Clip, Frame, Prior
 
 COVERED = 0.25
 """Share of the image that the animal fills."""
-
 OPACITY = 0.7
-
 TILING = 1.5
-"""Standard deviation over the radius of a disc with a Gaussian's share of the surface: the surface is closed."""
-
+"""Standard deviation over the radius of a disc with a Gaussian's share of the surface; closes the surface."""
 FLATNESS = 0.5
 """Scale along the normal over the scale in the surface."""
-
 DISTANCE, AZIMUTH = 12.0, math.radians(40)
 
 FRAMES, FPS = 8, 10.0
-
 PROGRESS = 0.175
-"""Share of the iterations at which a step is timed: under `paper` the deformation is complete (0.15), colour has its
-last degree (0.15), and the pull to the prior (until 0.2) and the geometric losses (until 0.5) still act."""
+"""Share of the iterations at which a step is timed: under `paper` deformation and colour are complete (0.15), and
+the losses of prior (until 0.2) and geometry (until 0.5) act."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +82,7 @@ def splat_scene(count: int, size: int, seed: int = 0) -> SplatScene:
         torch.rand(count, 3, generator=generator),
     )
     focal = 2.5 * size
-    for _ in range(6):  # the covered area grows with the square of the focal length, but for what leaves the frame
+    for _ in range(6):  # the covered area grows with the square of the focal length, except at the border
         camera = _camera(AZIMUTH, focal, size)
         scene = SplatScene(gaussians, camera.world_to_camera[None].float(), camera.intrinsics[None].float(), size)
         focal *= math.sqrt(COVERED / max(coverage(scene), 1e-3))
@@ -110,7 +105,7 @@ def step_config(size: int, gaussians: int, preset: str) -> Config:
 
 
 def training(size: int, gaussians: int, preset: str, device: torch.device | None = None) -> tuple[Training, int]:
-    """Build a main stage of `ours` in its middle; return it and the index of its next step.
+    """Build a training of `ours` at `PROGRESS`; return it and the index of its next step.
 
     Raises:
         UserError: no such preset.
@@ -127,7 +122,7 @@ def training(size: int, gaussians: int, preset: str, device: torch.device | None
 
 
 def posed_clip(size: int, gaussians: int) -> tuple[Clip, Prior]:
-    """Build a clip of the template swinging its legs before a moving camera; the prior is the true motion."""
+    """Build a clip of the template with swinging legs and a moving camera, and the prior of its true motion."""
     prior = _prior(_swing(0.5), [AZIMUTH + math.pi / 2 * index / FRAMES for index in range(FRAMES)], size)
     generator = torch.Generator().manual_seed(1)
     surface = sample_surface(prior, gaussians, generator)
@@ -148,7 +143,7 @@ def _frame(surface: SurfaceSample, colors: Tensor, prior: Prior, index: int) -> 
 
 
 def _camera(azimuth: float, focal: float, size: int) -> Camera:
-    """Build a camera that looks at the middle of the template at rest from a little above."""
+    """Build a camera that looks at the centre of the template at rest from a little above."""
     target = quadruped().vertices.aminmax(dim=0)
     middle = ((target.min + target.max) / 2).double()
     offset = DISTANCE * torch.tensor((math.sin(azimuth), 0.25, math.cos(azimuth)), dtype=torch.float64)

@@ -26,24 +26,16 @@ CPU = torch.device("cpu")
 STEP, CACHED, UNCACHED = "step", "rendering, frames cached", "rendering, frames not cached"
 
 REPORTED = Row(
-    subject="the paper, one A6000",
-    quantity=STEP,
-    value=13 * 60 * 1000 / 10_000,
-    unit="ms",
-    size=512,
-    repeats=0,
+    subject="the paper, one A6000", quantity=STEP, value=13 * 60 * 1000 / 10_000, unit="ms", size=512, repeats=0,
     note="reported: 10,000 iterations at 512² in 13 minutes",
-)
+)  # fmt: skip
 
 PROFILED = 4
-"""Most turns that are profiled: reading the profiler's log takes longer than the steps."""
-
+"""Most periods that are profiled: reading the profiler's log takes longer than the steps."""
 SPAN = 10
-"""Turns after which the index goes back, so that long measurements stay at one point of the schedule."""
-
+"""Periods after which the step index restarts, so that long measurements stay at one point of the schedule."""
 OPERATORS = 12
-"""Number of operators that are listed."""
-
+"""Number of listed operators."""
 ALL, NONE = "all kernels", "no kernel: plain torch"
 SCENES = {"quick": (2_000, 128), "paper": (20_000, 256)}
 """Preset -> Gaussians and image side of the timed step."""
@@ -58,18 +50,18 @@ def bench_step(
     device: torch.device = CPU,
     kernels: bool = False,
 ) -> list[Row]:
-    """Time steps with ``count`` Gaussians at every image side, in turns; profile them; render the result.
+    """Time steps with ``count`` Gaussians at every image side, alternately; profile them; time the rendering.
 
-    ``probe`` adds memory, in its own processes, and ``kernels`` the step with each fused kernel switched off (CPU
-    only).
+    ``probe`` adds memory, in processes of their own, and ``kernels`` the step with each fused kernel switched off (both
+    on the CPU only).
 
     Raises:
         UserError: no such preset.
     """
     steppers = {size: Stepper(count, size, preset, device) for size in sizes}
     for stepper in steppers.values():
-        stepper.turn()  # kernels are compiled: their time is not in anybody's budget
-    samples = measure({size: stepper.turn for size, stepper in steppers.items()}, repeats, "training step")
+        stepper.run_period()  # compiles kernels, untimed
+    samples = measure({size: stepper.run_period for size, stepper in steppers.items()}, repeats, "training step")
     rows = [
         timed_row(OURS, STEP, per(samples[size], stepper.period), count, size) for size, stepper in steppers.items()
     ]
@@ -83,17 +75,14 @@ def bench_step(
 
 
 class Stepper:
-    """A training that continues from turn to turn.
-
-    A turn has ``period`` steps: some losses act only in every n-th step, so single steps differ.
-    """
+    """A training that continues by periods of steps: some losses act only in every n-th step."""
 
     def __init__(self, count: int, size: int, preset: str, device: torch.device = CPU) -> None:
         self.count, self.size, self.device = count, size, device
         self.training, self.first = training(size, count, preset, device)
         self.period, self.taken = loss_period(self.training.config), 0
 
-    def turn(self) -> None:
+    def run_period(self) -> None:
         """Take `period` steps, as `ours.fit.train` does."""
         with torch_on_one():
             for _ in range(self.period):
@@ -101,31 +90,25 @@ class Stepper:
                 self.taken += 1
         _wait(self.device)
 
-    def operators(self, turns: int) -> list[Row]:
+    def operators(self, periods: int) -> list[Row]:
         """Return the operators of torch and our autograd functions that take most time, as shares of all."""
         with (
-            progress(f"profile of a step at {self.size}²", turns) as bar,
+            progress(f"profile of a step at {self.size}²", periods) as bar,
             profile(activities=[ProfilerActivity.CPU]) as profiler,
         ):
-            for _ in range(turns):
-                self.turn()
+            for _ in range(periods):
+                self.run_period()
                 bar.update()
-        steps = turns * self.period
+        steps = periods * self.period
         found = sorted(profiler.key_averages(), key=lambda event: -event.self_cpu_time_total)
         total = sum(event.self_cpu_time_total for event in found)
         return [
             Row(
-                subject=event.key,
-                quantity="share of a step",
-                value=event.self_cpu_time_total / total,
-                unit="1",
-                gaussians=self.count,
-                size=self.size,
-                repeats=steps,
-                note=f"{event.count / steps:.3g} calls a step",
+                subject=event.key, quantity="share of a step", value=event.self_cpu_time_total / total, unit="1",
+                gaussians=self.count, size=self.size, repeats=steps, note=f"{event.count / steps:.3g} calls a step",
             )
             for event in found[:OPERATORS]
-        ]
+        ]  # fmt: skip
 
 
 def loss_period(config: Config) -> int:
@@ -140,19 +123,15 @@ def kernel_rows(repeats: int) -> list[Row]:
     for preset, (count, size) in SCENES.items():
         stepper = Stepper(count, size, preset)
         before = {name: kernel.calls for name, kernel in KERNELS.items()}
-        stepper.turn()
+        stepper.run_period()
         used = [name for name, kernel in KERNELS.items() if kernel.calls > before[name]]
-        choices: dict[str, tuple[str, ...]] = {
-            ALL: (),
-            **{f"without {name}": (name,) for name in used},
-            NONE: tuple(used),
-        }
+        choices: dict[str, list[str]] = {ALL: [], **{f"without {name}": [name] for name in used}, NONE: used}
 
-        def turn(names: tuple[str, ...], stepper: Stepper = stepper) -> None:
-            with without_kernels(*names):
-                stepper.turn()
+        def run(off: list[str], stepper: Stepper = stepper) -> None:
+            with without_kernels(*off):
+                stepper.run_period()
 
-        calls = {name: partial(turn, off) for name, off in choices.items()}
+        calls = {name: partial(run, off) for name, off in choices.items()}
         samples = measure(calls, repeats, f"kernels, {preset}")
         rows += [
             timed_row(name, f"step, preset {preset}", per(sample, stepper.period), count, size)
@@ -162,28 +141,23 @@ def kernel_rows(repeats: int) -> list[Row]:
 
 
 def render_rows(count: int, size: int, repeats: int, preset: str, device: torch.device = CPU) -> list[Row]:
-    """Time the frames of a fitted clip, its Gaussians computed for each frame or kept."""
+    """Time the rendering of a fitted clip's frames, with their Gaussians computed for each frame or kept."""
     clip, prior = posed_clip(size, count)
     config = msgspec.structs.replace(
         step_config(size, count, preset), iterations=1, warmup=WarmUp(iterations=0, regress=0)
     )
-    with progress("a fitted clip", 1) as bar:  # the quality of the fit is nothing to the time of its rendering
+    with progress("a fitted clip", 1) as bar:  # one iteration: quality does not matter for time
         made = Ours().fit(clip, prior, config=config, seed=0, device=device, log=lambda *_: None, workdir=None)
         bar.update()
     views = [(frame.time, frame.camera) for frame in clip.frames if frame.camera is not None]
-    kept = [made.at(time) for time, _ in views]
+    kept = {time: made.at(time) for time, _ in views}
 
-    def cached() -> list[Tensor]:
-        images = [_render(splats, camera) for splats, (_, camera) in zip(kept, views, strict=True)]
+    def draw(splats_at: Callable[[float], Splats]) -> list[Tensor]:
+        images = [_render(splats_at(time), camera) for time, camera in views]
         _wait(device)
         return images
 
-    def uncached() -> list[Tensor]:
-        images = [_render(made.at(time), camera) for time, camera in views]
-        _wait(device)
-        return images
-
-    calls: dict[str, Callable[[], object]] = {CACHED: cached, UNCACHED: uncached}
+    calls = {CACHED: partial(draw, kept.__getitem__), UNCACHED: partial(draw, made.at)}
     samples = measure(calls, repeats, f"rendering at {size}²")
     return [timed_row(OURS, name, per(sample, len(views)), count, size) for name, sample in samples.items()]
 

@@ -1,4 +1,4 @@
-"""Markdown tables of a result; ratios are computed from its rows."""
+"""Format a result as Markdown tables; ratios are computed from its rows."""
 
 import math
 from collections.abc import Sequence
@@ -35,13 +35,13 @@ def _plural(count: int, noun: str) -> str:
 
 
 def _raster_tables(rows: Sequence[Row]) -> list[str]:
-    """Tabulate the scenes with ours and the floor, then each peer; below them the probes."""
+    """Tabulate the scenes with ours and the lower bound, then the peers, then the probes."""
     scenes = dict.fromkeys(_scene_of(row) for row in rows if row.quantity == FORWARD)
     peers = [name for name in dict.fromkeys(row.subject for row in rows if row.quantity == FORWARD)
              if name not in (OURS, FLOOR)]  # fmt: skip
     ours = _table(
-        ["Gaussians", "image", "useful blends", "forward, ms", "forward+backward, ms", "floor forward, ms",
-         "floor forward+backward, ms", "GFLOP/s", "forward / floor", "forward+backward / floor"],
+        ["Gaussians", "image", "useful blends", "forward, ms", "forward+backward, ms", "bound forward, ms",
+         "bound forward+backward, ms", "GFLOP/s", "forward / bound", "forward+backward / bound"],
         [
             [*_scene_cells(scene), *(
                 _number(_find(rows, subject, quantity, scene))
@@ -62,12 +62,13 @@ def _raster_tables(rows: Sequence[Row]) -> list[str]:
 
 
 def _against(rows: Sequence[Row], peer: str, scene: tuple[int | None, int | None]) -> list[str]:
-    found = [_find(rows, peer, quantity, scene) for quantity in (FORWARD, BOTH)]
-    if found[0] is not None and found[0].value is None:
-        return [found[0].note, "", "", "", _number(_find(rows, peer, "PSNR against rewild4d", scene))]
-    ratios = [_ratio(row, _find(rows, OURS, quantity, scene)) for row, quantity in
-              zip(found, (FORWARD, BOTH), strict=True)]  # fmt: skip
-    return [*map(_number, found), *ratios, _number(_find(rows, peer, "PSNR against rewild4d", scene))]
+    """Return the cells of a peer: times, ratios to ours, PSNR; or the reason why it is not timed."""
+    forward, both = (_find(rows, peer, quantity, scene) for quantity in (FORWARD, BOTH))
+    parity = _number(_find(rows, peer, "PSNR against rewild4d", scene))
+    if forward is not None and forward.value is None:
+        return [forward.note, "", "", "", parity]
+    ratios = _ratio(forward, _find(rows, OURS, FORWARD, scene)), _ratio(both, _find(rows, OURS, BOTH, scene))
+    return [_number(forward), _number(both), *ratios, parity]
 
 
 def _step_tables(rows: Sequence[Row]) -> list[str]:
@@ -77,8 +78,7 @@ def _step_tables(rows: Sequence[Row]) -> list[str]:
         ["what", "whose", "Gaussians", "image", "ms", "least, ms", "quartiles apart, ms", "a second"],
         [
             [row.quantity, row.subject, *_scene_cells(_scene_of(row)), _number(row), _text(row.minimum),
-             _text(row.spread),
-             _text(1000 / row.value if row.value else None)]
+             _text(row.spread), _text(1000 / row.value if row.value else None)]
             for row in timed
         ],
     )  # fmt: skip
@@ -107,7 +107,7 @@ def _kernel_table(rows: Sequence[Row]) -> str:
 
 
 def _list(rows: Sequence[Row]) -> str:
-    """Tabulate one number a line."""
+    """Tabulate single numbers."""
     return _table(
         ["what", "Gaussians", "image", "value", "note"],
         [[row.quantity, *_scene_cells(_scene_of(row)), _with_unit(row), row.note] for row in rows],
@@ -147,7 +147,7 @@ def _number(row: Row | None) -> str:
 
 
 def _text(value: float | None) -> str:
-    """Format three digits, or all integer digits."""
+    """Format three significant digits, or all integer digits."""
     if value is None:
         return "-"
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:#.3g}".rstrip(".") if value else "0"

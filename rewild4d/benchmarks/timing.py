@@ -1,4 +1,4 @@
-"""Time several contenders in turns, so that a slowdown of the machine hits all of them."""
+"""Time several contenders alternately, so that a slowdown of the machine affects all of them."""
 
 import statistics
 import sys
@@ -14,17 +14,17 @@ from tqdm import tqdm
 Name = TypeVar("Name", bound=Hashable)
 
 BUDGET = 10.0
-"""Seconds after which a contender takes no further turn after its first two."""
+"""Seconds after which a contender that was timed twice is not timed again."""
 
 
 @dataclass(frozen=True)
 class Sample:
     """A contender's times in milliseconds."""
 
-    median: float  # of all turns
-    minimum: float  # of all turns
+    median: float
+    minimum: float
     spread: float  # interquartile range
-    repeats: int  # number of turns
+    repeats: int  # number of times
 
 
 def summary(times: list[float]) -> Sample:
@@ -46,9 +46,9 @@ def measure(
     budget: float = BUDGET,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[Name, Sample]:
-    """Time all contenders in rounds, each one once a round, within a ``budget`` in seconds.
+    """Time each contender once a round, until it has spent its ``budget`` in seconds.
 
-    Each turn is an untimed call, since the last contender left its own data in the caches, and a timed one.
+    An untimed call precedes each timed one to fill the caches.
     """
     times: dict[Name, list[float]] = {name: [] for name in contenders}
     spent = dict.fromkeys(contenders, 0.0)
@@ -70,7 +70,7 @@ def measure(
 
 @contextmanager
 def progress(title: str, total: int) -> Iterator[tqdm]:
-    """Show a bar on standard error, which leaves one line where that is a file."""
+    """Show a progress bar on standard error."""
     pause = 0.5 if sys.stderr.isatty() else 10.0
     with tqdm(desc=title, total=total, file=sys.stderr, mininterval=pause) as bar:
         yield bar
@@ -78,7 +78,7 @@ def progress(title: str, total: int) -> Iterator[tqdm]:
 
 @contextmanager
 def threads(count: int | None) -> Iterator[int]:
-    """Compute with a number of threads (None: torch's own); yield the number."""
+    """Set torch's number of threads (None keeps it); yield the number."""
     before = torch.get_num_threads()
     torch.set_num_threads(count or before)
     try:
