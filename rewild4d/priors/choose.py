@@ -53,7 +53,7 @@ class PriorChoice:
 
     @property
     def noise(self) -> float | None:
-        """Noise level of a coarse prior, 1 where none is named; None for the others."""
+        """Noise level of a coarse prior, 1 by default; None for other priors."""
         kind, _, level = self.name.partition(":")
         if kind != "coarse":
             return None

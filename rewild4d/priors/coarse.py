@@ -28,18 +28,15 @@ SHAPE_NOISE = 0.3
 def coarse_prior(
     clip: Clip, many_views: Sequence[Frame], *, noise: float, seed: int, config: PriorConfig, log: Log
 ) -> Prior:
-    """Make the template with nearly the true root and joint angles, plus noise.
+    """Make a prior named "coarse-<noise>" with nearly the true root and joint angles, plus noise.
 
     Args:
         clip: gives the prior's frames and cameras.
         many_views: the held-out frames, with cameras; those at the clip's times are used.
-        noise: 0 adds nothing; 1 adds the standard deviations of this module.
+        noise: factor of the standard deviations of this module.
         seed: of the noise and of the fit.
         config: of the fit.
         log: progress.
-
-    Returns:
-        A prior named "coarse-<noise>".
     """
     timestep_of = {round(time, 6): index for index, time in enumerate(clip.times)}
     seen = [*clip.frames, *(frame for frame in many_views if round(frame.time, 6) in timestep_of)]

@@ -42,13 +42,7 @@ class Animal:
 
 
 def fit_template(clip: Clip, *, config: PriorConfig, seed: int, log: Log) -> Prior:
-    """Fit the template to a clip's masks.
-
-    Args:
-        clip: its masks and known world cameras are used.
-        config: settings.
-        seed: of the frames drawn for each step of a long clip.
-        log: progress.
+    """Fit the template to a clip's masks under its cameras; the seed is that of the frames drawn for each step.
 
     Returns:
         A prior with one pose per frame; `quality` has mask_iou, cost, facing_margin, starts (their number) and

@@ -126,13 +126,7 @@ def fit_footage(
 ) -> Prior:
     """Fit the template to a clip's masks under unknown cameras.
 
-    Args:
-        clip: its masks are used, not its cameras.
-        config: settings.
-        seed: of the frames drawn for each step of a long clip.
-        log: progress.
-        said: keypoints and the animal's travel, where known.
-        name: of the prior.
+    The seed is that of the frames drawn for each step of a long clip.
 
     Returns:
         A prior with one camera and pose per frame and for its mirror image; `quality` has the figures of

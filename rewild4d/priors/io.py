@@ -67,17 +67,17 @@ OFF_ROTATION = 0.01
 
 def seal(prior: Prior) -> Prior:
     """Return the prior with the digest of everything else."""
-    cameras = [array for camera in (*prior.cameras, *prior.cameras_flip) for array in _camera_arrays(camera)]
+    cameras = [
+        array
+        for camera in (*prior.cameras, *prior.cameras_flip)
+        for array in (camera.world_to_camera, camera.intrinsics, np.array((camera.width, camera.height)))
+    ]
     quality = json.dumps(prior.quality, sort_keys=True)
     arrays = (
         prior.vertices, prior.faces, prior.weights, prior.bones, prior.parents, prior.mirror, prior.times,
         prior.object_to_world, prior.transforms, prior.transforms_flip,
     )  # fmt: skip
     return replace(prior, digest=digest(prior.name, prior.provenance, quality, *arrays, *cameras))
-
-
-def _camera_arrays(camera: Camera) -> tuple[Tensor, Tensor, np.ndarray]:
-    return camera.world_to_camera, camera.intrinsics, np.array((camera.width, camera.height))
 
 
 def save_prior(prior: Prior, path: Path) -> None:
@@ -121,13 +121,13 @@ def load_prior(path: Path) -> Prior:
         UserError: no such file, not an npz, an array is missing, or has another shape, kind or values than documented.
     """
     raw = read_arrays(path, "a prior file (npz)")
-    arrays, flipped = _validated(path, raw)
+    arrays = _validated(path, raw)
     cameras = _cameras(arrays["world_to_camera"], arrays["intrinsics"], arrays["sizes"])
-    mirrored = tuple(mirror_camera(camera) for camera in cameras)
-    if len(flipped) == len(FLIPPED):
-        mirrored = _cameras(flipped["world_to_camera_flip"], flipped["intrinsics_flip"], arrays["sizes"])
-        transforms_flip = flipped["transforms_flip"]
+    if FLIPPED.keys() <= arrays.keys():
+        cameras_flip = _cameras(arrays["world_to_camera_flip"], arrays["intrinsics_flip"], arrays["sizes"])
+        transforms_flip = arrays["transforms_flip"]
     else:
+        cameras_flip = tuple(mirror_camera(camera) for camera in cameras)
         transforms_flip = mirror_transforms(arrays["transforms"], arrays["mirror"])
     shared: dict[str, Any] = {
         key: arrays[key] for key in SHAPES if key not in ("world_to_camera", "intrinsics", "sizes")
@@ -138,7 +138,7 @@ def load_prior(path: Path) -> Prior:
             name=text.get("name", path.stem),
             provenance=text.get("provenance", f"Read from {path.name}."),
             cameras=cameras,
-            cameras_flip=mirrored,
+            cameras_flip=cameras_flip,
             transforms_flip=transforms_flip,
             quality=_quality(path, text.get("quality", "{}")),
             digest="",
@@ -147,13 +147,13 @@ def load_prior(path: Path) -> Prior:
     )
 
 
-def _validated(path: Path, raw: Mapping[str, np.ndarray]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def _validated(path: Path, raw: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
     """Check all arrays; return those of `SHAPES`, and of `FLIPPED` where the file has them."""
     sizes: dict[str, int] = {}
-    arrays = {key: _checked(path, raw, key, shape, sizes) for key, shape in SHAPES.items()}
-    flipped = {key: _checked(path, raw, key, shape, sizes) for key, shape in FLIPPED.items() if key in raw}
-    _check_values(path, arrays, flipped)
-    return arrays, flipped
+    shapes = SHAPES | {key: shape for key, shape in FLIPPED.items() if key in raw}
+    arrays = {key: _checked(path, raw, key, shape, sizes) for key, shape in shapes.items()}
+    _check_values(path, arrays)
+    return arrays
 
 
 def _quality(path: Path, text: str) -> dict[str, float]:
@@ -189,13 +189,13 @@ def _checked(
     return torch.from_numpy(array.astype(np.int64 if integer else np.float32 if key in SINGLE else np.float64))
 
 
-def _check_values(path: Path, arrays: Mapping[str, Tensor], flipped: Mapping[str, Tensor]) -> None:
+def _check_values(path: Path, arrays: Mapping[str, Tensor]) -> None:
     """Check values.
 
     Raises:
         UserError: names the first invalid array.
     """
-    bones = torch.arange(len(arrays["parents"]))
+    bones, flipped = torch.arange(len(arrays["parents"])), [key for key in FLIPPED if key in arrays]
     vertices, faces, mirror, parents = (arrays[key] for key in ("vertices", "faces", "mirror", "parents"))
     sums, extent = arrays["weights"].sum(1), float((vertices.amax(0) - vertices.amin(0)).norm())
     scales = torch.linalg.det(arrays["object_to_world"][:, :3, :3])
@@ -222,7 +222,7 @@ def _check_values(path: Path, arrays: Mapping[str, Tensor], flipped: Mapping[str
         (bool((arrays["sizes"] > 0).all()), "'sizes' above zero", f"{int(arrays['sizes'].min())}"),
         (len(flipped) in (0, len(FLIPPED)), f"all or none of {', '.join(FLIPPED)}", f"only {', '.join(flipped)}"),
     ]
-    for key, array in {**arrays, **flipped}.items():
+    for key, array in arrays.items():
         if key in RIGID:
             fault = off_similarity(array, rigid=True)
             checks.append((fault <= OFF_ROTATION, f"rigid matrices in '{key}'", f"some that are {fault:.2g} off"))

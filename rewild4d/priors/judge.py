@@ -23,11 +23,7 @@ AGREED = 0.9
 
 
 def measured(prior: Prior, frames: Sequence[Frame]) -> dict[str, float]:
-    """Measure a prior by its masks and cameras.
-
-    Args:
-        prior: one row per frame.
-        frames: with masks, of which at least one shows something.
+    """Measure a prior with a row for each frame by masks, of which at least one shows something, and cameras.
 
     Returns:
         mask_iou: mean intersection over union of template and mask; hops: number of frames whose camera is far from the
@@ -67,17 +63,12 @@ def doubts(quality: Mapping[str, float]) -> tuple[str, ...]:
     if agreed < AGREED:
         found.append(f"head and tail are uncertain: the clip and its mirror image agree in {agreed:.0%} of the frames")
     elif margin < UNDECIDED:
-        found.append(f"head and tail are uncertain: the other way round costs only {margin:.4f} more")
+        found.append(f"head and tail are uncertain: the reversed heading costs only {margin:.4f} more")
     return tuple(found)
 
 
 def joint_scores(prior: Prior, frames: Sequence[Frame], found: Marks) -> dict[str, float]:
-    """Return the share of correct joints, and of frames with the correct heading.
-
-    Args:
-        prior: one row per frame.
-        frames: with masks.
-        found: annotated points; their frames are rows.
+    """Return the share of correct joints, and of frames with the correct heading, of a prior with a row for each frame.
 
     Returns:
         pck: share of points within `CORRECT` of the box (Yang & Ramanan 2013); facing: share of the frames with both

@@ -9,11 +9,7 @@ from rewild4d.transforms import axis_angle_to_matrix, rigid
 
 
 def depth_levels(parents: Sequence[int]) -> list[list[int]]:
-    """Return bones grouped by their distance from a root, roots first.
-
-    Raises:
-        ValueError: the parents form a cycle or point outside.
-    """
+    """Return bones grouped by their distance from a root, roots first; a `ValueError` where parents form no forest."""
     remaining, done, levels = set(range(len(parents))), {-1}, []
     while remaining:
         level = sorted(bone for bone in remaining if parents[bone] in done)
@@ -43,7 +39,7 @@ def moved(points: Tensor, transforms: Tensor) -> Tensor:
 
 
 def pose(angles: Tensor, pivots: Tensor, parents: Sequence[int]) -> Tensor:
-    """Compute the chained transforms P_j = P_parent(j) T(c_j) R_j T(-c_j): rest -> posed, identity at zero angles.
+    """Compute the rigid transforms P_j = P_parent(j) T(c_j) R_j T(-c_j) from rest to pose, [..., J, 4, 4].
 
     The axes of every joint are the object's (x pitches, y yaws, z rolls), so a mirrored pose has angles (x, -y, -z) on
     the bone of the other side.
@@ -52,9 +48,6 @@ def pose(angles: Tensor, pivots: Tensor, parents: Sequence[int]) -> Tensor:
         angles: axis-angle vectors in radians, [..., J, 3].
         pivots: start of each bone at rest, broadcastable to [..., J, 3].
         parents: parent of each bone, -1 for a root.
-
-    Returns:
-        Rigid transforms, [..., J, 4, 4].
     """
     rotations = axis_angle_to_matrix(angles)
     pivots = pivots.expand(angles.shape)

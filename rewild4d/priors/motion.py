@@ -62,10 +62,9 @@ def quats_from_normals(normals: Tensor) -> Tensor:
 
 
 def pose_at(prior: Prior, time: float) -> tuple[Tensor, Tensor]:
-    """Return the prior's motion at any time: exact at its frames, interpolated between, held beyond the ends.
+    """Return object_to_world, float64, [4, 4], and rest -> posed transforms, float32, [J, 4, 4], at any time.
 
-    Returns:
-        object_to_world, float64, [4, 4]; rest -> posed transforms, float32, [J, 4, 4].
+    They are exact at the prior's frames, interpolated between them, and constant beyond the ends.
     """
     before, after, part = _neighbours(prior.times, time)
     if before == after:
@@ -114,12 +113,7 @@ def blend_similarities(a: Tensor, b: Tensor, part: float) -> Tensor:
 def pose_gaussians(sample: SurfaceSample, quats: Tensor, scales: Tensor, colors: Tensor, transforms: Tensor) -> Splats:
     """Make opaque Gaussians on the posed surface, in the object frame.
 
-    Args:
-        sample: the surface at rest.
-        quats: orientations at rest, [n, 4].
-        scales: [n, 3].
-        colors: [n, 3].
-        transforms: rest -> posed, [J, 4, 4].
+    ``quats`` [n, 4] are orientations at rest, ``scales`` and ``colors`` [n, 3], ``transforms`` rest -> posed [J, 4, 4].
     """
     joint_quats = matrix_to_quat(split_similarity(transforms)[1])
     return Splats(
@@ -132,14 +126,9 @@ def pose_gaussians(sample: SurfaceSample, quats: Tensor, scales: Tensor, colors:
 
 
 def colors_from_frames(prior: Prior, sample: SurfaceSample, frames: Sequence[Frame]) -> Tensor:
-    """Return RGB of each surface point in [0, 1], [n, 3].
+    """Return RGB of each surface point in [0, 1], [n, 3], from frames whose times are the prior's.
 
     It is the mean over the frames that see the point, else that of the mirrored point, else the mean colour.
-
-    Args:
-        prior: posed at the frames' times.
-        sample: points on its rest surface.
-        frames: training frames, with mattes.
     """
     total = torch.zeros(len(sample.points), 3)
     weight = torch.zeros(len(sample.points), 1)

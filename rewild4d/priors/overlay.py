@@ -25,8 +25,7 @@ def overlay(clip: Clip, prior: Prior, rows: Sequence[int] | None = None, photo: 
     Left legs are drawn orange, right legs blue, the spine white and the head red.
 
     Args:
-        clip: the frames.
-        prior: a prior with one pose per frame.
+        clip, prior: frames, and a pose for each.
         rows: indices of the frames; None is all.
         photo: share of the animal's picture in the colours under the bones, from 0 to 1.
 
@@ -56,16 +55,9 @@ def _color(prior: Prior, bone: int) -> tuple[int, int, int]:
 
 
 def save_overlay(clip: Clip, prior: Prior, beside: Path, side: int = 320) -> list[Path]:
-    """Write the overlay of every frame as a video and of twelve of them as one picture, cut around the animal.
+    """Write overlays cropped to the animal: of twelve frames to <beside>.png, of all as a video to <beside>.mp4.
 
-    Args:
-        clip: the frames.
-        prior: one row per frame.
-        beside: the pictures get this path with .png and .mp4.
-        side: of one tile in pixels.
-
-    Returns:
-        The files written: <beside>.png and <beside>.mp4.
+    ``side`` is that of a tile in pixels. Returns the two paths.
     """
     tiles: list[Any] = [_tile(clip, prior, row, side) for row in range(len(clip.frames))]
     shown = [tiles[i] for i in np.linspace(0, len(tiles) - 1, min(12, len(tiles))).round().astype(int)]

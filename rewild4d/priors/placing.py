@@ -89,10 +89,7 @@ def _apart(prior: Prior, row: int, first: Camera, second: Camera) -> float:
 def at_times(prior: Prior, times: Sequence[float], clip: Clip) -> Prior:
     """Return the prior with a row for each of the clip's frames, and the clip's times; a note counts interpolated rows.
 
-    Args:
-        prior: to be interpolated.
-        times: of the clip's frames in the prior's time, seconds.
-        clip: gives times, frame rate and the name for messages.
+    ``times`` are those of the frames in the prior's time, seconds.
 
     Raises:
         UserError: the prior does not span the times, or has less than half of them.

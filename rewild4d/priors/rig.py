@@ -37,15 +37,9 @@ SAMPLES = 3000
 
 
 def rig_prior(clip: Clip, rig: Rig, template: Prior) -> Prior:
-    """Make a prior of the true animal.
+    """Make a prior named "rig" of the true animal in the clip's frames.
 
-    Args:
-        clip: gives the prior's frames and cameras.
-        rig: of the same frames.
-        template: fitted to the clip; it gives left and head, which a rig does not name.
-
-    Returns:
-        A prior named "rig".
+    The template, fitted to the clip, gives left and head, which a rig does not name.
 
     Raises:
         UserError: a frame has no camera.
@@ -90,14 +84,9 @@ def rigid_motion(points: Tensor, others: Tensor) -> Tensor:
 
 
 def symmetric_frame(points: Tensor, axes: Tensor) -> Tensor:
-    """Find the object frame of a rest shape: x normal to its symmetry plane, y up, z to the head.
+    """Return the similarity from a shape's object frame: x normal to its symmetry plane, y up, z to the head, [4, 4].
 
-    Args:
-        points: of the shape, [n, 3].
-        axes: the three directions as columns, correct to some degrees, [3, 3].
-
-    Returns:
-        Similarity from the object frame to the points', [4, 4].
+    ``points`` [n, 3] are those of the shape, and the columns of ``axes`` [3, 3] are x, y and z to some degrees.
     """
     local = (points @ axes).numpy()
     tree = cKDTree(local)

@@ -51,11 +51,7 @@ class Targets:
 
 
 def known_camera(frame: Frame, name: str) -> Camera:
-    """Return the frame's camera.
-
-    Raises:
-        UserError: it has none.
-    """
+    """Return the frame's camera; a `UserError` where it has none."""
     if frame.camera is None:
         raise UserError(
             f"{name}: expected a camera for every frame, but the frame at {frame.time:g} s has none; "
@@ -65,24 +61,16 @@ def known_camera(frame: Frame, name: str) -> Camera:
 
 
 def require_mask(frames: Sequence[Frame], name: str) -> None:
-    """Check that a mask of the case ``name`` shows something.
-
-    Raises:
-        UserError: none does.
-    """
+    """Raise a `UserError` unless a mask of the case ``name`` shows something."""
     if not any((frame.mask > 0.5).any() for frame in frames):
         raise UserError(f"{name}: expected at least one mask that shows the animal, but all {len(frames)} are empty.")
 
 
 def crop_targets(frames: Sequence[Frame], timesteps: Sequence[int], world: Tensor, size: int, name: str) -> Targets:
-    """Cut square crops around the masks, resampled by area; frames with an empty mask are left out (not all may be).
+    """Cut square crops of ``size`` pixels around the masks, resampled by area, and leave out frames with an empty mask.
 
-    Args:
-        frames: observations with cameras.
-        timesteps: index of each frame's time.
-        world: similarity from the working frame, where the targets' cameras are, to the world, [4, 4].
-        size: side of the crop in pixels.
-        name: of the case, for messages.
+    ``timesteps`` are indices of the frames' times, ``world`` the similarity [4, 4] from the working frame, where the
+    targets' cameras are, to the world, and ``name`` the case.
     """
     masks, valid, cameras, kept = [], [], [], []
     for frame, timestep in zip(frames, timesteps, strict=True):
@@ -129,16 +117,10 @@ def _window(image: Tensor, left: int, top: int, side: int, size: int) -> Tensor:
 
 
 def splat(points: Tensor, sizes: Tensor, intrinsics: Tensor, size: int) -> Tensor:
-    """Render soft silhouettes of round Gaussians.
+    """Render soft silhouettes of round Gaussians, alpha [..., size, size].
 
-    Args:
-        points: in camera coordinates, [..., n, 3].
-        sizes: standard deviations, broadcastable to [..., n].
-        intrinsics: [..., 3, 3].
-        size: side of the square image in pixels.
-
-    Returns:
-        Alpha, [..., size, size].
+    ``points`` [..., n, 3] are in camera coordinates, ``sizes`` standard deviations, broadcastable to [..., n], and
+    ``intrinsics`` [..., 3, 3].
     """
     depth = points[..., 2].clamp_min(1e-2)
     focal = torch.stack((intrinsics[..., 0, 0], intrinsics[..., 1, 1]), -1)[..., None, :]
@@ -153,19 +135,16 @@ def splat(points: Tensor, sizes: Tensor, intrinsics: Tensor, size: int) -> Tenso
 
 
 def rasterized(vertices: Tensor, quads: Tensor, intrinsics: Tensor, size: int) -> Tensor:
-    """Render silhouettes of a surface by the benchmark's rasterizer: a flat Gaussian on every quadrilateral.
+    """Render silhouettes of a surface by a flat Gaussian on every quadrilateral, alpha [..., v, size, size].
 
     The 50 % contour is the surface's outline to a few hundredths of its area. Gradients reach the vertices through the
     Gaussians' centres alone, which is most of them at half the cost.
 
     Args:
-        vertices: in camera coordinates, [..., n, 3].
+        vertices: in camera coordinates, [..., v, n, 3].
         quads: corners in order, [q, 4].
-        intrinsics: one per element of the last leading dimension, [v, 3, 3].
+        intrinsics: [v, 3, 3].
         size: side of the square images in pixels.
-
-    Returns:
-        Alpha, [..., v, size, size].
     """
     corners = vertices[..., quads, :]
     means = corners.mean(-2)
@@ -210,13 +189,7 @@ def mismatch(rendered: Tensor, targets: Targets, sigma: float) -> Tensor:
 
 
 def outline(vertices: Tensor, faces: Tensor, camera: Camera) -> np.ndarray:
-    """Draw the silhouette of a mesh, anti-aliased, uint8, [h, w].
-
-    Args:
-        vertices: in the camera's world, [n, 3].
-        faces: [f, 3].
-        camera: of the image.
-    """
+    """Draw the silhouette of a mesh, anti-aliased, uint8, [h, w]; vertices [n, 3] are in the camera's world."""
     pixels, depth = camera.project(vertices.double())
     image = np.zeros((4 * camera.height, 4 * camera.width), np.uint8)
     corners = pixels.numpy()[faces.numpy()]
@@ -229,14 +202,7 @@ def outline(vertices: Tensor, faces: Tensor, camera: Camera) -> np.ndarray:
 
 
 def overlap(vertices: Sequence[Tensor], faces: Tensor, cameras: Sequence[Camera], masks: Sequence[Tensor]) -> float:
-    """Compute the mean intersection over union of posed meshes with masks at 0.5; empty masks do not count.
-
-    Args:
-        vertices: posed in the cameras' world, one [n, 3] per observation.
-        faces: [f, 3].
-        cameras: one per observation.
-        masks: soft mattes, [1, h, w] each.
-    """
+    """Return the mean intersection over union of meshes [n, 3] and masks [1, h, w] at 0.5; empty masks do not count."""
     scores = []
     for points, camera, mask in zip(vertices, cameras, masks, strict=True):
         wanted = mask[0].numpy() > 0.5

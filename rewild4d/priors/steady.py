@@ -38,26 +38,16 @@ class Filtered:
 
 
 def clusters(points: Tensor, eps: float = EPS, neighbours: int = NEIGHBOURS) -> Tensor:
-    """Return the DBSCAN cluster of each point [n, d], from 0, -1 for noise, int64, [n].
-
-    Args:
-        points: [n, d].
-        eps: largest distance of neighbours.
-        neighbours: least number of neighbours, itself included, of a point inside a cluster.
-    """
+    """Return the DBSCAN cluster of each point [n, d], from 0, -1 for noise, int64, [n]."""
     from sklearn.cluster import DBSCAN  # takes a second to import
 
     return torch.from_numpy(DBSCAN(eps=eps, min_samples=neighbours).fit_predict(points.numpy()))
 
 
 def steady(cameras: Sequence[Camera], times: Tensor) -> Tensor:
-    """Return which cameras belong to the largest cluster, or all where there is none, bool, [T].
+    """Return which cameras, in the object frame, belong to the largest cluster, or all where there is none, bool, [T].
 
-    Points of up to `GAP` missing frames, such as held-out ones, are interpolated.
-
-    Args:
-        cameras: in the object frame.
-        times: of their frames, in seconds, ascending, [T].
+    Up to `GAP` missing frames between ``times`` (seconds, [T]), such as held-out ones, are interpolated.
     """
     matrices = torch.stack([camera.world_to_camera.double() for camera in cameras])
     centers = -(matrices[:, :3, :3].transpose(1, 2) @ matrices[:, :3, 3:])[..., 0]

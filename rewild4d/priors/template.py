@@ -300,16 +300,7 @@ def posed_prior(
     template: Template, transforms: Tensor, object_to_world: Tensor, cameras: Sequence[Camera], times: Tensor, *,
     name: str, provenance: str, quality: dict[str, float] | None = None, digest: str = "",
 ) -> Prior:  # fmt: skip
-    """Make a prior of the template in some poses; its mirrored half is the exact mirror image.
-
-    Args:
-        template: at rest.
-        transforms: rest -> posed, per bone, [T, J, 4, 4].
-        object_to_world: similarities, float64, [T, 4, 4].
-        cameras: in the object frame, T of them.
-        times: in seconds, float64, [T].
-        name, provenance, quality, digest: see `Prior`.
-    """
+    """Make a prior of the posed template with the exact mirror image as its mirrored half; arguments as in `Prior`."""
     mirror = torch.tensor(MIRROR)
     return Prior(
         name=name, provenance=provenance, vertices=template.vertices, faces=template.faces, weights=template.weights,
