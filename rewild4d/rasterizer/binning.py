@@ -24,13 +24,10 @@ from rewild4d.rasterizer.projection import (
 
 BLOCK, BLOCKS = 4, 16
 """A tile is sixteen blocks of 4 x 4 pixels, numbered row by row."""
-
 BLOCK_LEFT = np.array([BLOCK * (block % 4) for block in range(BLOCKS)], np.float32)
 BLOCK_TOP = np.array([BLOCK * (block // 4) for block in range(BLOCKS)], np.float32)
-
 SLACK = np.float32(1e-3)
 """Added to the extent in exponent units, so that rounding never drops a block that the blend would draw into."""
-
 RADIX_BITS = 11
 RADIX = 1 << RADIX_BITS
 

@@ -50,10 +50,8 @@ from rewild4d.rasterizer.projection import (
 CONSTANTS = np.array([LOG2_MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, *POWER_TERMS], np.float32)
 """An argument of the kernels, so that the loop over blocks holds them in registers."""
 WEAKEST, STRONGEST_ALPHA, LEAST_LEFT, TERMS = range(4)
-
 AHEAD = 16
 """Gaussians whose position in a tile is computed together, to hide its latency."""
-
 PLACED = 4 * LANES
 """Numbers of a position in a tile."""
 

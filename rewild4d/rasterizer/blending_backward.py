@@ -41,7 +41,6 @@ from rewild4d.rasterizer.projection_backward import TT, TU, UU
 
 MOMENTS = 6
 """Sums of q, q t, q u, q t^2, q t u, q u^2 at the start of a slot, q = dL/dalpha alpha."""
-
 FEW = 3
 """Channels whose sums stay in registers."""
 

@@ -6,14 +6,13 @@ See CONVENTIONS.md.
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 MIN_ALPHA = 1.0 / 255.0
 """A Gaussian weaker than this at a pixel is skipped there."""
-
 MAX_ALPHA = 0.99
 """Largest alpha of one Gaussian; above it opacity, position and shape get no gradient."""
-
 MIN_TRANSMITTANCE = 1e-4
 """A pixel is closed before the Gaussian that would reduce its transmittance to this value or below."""
 
@@ -21,7 +20,6 @@ EPS2D = 0.3
 """Variance in square pixels that is added to every projected Gaussian (3DGS)."""
 FRUSTUM_MARGIN = 0.3
 """The projection's Jacobian is taken at most this share of half the image outside the frame."""
-
 MIN_COMPENSATION = 1e-8
 """Least det(Σ) / det(Σ + eps2d I) under ``antialias``, so that the square root's derivative is finite."""
 
@@ -46,6 +44,14 @@ Rendered = tuple[Tensor, Tensor, RasterInfo]
 
 Options = tuple[int, int, float, bool, float]
 """Width, height, eps2d, antialias, near."""
+
+
+def camera_gradients(totals: Tensor, world_to_camera: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+    """Return gradients of both from [V, 16]: the upper three rows of world_to_camera, then fx, fy, cx, cy."""
+    v_world_to_camera, v_intrinsics = torch.zeros_like(world_to_camera), torch.zeros_like(intrinsics)
+    v_world_to_camera[:, :3] = totals[:, :12].view(-1, 3, 4).to(world_to_camera)
+    v_intrinsics[:, (0, 1, 0, 1), (0, 1, 2, 2)] = totals[:, 12:].to(intrinsics)
+    return v_world_to_camera, v_intrinsics
 
 
 class RasterInput(NamedTuple):

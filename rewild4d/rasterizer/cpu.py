@@ -19,7 +19,7 @@ from rewild4d.kernels.threads import run, spans, thread_count
 from rewild4d.rasterizer.binning import BLOCK_LEFT, BLOCK_TOP
 from rewild4d.rasterizer.blending import CONSTANTS
 from rewild4d.rasterizer.blending_backward import slot_width
-from rewild4d.rasterizer.conventions import Options, RasterInfo, RasterInput, Rendered
+from rewild4d.rasterizer.conventions import Options, RasterInfo, RasterInput, Rendered, camera_gradients
 from rewild4d.rasterizer.crowds import CROWD, NOWHERE
 from rewild4d.rasterizer.projection import RECORD, TILE
 from rewild4d.rasterizer.projection_backward import CAMERA, CHUNK
@@ -29,7 +29,6 @@ keep_freed_memory()
 
 SERIAL_BELOW = 512
 """Number of Gaussians up to which one thread is fastest."""
-
 MOST_PARTS = 4
 """Most parts in which a view's Gaussians are marked: one thread adds the square of that many counts a tile."""
 
@@ -62,8 +61,9 @@ def _padded(tensor: Tensor, rows: int, dimension: int = 0) -> Tensor:
     return torch.cat([tensor, tensor.new_zeros(shape)], dimension)
 
 
-def _table(rows: Sequence[tuple[int, ...]], columns: int) -> np.ndarray:
-    return np.array(rows, np.int64).reshape(-1, columns)
+def _bounds(count: int, parts: int) -> np.ndarray:
+    """Return the first and one past the last of each part, [P, 2]."""
+    return np.array(spans(count, parts), np.int64).reshape(-1, 2)
 
 
 class _Project(torch.autograd.Function):
@@ -87,7 +87,7 @@ class _Project(torch.autograd.Function):
         gaussians = tuple(array(_padded(tensor, room)).ravel() for tensor in gaussian_tensors)
         cameras = array(world_to_camera).astype(np.float64), array(intrinsics).astype(np.float64)
         threads = thread_count() if count * views > SERIAL_BELOW else 1
-        bounds = _table(spans(room, min(threads, room // WIDTH)), 2)  # `project` takes eight at a time
+        bounds = _bounds(room, min(threads, room // WIDTH))  # `project` takes eight at a time
         call = (
             phase_counters(2), bounds, gaussians, cameras, options, means2d.numpy().ravel(), records.numpy().ravel(),
             radii.numpy(), depths.numpy(), tiles.numpy().ravel(), slots.numpy(), order.numpy(), counts,
@@ -116,7 +116,7 @@ class _Project(torch.autograd.Function):
         gradients = [tensor.new_empty(room, *tensor.shape[1:]) for tensor in inputs[:4]]
         outputs = tuple(tensor.numpy().ravel() for tensor in gradients)
         shared = tuple(array(_padded(tensor, room, 1)).ravel() for tensor in (radii, g_means2d, g_records))
-        bounds = _table(spans(room, -(-room // CHUNK)), 2)
+        bounds = _bounds(room, -(-room // CHUNK))
         v_cameras = np.zeros((len(bounds), views * CAMERA * WIDTH))
         with_cameras = any(ctx.needs_input_grad[5:7])
         call = (
@@ -126,9 +126,7 @@ class _Project(torch.autograd.Function):
         v_world_to_camera = v_intrinsics = None
         if with_cameras:
             totals = torch.from_numpy(v_cameras.reshape(-1, views, CAMERA, WIDTH).sum(axis=(0, 3)))
-            v_world_to_camera, v_intrinsics = torch.zeros_like(world_to_camera), torch.zeros_like(intrinsics)
-            v_world_to_camera[:, :3] = totals[:, :12].view(views, 3, 4).to(world_to_camera)
-            v_intrinsics[:, (0, 1, 0, 1), (0, 1, 2, 2)] = totals[:, 12:].to(intrinsics)
+            v_world_to_camera, v_intrinsics = camera_gradients(totals, world_to_camera, intrinsics)
         return None, *(gradient[:count] for gradient in gradients), v_world_to_camera, v_intrinsics
 
 
@@ -185,7 +183,7 @@ class _Blend(torch.autograd.Function):
         v_features = _zeros(*features.shape)
         threads = thread_count() if len(lists.pair_bits) > SERIAL_BELOW else 1
         call = (
-            phase_counters(2), np.zeros(1, np.int64), _table(spans(records.shape[1], threads), 2),
+            phase_counters(2), np.zeros(1, np.int64), _bounds(records.shape[1], threads),
             *lists.tiles, lists.entries, lists.pair_bits, records.numpy(), array(features).ravel(), array(background),
             image.numpy(), alpha.numpy(), array(g_image), array(g_alpha), any(ctx.needs_input_grad[:2]), ctx.crowd,
             sums, lists.slots, width, v_means2d.numpy(), v_records.numpy(), v_features.numpy(),

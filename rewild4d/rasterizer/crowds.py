@@ -26,10 +26,8 @@ from rewild4d.rasterizer.projection import (
 
 CROWD = 256
 """Gaussians in a tile's list above which its gradient is in double precision, if cameras need gradients."""
-
 NOWHERE = np.iinfo(np.int64).max
 """In place of `CROWD` if they need none."""
-
 _PIXELS = BLOCK * BLOCK
 
 

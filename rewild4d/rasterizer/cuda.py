@@ -9,7 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from rewild4d.rasterizer import triton_blend, triton_project, triton_tiles
 from rewild4d.rasterizer.checks import check_values
-from rewild4d.rasterizer.conventions import Options, RasterInfo, RasterInput, Rendered
+from rewild4d.rasterizer.conventions import Options, RasterInfo, RasterInput, Rendered, camera_gradients
 
 TILE, MOMENTS = triton_blend.SIDE.value, triton_blend.MOMENTS.value
 BLOCK, RECORD, CAMERA = triton_project.BLOCK.value, triton_project.RECORD.value, triton_project.CAMERA.value
@@ -108,10 +108,7 @@ class _Project(torch.autograd.Function):
             )  # fmt: skip
         v_world_to_camera = v_intrinsics = None
         if with_cameras:
-            totals = v_cameras.sum(dim=0).to(radii.dtype)
-            v_world_to_camera, v_intrinsics = torch.zeros_like(world_to_camera), torch.zeros_like(intrinsics)
-            v_world_to_camera[:, :3] = totals[:, :12].view(views, 3, 4)
-            v_intrinsics[:, (0, 1, 0, 1), (0, 1, 2, 2)] = totals[:, 12:]
+            v_world_to_camera, v_intrinsics = camera_gradients(v_cameras.sum(dim=0), world_to_camera, intrinsics)
         return None, None, *gradients, v_world_to_camera, v_intrinsics
 
 

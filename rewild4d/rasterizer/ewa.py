@@ -15,19 +15,11 @@ def project(
     height: int,
     eps2d: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Project Gaussians to the images.
-
-    Args:
-        means: [N, 3].
-        covariances: in the world, [N, 3, 3].
-        world_to_camera: [..., 4, 4].
-        intrinsics: [..., 3, 3].
-        width: image width in pixels.
-        height: image height in pixels.
-        eps2d: added to both projected variances.
+    """Project means [N, 3] and covariances [N, 3, 3] by cameras [..., 4, 4] and [..., 3, 3].
 
     Returns:
-        Centres [..., N, 2] and covariances [..., N, 2, 2] in pixels, depths [..., N], antialiasing factors [..., N].
+        Centres [..., N, 2] and covariances [..., N, 2, 2] in pixels, with ``eps2d`` added to both variances; depths and
+        antialiasing factors [..., N].
     """
     rotation = world_to_camera[..., :3, :3]
     local = means @ rotation.mT + world_to_camera[..., None, :3, 3]
@@ -65,19 +57,10 @@ def determinant(matrix: Tensor) -> Tensor:
 def radii(
     centres: Tensor, cov2d: Tensor, depths: Tensor, opacities: Tensor, width: int, height: int, near: float
 ) -> Tensor:
-    """Return the distance from its centre at which a Gaussian's alpha falls to 1/255.
+    """Return the distance in pixels along the longest axis at which a Gaussian's alpha falls to 1/255, [..., N].
 
-    Args:
-        centres: in pixels, [..., N, 2].
-        cov2d: in square pixels, [..., N, 2, 2].
-        depths: along the camera's z, [..., N].
-        opacities: as seen, antialiasing included, [..., N].
-        width: image width in pixels.
-        height: image height in pixels.
-        near: least depth at which Gaussians are drawn.
-
-    Returns:
-        Radii along the longest axis, 0 where nothing can be drawn, [..., N].
+    It is 0 where nothing is drawn. Centres, covariances and depths are those of `project`; opacities include the
+    antialiasing factor.
     """
     squared = 2 * (opacities / MIN_ALPHA).clamp_min(1).log()
     variance_x, variance_y = cov2d[..., 0, 0], cov2d[..., 1, 1]

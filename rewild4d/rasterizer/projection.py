@@ -17,7 +17,6 @@ from rewild4d.rasterizer.conventions import FRUSTUM_MARGIN, MIN_ALPHA, MIN_COMPE
 
 # Columns of a record.
 CENTER_X, CENTER_Y, ALONG_X, ALONG_Y, DOWN, LOG_OPACITY, REST_X, REST_Y, RECORD = 0, 1, 2, 3, 4, 5, 6, 7, 8
-
 TILE = 16
 """Side of a tile in pixels."""
 

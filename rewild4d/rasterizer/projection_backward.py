@@ -30,10 +30,8 @@ from rewild4d.rasterizer.projection import (
 
 # Columns of a record's gradient, beside LOG_OPACITY.
 TT, TU, UU = 2, 3, 4
-
 CAMERA = 16
 """Numbers of a camera's gradient: the upper three rows of world_to_camera, then fx, fy, cx, cy."""
-
 CHUNK = 1024
 """Gaussians in a unit of work; the camera's gradient is summed by these for any number of threads."""
 

@@ -120,7 +120,7 @@ def blend_back(
     alpha: np.ndarray, g_image: np.ndarray, g_alpha: np.ndarray, geometry: bool, crowd: int, sums: np.ndarray,
     slots: np.ndarray, width: int, v_means2d: np.ndarray, v_records: np.ndarray, v_features: np.ndarray,
 ) -> None:  # fmt: skip
-    """The gradient of `bin_and_blend`: slots of all tiles, then their sums for each Gaussian.
+    """Compute the gradient of `bin_and_blend`: slots of all tiles, then their sums for each Gaussian.
 
     Args:
         counters: of two phases.
@@ -149,7 +149,7 @@ def project_back(
     tickets: np.ndarray, bounds: np.ndarray, gaussians: tuple, cameras: tuple, options: tuple, with_cameras: bool,
     radii: np.ndarray, g_means2d: np.ndarray, g_records: np.ndarray, v_gaussians: tuple, v_cameras: np.ndarray,
 ) -> None:  # fmt: skip
-    """The gradient of `project_and_sort`.
+    """Compute the gradient of `project_and_sort`.
 
     Args:
         bounds: first and one past the last Gaussian of each piece, [P, 2].

@@ -18,7 +18,6 @@ SIDE = tl.constexpr(8)
 PIXELS = tl.constexpr(SIDE.value**2)
 MOMENTS = tl.constexpr(6)
 """Sums of q, q t, q u, q t^2, q t u, q u^2 that come before the channel sums in a slot, q = dL/dalpha alpha."""
-
 _MAX_ALPHA = tl.constexpr(conventions.MAX_ALPHA)
 _WEAKEST = tl.constexpr(projection.LOG2_MIN_ALPHA)
 _STRONGEST = tl.constexpr(math.log2(conventions.MAX_ALPHA))
