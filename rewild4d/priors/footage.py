@@ -57,7 +57,7 @@ NEAR = 0.04
 """Distance of a joint to its keypoint, in window sides, below which the cost is quadratic and above which linear."""
 
 
-class StandingCamera(Race):
+class FixedCamera(Race):
     """Hypotheses under Fauna's camera.
 
     Attributes:
@@ -145,7 +145,7 @@ def fit_footage(
 
 def _run(
     case: str, frames: tuple[Frame, ...], said: Evidence, config: PriorConfig, seed: int, log: Log, known: Views | None
-) -> StandingCamera:
+) -> FixedCamera:
     """Run all rounds, from all starts to one guess; scale and proportions are those of ``known``, if given."""
     total = 2 * sum(stage.steps for stage in config.stages)
     boxes = windows(frames)
@@ -154,7 +154,7 @@ def _run(
         for frame, box in zip(frames, boxes, strict=True)
     ]
     working, generator = torch.eye(4, dtype=torch.float64), torch.Generator().manual_seed(seed)
-    race = StandingCamera(seen, range(len(frames)), case, working, config, generator, log, total)
+    race = FixedCamera(seen, range(len(frames)), case, working, config, generator, log, total)
     race.said, race.boxes = said, boxes.float()
     # known proportions need fewer starts
     count = config.yaw_starts if known is None else max(4, config.yaw_starts // 2)
@@ -170,7 +170,7 @@ def _run(
     return race
 
 
-def _prior(clip: Clip, race: StandingCamera, race_flip: StandingCamera, name: str, seed: int) -> Prior:
+def _prior(clip: Clip, race: FixedCamera, race_flip: FixedCamera, name: str, seed: int) -> Prior:
     """Return the prior of the fitted clip and its mirrored copy."""
     template, count = quadruped(Proportions(race.guesses.shape[0], race.guesses.relief[0])), len(clip.frames)
     transforms, transforms_flip = (
@@ -190,7 +190,7 @@ def _prior(clip: Clip, race: StandingCamera, race_flip: StandingCamera, name: st
     return seal(replace(prior, quality=quality | measured(prior, clip.frames)))
 
 
-def object_cameras(race: StandingCamera) -> tuple[Camera, ...]:
+def object_cameras(race: FixedCamera) -> tuple[Camera, ...]:
     """Return the cameras of the best guess in the object frame, with a rest diagonal of `OBJECT_DIAGONAL`."""
     guesses = race.guesses
     size = guesses.scales()[0] * diagonal(quadruped(Proportions(guesses.shape, guesses.relief), unit=False).vertices)[0]
