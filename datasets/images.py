@@ -20,7 +20,7 @@ from tqdm import tqdm
 from rewild4d.contracts import Selection
 from rewild4d.errors import UserError
 from rewild4d.files import atomic, cache_folder, digest, file_state
-from rewild4d.reading import picture_size, read_bytes
+from rewild4d.foreign.reading import picture_size, read_bytes
 from rewild4d.types import Camera
 
 BOX_ALPHA = 25

@@ -17,7 +17,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from rewild4d.datasets.masking.meaning import Census, Meaning
 from rewild4d.errors import UserError
 from rewild4d.files import natural
-from rewild4d.reading import picture_size
+from rewild4d.foreign.reading import picture_size
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 LOSSY = (".jpg", ".jpeg", ".webp")

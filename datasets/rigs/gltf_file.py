@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rewild4d.errors import UserError, reason
-from rewild4d.reading import TEXT, beside, picture_size, read_bytes, require_room
-from rewild4d.texts import parse_json
+from rewild4d.foreign.reading import TEXT, beside, picture_size, read_bytes, require_room
+from rewild4d.foreign.texts import parse_json
 
 MOST_NODES = 20_000
 """Of a file: rigs have hundreds."""
@@ -173,6 +173,6 @@ def decoded(path: Path, data: bytes, index: int) -> NDArray[np.uint8]:
 def least_alpha(data: bytes) -> float:
     """Return the least alpha of an image that `decoded` takes, in [0, 1]; 1 where it has none."""
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels.ndim < 3 or pixels.shape[2] < 4:
+    if pixels is None or pixels.ndim < 3 or pixels.shape[2] < 4:
         return 1.0
-    return float(pixels[..., 3].min() / np.iinfo(pixels.dtype).max)
+    return float(pixels[..., 3].min() / (65535 if pixels.dtype == np.uint16 else 255))

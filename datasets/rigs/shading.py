@@ -118,7 +118,7 @@ class Picture:
                 if surface.lit:
                     color[mine] *= shade[mine]
                 if surface.glow is not None:
-                    color[mine] = added(color[mine], _emitted(surface.glow, corners, share[mine]))
+                    color[mine] = added(color[mine].astype(np.float64), _emitted(surface.glow, corners, share[mine]))
         return where, color
 
     def _shade(self, normals: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -23,10 +23,10 @@ from rewild4d.datasets.images import read_picture
 from rewild4d.datasets.masking.masks import read_values
 from rewild4d.errors import UserError
 from rewild4d.files import load_tensors
+from rewild4d.foreign.reading import VARIABLE, largest, read_arrays
 from rewild4d.io.ply import read_splats
 from rewild4d.metrics.sets import read_features
 from rewild4d.priors.io import load_prior
-from rewild4d.reading import VARIABLE, largest, read_arrays
 
 SOON, LITTLE = 2.0, 100 << 20
 GIB = 1 << 30
