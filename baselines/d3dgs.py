@@ -31,6 +31,7 @@ from rewild4d.baselines.common.volume import random_points, scene_frame
 from rewild4d.baselines.d3dgs_config import INFO, STAR_INFO, D3dgsConfig, D3dgsStarConfig, NetworkShape
 from rewild4d.baselines.d3dgs_network import DeformationNetwork
 from rewild4d.contracts import Log, MethodInfo
+from rewild4d.foreign.states import read_as
 from rewild4d.ours.canonical import Gaussians, attributes
 from rewild4d.ours.checkpoint import fit_digest, load_fitted, save_fitted
 from rewild4d.ours.config import Canonical
@@ -155,10 +156,11 @@ class D3dgs:
     def load(self, folder: Path, device: torch.device) -> D3dgsReconstruction:
         """Read back what `D3dgsReconstruction.save` wrote."""
         state, config = load_fitted(folder, STATE, self.name, self.Config)
-        gaussians = Gaussians.from_state(state["model"], config.canonical.max_scale)
-        model = D3dgsModel(gaussians, config.network, torch.Generator())
-        model.load_state_dict(state["model"])
-        return D3dgsReconstruction(model.to(device), config, Root.from_state(state["root"]))
+        with read_as(folder, self.name):
+            gaussians = Gaussians.from_state(state["model"], config.canonical.max_scale)
+            model = D3dgsModel(gaussians, config.network, torch.Generator())
+            model.load_state_dict(state["model"])
+            return D3dgsReconstruction(model.to(device), config, Root.from_state(state["root"]))
 
     def _start(
         self, clip: Clip, prior: Prior, config: D3dgsConfig, generator: torch.Generator

@@ -35,6 +35,7 @@ from rewild4d.baselines.external_reading import Moment, moved_discs, painted, re
 from rewild4d.contracts import Log, MethodInfo
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import digest, load_tensors, save_tensors, write_text
+from rewild4d.foreign.states import read_as
 from rewild4d.foreign.texts import read_json
 from rewild4d.io.meshes import Discs
 from rewild4d.ours.motion import camera_between, frame_position
@@ -138,9 +139,10 @@ class External:
 
     def load(self, folder: Path, device: torch.device) -> ExternalReconstruction:
         state = load_tensors(folder / STATE)
-        cameras = {time: values and Camera(*values) for time, values in state["cameras"].items()}
-        moments = tuple(Splats(*values) for values in state["moments"])
-        return ExternalReconstruction(state["times"], moments, cameras, tuple(state["marks"]), state["notes"])
+        with read_as(folder, "external"):
+            cameras = {time: values and Camera(*values) for time, values in state["cameras"].items()}
+            moments = tuple(Splats(*values) for values in state["moments"])
+            return ExternalReconstruction(state["times"], moments, cameras, tuple(state["marks"]), state["notes"])
 
 
 def _profile(config: ExternalConfig) -> Profile:

@@ -35,6 +35,7 @@ from rewild4d.baselines.gart_skeleton import PoseTable, prior_poses
 from rewild4d.baselines.gart_skinning import ResidualField, posed
 from rewild4d.baselines.gart_smal import template_prior
 from rewild4d.contracts import Log, MethodInfo
+from rewild4d.foreign.states import read_as
 from rewild4d.harmonics import C0
 from rewild4d.kernels.threads import torch_on_one
 from rewild4d.ours.canonical import REST_GAIN, Gaussians
@@ -177,13 +178,14 @@ class Gart:
     def load(self, folder: Path, device: torch.device) -> GartReconstruction:
         """Read back what `GartReconstruction.save` wrote."""
         state, config = load_fitted(folder, STATE, self.name, self.Config)
-        gaussians = Gaussians.from_state(state["model"], config.canonical.max_scale)
-        gaussians.blur.copy_(state["model"]["gaussians.blur"])
-        saved: dict[str, Any] = state["poses"]
-        poses = PoseTable(saved["quats"], saved["offsets"], saved["pivots"], state["parents"])
-        poses.load_state_dict(saved)
-        root = Root.from_state(state["root"])
-        return self.Result(gaussians.to(device), state["weights"].to(device), poses.to(device), config, root)
+        with read_as(folder, self.name):
+            gaussians = Gaussians.from_state(state["model"], config.canonical.max_scale)
+            gaussians.blur.copy_(state["model"]["gaussians.blur"])
+            saved: dict[str, Any] = state["poses"]
+            poses = PoseTable(saved["quats"], saved["offsets"], saved["pivots"], state["parents"])
+            poses.load_state_dict(saved)
+            root = Root.from_state(state["root"])
+            return self.Result(gaussians.to(device), state["weights"].to(device), poses.to(device), config, root)
 
 
 class GartStar(Gart):

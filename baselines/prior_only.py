@@ -10,6 +10,7 @@ from torch import Tensor
 from rewild4d.baselines.floors_config import PRIOR_ONLY_INFO, PriorOnlyConfig
 from rewild4d.contracts import Log
 from rewild4d.files import load_tensors, save_tensors
+from rewild4d.foreign.states import read_as
 from rewild4d.priors.io import load_prior, save_prior
 from rewild4d.priors.motion import (
     SurfaceSample,
@@ -83,6 +84,8 @@ class PriorOnly:
 
     def load(self, folder: Path, device: torch.device) -> PriorOnlyReconstruction:
         state = load_tensors(folder / "surface.pt")
-        cameras = {time: Camera(*values) for time, values in state["cameras"].items()}
-        prior, sample = load_prior(folder / "prior.npz"), SurfaceSample(**state["sample"])
-        return PriorOnlyReconstruction(prior, sample, state["colors"], cameras, state["thickness"])
+        prior = load_prior(folder / "prior.npz")
+        with read_as(folder, "prior-only"):
+            cameras = {time: Camera(*values) for time, values in state["cameras"].items()}
+            sample = SurfaceSample(**state["sample"])
+            return PriorOnlyReconstruction(prior, sample, state["colors"], cameras, state["thickness"])

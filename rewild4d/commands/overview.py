@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from rewild4d.config import parse_flags, preset_names
 from rewild4d.errors import UserError
-from rewild4d.evaluation.protocol import default_name, load_protocols
+from rewild4d.evaluation.protocol import default_name, load_protocols, newest_version
 from rewild4d.leaderboard.specs import load_specs
 from rewild4d.registry import BUILTIN, dataset_title, method_info, names
 
@@ -29,8 +29,11 @@ def main(arguments: list[str]) -> int:
     print("protocols")
     protocols = load_protocols()
     for name, protocol in protocols.items():
-        chosen = name == default_name(protocol.dataset, protocols)
-        print(f"  {name:<24} {protocol.title}" + (" (default)" if chosen else ""))
+        newest = newest_version(name.rpartition("-v")[0], protocols)
+        mark = f" (older: {newest} is the newest)" if newest != name else ""
+        if name == default_name(protocol.dataset, protocols):
+            mark = " (default)"
+        print(f"  {name:<24} {protocol.title}{mark}")
     print("tables")
     for name, spec in load_specs().items():
         print(f"  {name:<24} {spec.title}")

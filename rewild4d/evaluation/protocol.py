@@ -1,6 +1,6 @@
 """Evaluation protocols: a TOML file states held-out frames and scores."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib import metadata, resources
 from importlib.resources.abc import Traversable
 from typing import Literal
@@ -125,6 +125,12 @@ def default_name(dataset: str, protocols: Mapping[str, Protocol]) -> str | None:
     """Return the name of a data set's default protocol, or None where it has none."""
     names = [name for name, protocol in protocols.items() if protocol.dataset == dataset and protocol.default]
     return max(names, key=lambda name: int(name.rpartition("-v")[2]), default=None)
+
+
+def newest_version(name: str, known: Iterable[str]) -> str:
+    """Return the full name of a protocol: of a family ("artemis-sweep-256") the highest version; others unchanged."""
+    family = [other for other in known if other.rpartition("-v")[0] == name]
+    return max(family, key=lambda other: int(other.rpartition("-v")[2])) if family else name
 
 
 def find_protocol(dataset: str, name: str | None) -> Protocol:

@@ -9,7 +9,7 @@ import msgspec
 
 from rewild4d.config import load_preset, merged, preset_names
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.evaluation.protocol import load_protocols
+from rewild4d.evaluation.protocol import load_protocols, newest_version
 from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.specs import Condition, Line, Spec, load_reported
 from rewild4d.leaderboard.tables import Entrant, Frame
@@ -52,9 +52,7 @@ def with_choice(name: str, spec: Spec, choice: Choice) -> Spec:
 
 def newest_protocol(name: str) -> str:
     """Return the full name of a protocol: of a family ("artemis-sweep-256") the highest version; others unchanged."""
-    protocols = load_protocols()
-    family = [known for known in protocols if known.rpartition("-v")[0] == name]
-    return max(family, key=lambda known: int(known.rpartition("-v")[2])) if family else name
+    return newest_version(name, load_protocols())
 
 
 def known_protocol(name: str, recorded: Iterable[str] = ()) -> str:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from dying import Killed, kill_late
 
-from rewild4d.baselines.common.splatting import reset_opacities, surface_gaussians
+from rewild4d.baselines.common.splatting import STATE, reset_opacities, surface_gaussians
 from rewild4d.baselines.common.volume import SCENE_HALF, common_volume, random_points, scene_frame
 from rewild4d.baselines.d3dgs import D3dgs, D3dgsConfig, D3dgsStar, D3dgsStarConfig, random_gaussians
 from rewild4d.baselines.d3dgs_network import DeformationNetwork, NetworkShape, octave_code
@@ -81,6 +81,16 @@ def test_a_killed_fit_resumes_to_the_same_bits(name: str, case: Case, tmp_path: 
         assert all(torch.equal(getattr(a, key), getattr(b, key)) for key in ("means", "quats", "scales", "colors"))
         assert not torch.equal(a.colors[:50], c.colors[:50])
     assert len(whole.at(0.0)) == SHORT["density"]["cap"]
+
+
+@pytest.mark.parametrize("name", TINY)
+def test_a_state_that_does_not_fit_is_one_sentence(name: str, case: Case, tmp_path: Path) -> None:
+    fitted(name, case).save(tmp_path)
+    state = torch.load(tmp_path / STATE)
+    for change in ({"model": {}}, {"root": None}, {"model": dict.fromkeys(state["model"])}):
+        torch.save(state | change, tmp_path / STATE)
+        with pytest.raises(UserError, match=f"expected a reconstruction by '{name}', but what it holds does not fit"):
+            load_method(name).load(tmp_path, CPU)
 
 
 @pytest.mark.parametrize("name", TINY)

@@ -21,9 +21,11 @@ from rewild4d.io import meshes, ply
 from rewild4d.metrics.samples import Conditions, Features
 from rewild4d.metrics.sets import Compared, read_features, write_features
 from rewild4d.ours.canonical import Gaussians
+from rewild4d.ours.checkpoint import CONFIG
 from rewild4d.ours.config import Config, Deform, Pose
 from rewild4d.ours.model import Model
-from rewild4d.ours.reconstruction import CONFIG, STATE, OursReconstruction, load_reconstruction
+from rewild4d.ours.motion import Root
+from rewild4d.ours.reconstruction import STATE, OursReconstruction, load_reconstruction
 from rewild4d.ours.skinning import SkinningField
 from rewild4d.priors.io import load_prior, save_prior
 from rewild4d.types import Splats
@@ -119,7 +121,7 @@ def reconstruction(name: str) -> Maker:
         own = Gaussians(values, TINY.canonical.max_scale)
         model = Model(TINY, own, field, torch.zeros(2, 3), parents, mirror, generator)
         times = torch.arange(2).double()
-        OursReconstruction(model, TINY, times, torch.eye(4).double().repeat(2, 1, 1), (None, None)).save(folder)
+        OursReconstruction(model, TINY, Root(times, torch.eye(4).double().repeat(2, 1, 1), (None, None))).save(folder)
         return folder / name
 
     return make
