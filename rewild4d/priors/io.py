@@ -142,6 +142,7 @@ def load_prior(path: Path) -> Prior:
             transforms_flip=transforms_flip,
             quality=_quality(path, text.get("quality", "{}")),
             digest="",
+            notes=(),
             **shared,
         )
     )
