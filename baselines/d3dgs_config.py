@@ -1,10 +1,13 @@
 """Settings of D-3DGS and D-3DGS*, and their rows in tables; without torch, since flags read it first."""
 
+from typing import Annotated
+
 import msgspec
+from msgspec import Meta
 
 from rewild4d.baselines.common.splatting_config import ImageLoss, Resets, SplatConfig
 from rewild4d.contracts import MethodInfo
-from rewild4d.ours.config import Canonical, Count, Degree, Density, Opacity, Positive, Rate, Share, Weight, Whole
+from rewild4d.ours.config import Canonical, Degree, Density, Opacity, Positive, Rate, Share, Weight, Whole
 
 PAPER = "Yang et al., Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene Reconstruction, CVPR 2024"
 LICENCE = "MIT (written anew from the paper)"
@@ -12,22 +15,27 @@ INFO = MethodInfo(title="D-3DGS", paper=PAPER, licence=LICENCE, uses_prior=False
 STAR_INFO = MethodInfo(title="D-3DGS*", paper=f"{PAPER}; the star as in the paper of `ours`", licence=LICENCE)
 
 
+Width = Annotated[int, Meta(ge=1, le=2048)]
+Layers = Annotated[int, Meta(ge=1, le=64)]
+Octaves = Annotated[int, Meta(ge=0, le=64)]
+
+
 class NetworkShape(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Sizes of the deformation network; the defaults are the original's."""
 
-    depth: Count = 8
+    depth: Layers = 8
     """Number of layers before the heads."""
-    width: Count = 256
+    width: Width = 256
     """Hidden width of each layer."""
     skip: Whole = 4
     """Layer after which the input is added again, counted from 0."""
-    place_octaves: Whole = 10
+    place_octaves: Octaves = 10
     """Octaves of the position code."""
-    time_octaves: Whole = 6
+    time_octaves: Octaves = 6
     """Octaves of the time code."""
-    time_width: Count = 256
+    time_width: Width = 256
     """Hidden width of the network that encodes time."""
-    time_features: Count = 30
+    time_features: Width = 30
     """Outputs of that network."""
     half: bool = True
     """Multiply in bfloat16 on a CPU that has it (docs/experiments/bfloat16.md)."""

@@ -32,6 +32,8 @@ PIXEL = 16
 """Bytes that one pixel of a picture takes while it is read: four channels in single precision."""
 TEXT = 8
 """Numbers written as text take this many times their size while they are parsed."""
+LONGEST_NAME = 255
+"""Bytes of a file's name that file systems take."""
 MOST_AXES = 32
 ZIP_FAULTS = (
     zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, OverflowError, LookupError,
@@ -139,7 +141,8 @@ def beside(path: Path, name: str) -> Path:
         UserError: it lies elsewhere, by its name or through a link.
     """
     folder = path.parent
-    if name and "\0" not in name and "://" not in name:
+    longest = max((len(os.fsencode(part)) for part in name.split("/")), default=0)
+    if name and "\0" not in name and "://" not in name and longest <= LONGEST_NAME:
         with contextlib.suppress(OSError, RuntimeError):  # a name that is too long, a link that leads to itself
             if (folder / name).resolve().is_relative_to(folder.resolve()):
                 return folder / name
@@ -240,6 +243,8 @@ def _header(path: Path, stream: IO[bytes], fault: str) -> tuple[tuple[int, ...],
     readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     try:
         shape, fortran, dtype = readers[npy.read_magic(stream)](stream)
+    except (zipfile.BadZipFile, zlib.error):  # of the archive around it
+        raise
     except Exception as error:  # NumPy parses it as Python text, which fails in any way where it is damaged
         raise UserError(f"{path}: expected {fault}: the header of an array is damaged or another file's.") from error
     if any(type(length) is not int or length < 0 for length in shape):

@@ -3,12 +3,13 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
 from rewild4d.errors import UserError, reason, shown
 
+R = TypeVar("R")
 Shape = tuple[str | int, ...]
 
 

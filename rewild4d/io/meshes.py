@@ -1,6 +1,7 @@
 """Triangle meshes with colour from OBJ and PLY files, and flat Gaussians on their surfaces."""
 
 import math
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -215,8 +216,9 @@ def _require_finite(path: Path, what: str, values: Tensor, row: str) -> None:
 
 def _texture(path: Path, library: str) -> Tensor | None:
     """Read the first picture of the material library; a missing library counts as none (3D-Fauna)."""
-    if not library or not (materials := beside(path, library)).is_file():
+    if not library or not os.path.isfile(path.parent / library):
         return None
+    materials = beside(path, library)
     for line in read_numbers(materials, "materials").decode("utf-8", errors="replace").splitlines():
         found = re.match(r"\s*map_Kd\s+(?:-\S+\s+\S+\s+)*(.+?)\s*$", line)
         if found:

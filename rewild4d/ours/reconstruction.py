@@ -114,13 +114,13 @@ def load_reconstruction(folder: Path, device: torch.device) -> OursReconstructio
 
 def _from_state(path: Path, state: dict[str, Any], config: Config, device: torch.device) -> OursReconstruction:
     """Return the reconstruction that a state holds, after its shapes were looked at."""
-    saved = state["model"]
     sizes: dict[str, int] = {}
+    require_tensors(path, state, {"times": ("T",), "object_to_world": ("T", 4, 4)}, sizes)
+    saved = state.get("model")
     require_tensors(path, saved, _shapes(config), sizes)
     parts = config.pose.anchor_size if config.deform.anchors else sizes["J"]
     inputs = parts + 3 * (1 + 2 * config.deform.frequencies) + 4 + 3
     require_tensors(path, saved, {"deform.query.weight": (config.deform.width, inputs)}, {})
-    require_tensors(path, state, {"times": ("T",), "object_to_world": ("T", 4, 4)}, sizes)
     require_skeleton(path, saved["parents"], saved["mirror"])
     require_skeleton(path, saved["parents"], saved["field.mirror"])
     gaussians = Gaussians.from_state(saved, config.canonical.max_scale)
