@@ -251,7 +251,7 @@ def consistent(path: Path) -> Iterator[None]:
         UserError: the block met one.
     """
     try:
-        with np.errstate(divide="ignore", invalid="ignore"):  # what comes of it is looked at
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what comes of it is looked at
             yield
     except (
         LookupError,

@@ -116,7 +116,7 @@ def _from_state(path: Path, state: dict[str, Any], config: Config, device: torch
     """Return the reconstruction that a state holds, after its shapes were looked at."""
     sizes: dict[str, int] = {}
     require_tensors(path, state, {"times": ("T",), "object_to_world": ("T", 4, 4)}, sizes)
-    saved = state.get("model")
+    saved: Any = state.get("model")
     require_tensors(path, saved, _shapes(config), sizes)
     parts = config.pose.anchor_size if config.deform.anchors else sizes["J"]
     inputs = parts + 3 * (1 + 2 * config.deform.frequencies) + 4 + 3

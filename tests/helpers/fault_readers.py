@@ -145,7 +145,7 @@ def read_frame(path: Path) -> object:
 
 def read_rig(path: Path) -> object:
     content(path)
-    return load_rig(path, clips(path)[0], 3)
+    return load_rig(path, next(iter(clips(path)), "none"), 3)
 
 
 def read_ours(path: Path) -> object:
