@@ -86,6 +86,10 @@ def _printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
+class DiskFull(UserError):
+    """Nothing more can be written: the disk or a quota is full, or a file may not grow. It is no fault of a run."""
+
+
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     """Make the error for a name that is not in ``known``, with a suggestion where one is close.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import re
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import platformdirs
 
-from rewild4d.errors import UserError
+from rewild4d.errors import DiskFull, UserError
 from rewild4d.foreign.reading import require_room, require_there, unpacked_size
 
 if TYPE_CHECKING:
@@ -31,34 +32,70 @@ except ImportError:  # Windows has none
     fcntl = None  # type: ignore[assignment]
 
 
+FULL = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
+"""Errors of a disk or a quota that is full, and of a file that may not grow."""
+
+
+def not_written(path: Path, error: OSError) -> UserError:
+    """Make the error for a file or folder that could not be written; `DiskFull` where that is the reason."""
+    is_full = error.errno in FULL or os.strerror(errno.ENOSPC) in str(error)  # ffmpeg's words, inside of imageio's
+    reason = os.strerror(errno.ENOSPC) if is_full and error.errno not in FULL else error.strerror or error
+    return (DiskFull if is_full else UserError)(f"{path}: could not be written: {reason}.")
+
+
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
     """Give a temporary path beside ``path`` and move it there when the block ends well; else leave nothing behind.
 
+    What a killed process leaves is used by the next one that writes the same file, so that it never adds up.
+
     Raises:
-        UserError: the folder cannot be written, or the disk is full.
+        UserError: the folder cannot be written.
+        DiskFull: the disk is full.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
+        handle, temporary = _begin(path)
     except OSError as error:
+        if error.errno in FULL:
+            raise not_written(path, error) from error
         raise UserError(f"{path}: expected a folder that can be written, but: {error.strerror}.") from error
-    os.close(handle)
-    temporary = Path(name)
     try:
         yield temporary
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)
     except OSError as error:
-        raise UserError(f"{path}: could not be written: {error.strerror or error}.") from error
+        raise not_written(path, error) from error
     finally:
         temporary.unlink(missing_ok=True)
+        if handle is not None:
+            os.close(handle)
+
+
+def _begin(path: Path) -> tuple[int | None, Path]:
+    """Make an empty file beside a path; a handle that is given holds it until it is closed."""
+    usual = path.with_name(f".{path.stem}.part{path.suffix}")
+    if fcntl is not None:
+        handle = os.open(usual, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        with contextlib.suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(handle), os.stat(usual)):  # else its writer has just moved it away
+                os.truncate(handle, 0)
+                return handle, usual
+        os.close(handle)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
+    os.close(handle)
+    return None, Path(name)
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what `atomic` had begun in a folder when its process was killed; nobody else may be writing there."""
-    for path in folder.glob(".*.????????.*"):
-        if path.is_file():
+    """Remove what `atomic` and `new_folder` had begun in a folder when their process was killed; nobody else may be
+    writing there."""
+    for path in (*folder.glob(".*.????????.*"), *folder.glob(".*.part"), *folder.glob(".*.part.*")):
+        if path.is_dir() and not path.is_symlink():
+            if path.suffix == ".part":
+                shutil.rmtree(path, ignore_errors=True)
+        else:
             path.unlink(missing_ok=True)
 
 
@@ -82,17 +119,24 @@ def replaced_folder(folder: Path, marker: str, earlier: str) -> Iterator[Path]:
     """
     if folder.exists() and not (folder.is_dir() and ((folder / marker).is_file() or not any(folder.iterdir()))):
         raise UserError(f"{folder}: expected an empty folder or {earlier}, but it holds something else.")
-    building = folder.with_name(f".{folder.name}.{os.getpid()}")
-    try:
-        building.mkdir(parents=True)
-        yield building
-        if folder.exists():
-            shutil.rmtree(folder)
-        building.rename(folder)
-    except OSError as error:
-        raise UserError(f"{folder}: could not be written: {error.strerror or error}.") from error
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
+    building, old = (folder.with_name(f".{folder.name}.{kind}") for kind in ("part", "old"))
+    with held(folder.parent, f"{folder}: waiting for another process that writes into {folder.parent}"):
+        try:
+            for left in (building, old) if folder.exists() else (building,):  # of a process that was killed
+                shutil.rmtree(left, ignore_errors=True)
+            building.mkdir()
+            yield building
+            if folder.exists():
+                folder.rename(old)
+            building.rename(folder)
+        except OSError as error:
+            raise not_written(folder, error) from error
+        finally:
+            shutil.rmtree(building, ignore_errors=True)
+            if folder.exists():
+                shutil.rmtree(old, ignore_errors=True)
+            elif old.exists():
+                old.rename(folder)
 
 
 @contextmanager

@@ -1,6 +1,8 @@
 """Progress of long work: a bar for the person who waits, a line a step for the file."""
 
+import errno
 import json
+import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -38,9 +40,18 @@ class Progress:
         if values:
             self.bar.set_postfix({key: f"{value:.4g}" for key, value in values.items()}, refresh=False)
             if self.path is not None:
-                with self.path.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps({"step": step, **values}) + "\n")
+                _append(self.path, json.dumps({"step": step, **values}) + "\n")
 
     def close(self) -> None:
         if self.bar is not None:
             self.bar.close()
+
+
+def _append(path: Path, line: str) -> None:
+    """Append a line whole, or not at all where the disk is full."""
+    data = line.encode()
+    with path.open("ab", buffering=0) as file:
+        size = file.seek(0, os.SEEK_END)
+        if file.write(data) != len(data):
+            file.truncate(size)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

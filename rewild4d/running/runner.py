@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 import shutil
 import sys
 import time
@@ -19,11 +18,11 @@ import msgspec
 import torch
 
 from rewild4d.contracts import DatasetReader, Reconstruction
-from rewild4d.errors import UserError, bounded, reason, unknown_name
+from rewild4d.errors import DiskFull, UserError, bounded, reason, unknown_name
 from rewild4d.evaluation.coverage import coverage
 from rewild4d.evaluation.networks import may_be_scored_now
 from rewild4d.evaluation.protocol import Protocol
-from rewild4d.files import held, remove_leftovers, write_text
+from rewild4d.files import held, not_written, remove_leftovers, write_text
 from rewild4d.foreign.texts import read_json
 from rewild4d.kernels.switch import chosen_kernels
 from rewild4d.leaderboard.records import FILE, SCHEMA, RunRecord, Timing, make_run_id, read_record, write_record
@@ -96,6 +95,7 @@ def execute(plan: Plan) -> list[RunRecord]:
 
     Raises:
         UserError: none of the cases can be read or the rasterizer cannot be used, before anything is fitted.
+        DiskFull: nothing more can be written; what was begun goes on with the next call.
     """
     plan = _readable(replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device)))
     plan.out.mkdir(parents=True, exist_ok=True)
@@ -175,6 +175,8 @@ def _run_case(plan: Plan, name: str) -> list[RunRecord]:
     try:
         prior = _prior(plan, clip, truth)
         case = Case(with_cameras(known_frames(clip, prior), prior), prior, truth)
+    except DiskFull:
+        raise
     except (UserError, FloatingPointError) as error:
         return [job.record() if job.finished() else job.fail(str(error)) for job in jobs]
     seen = coverage(clip, truth)
@@ -236,9 +238,13 @@ class Job:
             )  # fmt: skip
             timing = self._timing(fit_seconds, seconds)
             path = write_record(self._record(case, **fields, coverage=seen, timing=timing), self.folder)
+        except DiskFull:  # it is no failure of the run, and its record could not be written either
+            raise
         except UserError as error:
             return self.fail(str(error), case)
         except Exception as error:  # a bug or a diverged fit: the record keeps the message, the terminal the traceback
+            if isinstance(error, OSError) and isinstance(fault := not_written(self.folder, error), DiskFull):
+                raise fault from error
             traceback.print_exc(file=sys.stderr)
             return self.fail(f"{type(error).__name__}: {error}", case)
         shutil.rmtree(self.folder / "work", ignore_errors=True)
@@ -318,7 +324,7 @@ def fit_seconds(folder: Path) -> float:
 
 def save_reconstruction(reconstruction: Reconstruction, folder: Path) -> None:
     """Save into a folder that appears only when it is complete."""
-    building = folder.with_name(f".{folder.name}.{os.getpid()}")
+    building = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(building, ignore_errors=True)
     try:
         building.mkdir(parents=True)
@@ -326,6 +332,6 @@ def save_reconstruction(reconstruction: Reconstruction, folder: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
         building.rename(folder)
     except OSError as error:
-        raise UserError(f"{folder}: the reconstruction could not be written: {error.strerror or error}.") from error
+        raise not_written(folder, error) from error
     finally:
         shutil.rmtree(building, ignore_errors=True)

@@ -143,7 +143,7 @@ def test_evaluate_makes_a_failed_record_whole(plan: runner.Plan, monkeypatch: py
     plan = replace(plan, out=plan.out.with_name("other"))
 
     def full(*_: Any) -> None:
-        raise OSError(28, "No space left on device")
+        raise MemoryError("no memory left")
 
     with monkeypatch.context() as patch:
         patch.setattr("rewild4d.running.scoring.evaluate", full)
