@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/pip install --quiet --only-binary :all: --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help bench test faults setup weights lint types docs pre-commit clean
+.PHONY: help bench test faults kills setup weights lint types docs pre-commit clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -22,7 +22,11 @@ test: setup  ## run the tests
 	$(BIN)/python -m pytest
 
 faults: setup  ## try every reader on 2,000 damaged files
-	REWILD4D_MUTATIONS=2000 $(BIN)/python -m pytest -s tests/faults/test_mutated_files.py
+	REWILD4D_MUTATIONS=2000 $(BIN)/python -m pytest -s tests/faults
+
+MOMENTS ?= 20
+kills: setup  ## kill a run at 20 random moments of every stage, start it again, compare with an undisturbed one
+	$(BIN)/python tests/helpers/kill_drill.py --moments $(MOMENTS)
 
 setup: $(VENV)/.ready  ## install into .venv
 
