@@ -103,7 +103,11 @@ def _write(parts: Sequence[Part], folder: Path, say: Callable[[str], None], time
         return list(_copy_pictures(source, record, page, say, timeout))
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        drawn = list(pool.map(fill, found))
+        try:
+            drawn = list(pool.map(fill, found))
+        except BaseException:  # Ctrl-C does not wait for what has not begun
+            pool.shutdown(cancel_futures=True)
+            raise
     for (_, record), pictures in zip(found, drawn, strict=True):
         text = pages.get_template("run.html").render(
             title=f"{record.method} on {record.case}", record=record, scores=list(_scores(record)),
