@@ -4,6 +4,7 @@ A folder holds either images, or clips: subfolders of frames, or video files. An
 [h, w], [h, w, 3] or [h, w, 4] (floats in [0, 1], or unsigned integers over their full range).
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from rewild4d.datasets.images import read_picture
 from rewild4d.datasets.video.video_file import read_video, video_facts
 from rewild4d.errors import UserError
 from rewild4d.files import natural
-from rewild4d.foreign.reading import read_array
+from rewild4d.foreign.reading import FILM, read_array, require_room
 
 IMAGES = (".png", ".jpg", ".jpeg", ".npy")
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
@@ -265,9 +266,14 @@ def _video_frames(path: Path) -> list[np.ndarray]:
 
     Four videos are kept: a prediction, its truth and their masks.
     """
-    facts = video_facts(path)
     with _reader(path) as reader:
-        seconds, step = reader.get_meta_data()["duration"], 1 / reader.get_meta_data()["fps"]
+        about = reader.get_meta_data()
+    seconds, step = about["duration"], 1 / about["fps"]
+    (width, height), said = about["size"], seconds / step if math.isfinite(seconds / step) else 0.0
+    kind = "a film whose frames are held together"
+    require_room(path, round(said) * width * height * 4, kind, FILM)
+    facts = video_facts(path)
+    require_room(path, len(facts.times) * facts.width * facts.height * 4, kind, FILM)
     shown = facts.times[-1] + step
     if facts.is_stamped and shown < 0.9 * seconds - step:
         raise UserError(f"{path}: expected {seconds:.2f} s as its header says, got {shown:.2f} s: it is cut off.")

@@ -20,12 +20,14 @@ import numpy as np
 
 from rewild4d.errors import UserError
 from rewild4d.files import file_state
+from rewild4d.reading import PIXEL, require_room
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".gif", ".mpg", ".mpeg", ".wmv", ".ts", ".3gp")
 _TIME = re.compile(r"showinfo.*\bn: *\d+ .*\bpts_time:(\S+)")
 _FAULT = re.compile(r"\[(?:error|fatal)\] (.+)")
 _SHAPE = re.compile(r"showinfo.*\bn: *\d+ .*\bs:(\d+)x(\d+)")
 _STREAM = re.compile(r"Stream #.*Video:.*")
+_SIZE = re.compile(r", (\d{1,7})x(\d{1,7})\b")
 _ASPECT = re.compile(r"\bSAR (\d+):(\d+)")
 MOST_ASPECT = 10.0
 """Width over height of a pixel, or height over width, beyond which a header is wrong."""
@@ -161,7 +163,7 @@ def _header(path: Path, state: str) -> tuple[tuple[str, ...], str]:
         state: changes with the file.
 
     Raises:
-        UserError: pixels of a shape that no camera has.
+        UserError: pixels of a shape that no camera has, or more of them than `reading.largest` lets in.
     """
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-i", f"file:{path}"]
     said = subprocess.run(command, capture_output=True, text=True, errors="replace").stderr
@@ -169,6 +171,9 @@ def _header(path: Path, state: str) -> tuple[tuple[str, ...], str]:
     if re.search(r"alpha_mode\s*: 1", said, re.IGNORECASE):
         decoder = ("-c:v", "libvpx-vp9" if "Video: vp9" in said else "libvpx")
     stream = re.search(_STREAM, said)
+    if stream and (size := re.search(_SIZE, stream[0])):
+        width, height = map(int, size.groups())
+        require_room(path, PIXEL * width * height, f"frames of a video, {width}x{height} pixels,")
     # where the container says another shape than the stream in it, both are there, and the container's counts
     shapes = re.findall(_ASPECT, stream[0]) if stream else []
     across, down = map(int, shapes[-1]) if shapes else (1, 1)

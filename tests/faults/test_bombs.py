@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 import torch
@@ -21,9 +22,11 @@ from rewild4d.datasets.artemis.files import read_parents
 from rewild4d.datasets.artemis.volume import _tensor
 from rewild4d.datasets.images import read_picture
 from rewild4d.datasets.masking.masks import read_values
+from rewild4d.datasets.video.footage import open_footage
+from rewild4d.datasets.video.video_file import video_facts
 from rewild4d.errors import UserError
 from rewild4d.files import load_tensors
-from rewild4d.foreign.reading import VARIABLE, largest, read_arrays
+from rewild4d.foreign.reading import FILM, VARIABLE, largest, read_arrays
 from rewild4d.io.ply import read_splats
 from rewild4d.metrics.sets import read_features
 from rewild4d.priors.io import load_prior
@@ -153,3 +156,17 @@ def test_a_picture_beyond_what_pillow_takes_has_the_same_sentence(tmp_path: Path
     for read in (read_picture, read_values):
         with pytest.raises(UserError, match=rf"a picture of at most 67108864 pixels .*{VARIABLE} sets the limit"):
             read(tmp_path / "a.png")
+
+
+def test_films_are_measured_before_they_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sixty frames of 64x48 pixels: a frame takes 16 bytes a pixel while it is read, the film 4 bytes a pixel."""
+    path, frame, film = tmp_path / "a.mp4", 16 * 64 * 48, 60 * 4 * 64 * 48
+    imageio.mimwrite(path, [np.full((48, 64, 3), shade, np.uint8) for shade in range(60)], fps=30)
+    monkeypatch.setenv(VARIABLE, str(0.9 * frame / GIB))
+    with pytest.raises(UserError, match=r"expected frames of a video, 64x48 pixels, of at most"):
+        video_facts(path)
+    monkeypatch.setenv(VARIABLE, str(0.9 * film / FILM / GIB))
+    with pytest.raises(UserError, match="expected a film whose frames are held together of at most"):
+        open_footage(path).reels[0].picture(0)
+    monkeypatch.setenv(VARIABLE, str(1.1 * film / FILM / GIB))
+    assert open_footage(path).reels[0].picture(59).rgb.shape == (3, 48, 64)
