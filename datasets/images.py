@@ -6,6 +6,8 @@ So "full", "letterbox" and "crop" share one path, and `Window.camera` moves the 
 
 import math
 import re
+import struct
+import zlib
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -297,7 +299,7 @@ def _fault(data: bytes) -> str:
                 image.load()
     except Image.DecompressionBombError:  # OpenCV has a limit of its own
         return ""
-    except (OSError, SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError, LookupError, EOFError, struct.error, zlib.error) as error:
         damaged = re.search(r"checksum in b'(\w+)'", str(error))
         fault = f"with a damaged {damaged[1]} chunk" if damaged else f"that is cut off after {len(data)} bytes"
         return f"a {kind} {fault}"

@@ -23,7 +23,7 @@ def require_tensors(path: Path, held: Any, wanted: Mapping[str, Shape], sizes: d
         sizes: sizes by letter; those seen here are added.
 
     Raises:
-        UserError: it is no dictionary, or the first tensor that is missing, of another shape, or not finite.
+        UserError: it is no dictionary, a tensor is missing or of another shape, or any of those held is not finite.
     """
     if not isinstance(held, dict):
         raise UserError(f"{path}: expected tensors by name, got {type(held).__name__}.")
@@ -38,8 +38,14 @@ def require_tensors(path: Path, held: Any, wanted: Mapping[str, Shape], sizes: d
         if not fits or 0 in tensor.shape:
             written = ", ".join(f"{want}={sizes[want]}" if want in sizes else str(want) for want in map(str, shape))
             raise UserError(f"{path}: expected '{name}' of shape [{written}], got {shown(list(tensor.shape))}.")
-        if tensor.is_complex() or tensor.layout != torch.strided or not bool(torch.isfinite(tensor).all()):
-            raise UserError(f"{path}: expected finite numbers in '{name}', got others.")
+    for name, tensor in held.items():
+        if isinstance(tensor, torch.Tensor) and not _is_finite(tensor):
+            raise UserError(f"{path}: expected finite numbers in '{shown(name)}', got others.")
+
+
+def _is_finite(tensor: torch.Tensor) -> bool:
+    plain = tensor.layout == torch.strided and not tensor.is_complex() and not tensor.is_quantized
+    return plain and bool(torch.isfinite(tensor).all())
 
 
 def require_skeleton(path: Path, parents: torch.Tensor, mirror: torch.Tensor) -> None:

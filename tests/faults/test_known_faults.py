@@ -3,6 +3,7 @@
 import io
 import json
 import shutil
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from rewild4d.baselines.external import External
 from rewild4d.baselines.prior_only import PriorOnly
 from rewild4d.datasets.artemis.files import read_parents
 from rewild4d.datasets.artemis.volume import _tensor
+from rewild4d.datasets.images import read_picture
 from rewild4d.errors import UserError
 from rewild4d.io.meshes import read_mesh
 from rewild4d.io.ply import read_surface
@@ -62,7 +64,6 @@ def test_an_obj_that_names_what_no_file_is_called(tmp_path: Path) -> None:
         (torch.zeros(3, 3).to_sparse(), "expected a dense tensor of integers or floats, got torch.sparse_coo"),
         (torch.zeros(3, 3, dtype=torch.complex64), "expected a dense tensor of integers or floats"),
         (torch.zeros(3, 3, dtype=torch.bfloat16), "expected a dense tensor of integers or floats"),
-        (torch.quantize_per_tensor(torch.zeros(3), 1.0, 0, torch.qint8), "expected a (dense|saved torch) tensor"),
         ([torch.zeros(3, device="meta")], "got a tensor without values"),
         ({"a": 1}, "expected a saved torch tensor, got dict"),
     ],
@@ -88,6 +89,16 @@ def test_headers_of_arrays(header: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.npz").write_bytes(whole.replace("fox".encode("utf-32-le"), b"\xff" * 12))
     with pytest.raises(UserError, match="cannot be read as one: it is cut off, damaged or another file"):
         load_prior(tmp_path / "a.npz")
+
+
+def test_a_png_without_pixels(tmp_path: Path) -> None:
+    begin = b"IHDR" + (6).to_bytes(4, "big") * 2 + b"\x08\x02\0\0\0"
+    chunks = b"".join(
+        len(body[4:]).to_bytes(4, "big") + body + zlib.crc32(body).to_bytes(4, "big") for body in (begin, b"IEND")
+    )
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunks)
+    with pytest.raises(UserError, match=r"a\.png: expected a whole image, got a PNG that is cut off after"):
+        read_picture(tmp_path / "a.png")
 
 
 @pytest.mark.parametrize(
@@ -133,6 +144,7 @@ def changed_state(name: str, value: Any) -> Callable[[dict[str, Any]], Any]:
         (changed_state("field.logits", torch.zeros(9, 2)), "expected 'field.logits' of a cube of voxels, got 9 rows"),
         (changed_state("parents", torch.tensor([-1, 7])), "expected integers from -1 to 1 in 'parents'"),
         (changed_state("mirror", torch.tensor([0.0, 1.0])), "expected integers from 0 to 1 in 'mirror'"),
+        (changed_state("network.norm.bias", torch.full((8,), torch.inf)), "finite numbers in 'network.norm.bias'"),
         (changed_state("network.head.weight", torch.zeros(2, 2)), "what it holds does not fit .* size mismatch"),
     ],
 )  # fmt: skip
