@@ -20,7 +20,7 @@ import numpy as np
 
 from rewild4d.errors import UserError
 from rewild4d.files import file_state
-from rewild4d.reading import PIXEL, require_room
+from rewild4d.foreign.reading import PIXEL, require_room
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".gif", ".mpg", ".mpeg", ".wmv", ".ts", ".3gp")
 _TIME = re.compile(r"showinfo.*\bn: *\d+ .*\bpts_time:(\S+)")
