@@ -84,8 +84,7 @@ class PriorOnly:
 
     def load(self, folder: Path, device: torch.device) -> PriorOnlyReconstruction:
         state = load_tensors(folder / "surface.pt")
-        prior = load_prior(folder / "prior.npz")
         with read_as(folder, "prior-only"):
             cameras = {time: Camera(*values) for time, values in state["cameras"].items()}
-            sample = SurfaceSample(**state["sample"])
+            prior, sample = load_prior(folder / "prior.npz"), SurfaceSample(**state["sample"])
             return PriorOnlyReconstruction(prior, sample, state["colors"], cameras, state["thickness"])

@@ -24,7 +24,8 @@ from rewild4d.errors import UserError
 from rewild4d.io.meshes import read_mesh
 from rewild4d.io.ply import read_surface
 from rewild4d.metrics.sets import read_features
-from rewild4d.ours.reconstruction import CONFIG, STATE, load_reconstruction
+from rewild4d.ours.checkpoint import CONFIG
+from rewild4d.ours.reconstruction import STATE, load_reconstruction
 from rewild4d.priors.io import load_prior
 
 XYZ = "property float x\nproperty float y\nproperty float z\n"
