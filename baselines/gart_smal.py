@@ -14,6 +14,7 @@ A pickle can run any code when it is opened, so only arrays, sparse matrices and
 
 import copyreg
 import io
+import math
 import pickle
 from collections.abc import Mapping
 from dataclasses import replace
@@ -26,8 +27,8 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from rewild4d.errors import UserError
-from rewild4d.foreign.reading import arrays_of
+from rewild4d.errors import UserError, reason
+from rewild4d.foreign.reading import arrays_of, require_room
 from rewild4d.priors.io import seal
 from rewild4d.priors.kinematics import depth_levels
 from rewild4d.transforms import mirror_points, mirror_transforms, nearest_rotation, rigid, skin_points
@@ -35,6 +36,8 @@ from rewild4d.types import OBJECT_DIAGONAL, Prior
 
 NEEDED = ("vertices", "faces", "weights", "joints", "parents")
 NAMES_IN_SMAL = {"vertices": "v_template", "faces": "f", "joints": "J"}
+LEAST_SIZE, LARGEST = 1e-9, 1e9
+"""Of a template, in its own units: what is smaller or has larger numbers is damaged."""
 LEAST_MASS = 3.0
 """A joint with less than this sum of weights rotates with its parent."""
 
@@ -183,23 +186,32 @@ def _read(path: Path) -> Mapping[str, Any]:
         raw = _Careful(io.BytesIO(content), encoding="latin1").load()
     except FileNotFoundError as error:
         raise UserError(f"{wanted}, but there is no such file.") from error
-    except (OSError, ValueError, EOFError, pickle.UnpicklingError, AttributeError, TypeError,
-            IndexError, KeyError, ImportError) as error:  # fmt: skip
-        raise UserError(f"{wanted}, but it cannot be read: {error}.") from error
+    except (OSError, ValueError, EOFError, pickle.UnpicklingError, AttributeError, TypeError, LookupError, ImportError,
+            OverflowError, MemoryError, SystemError) as error:  # fmt: skip
+        raise UserError(f"{wanted}, but it cannot be read: {reason(error)}.") from error
     if not isinstance(raw, dict):
         raise UserError(f"{path}: expected a SMAL pickle that holds a dictionary, got a {type(raw).__name__}.")
-    found = {key: _array(raw[name]) for key in NEEDED if (name := NAMES_IN_SMAL.get(key, key)) in raw}
+    found = {key: _array(path, raw[name]) for key in NEEDED if (name := NAMES_IN_SMAL.get(key, key)) in raw}
     if "J_regressor" in raw and "vertices" in found:
-        found["joints"] = _array(raw["J_regressor"]) @ found["vertices"]
+        found["joints"] = _array(path, raw["J_regressor"]) @ found["vertices"]
     if "kintree_table" in raw:
-        found["parents"] = np.asarray(_array(raw["kintree_table"]))[0]
+        found["parents"] = np.asarray(_array(path, raw["kintree_table"]))[0]
     return found
 
 
-def _array(value: Any) -> np.ndarray:
+def _array(path: Path, value: Any) -> np.ndarray:
     if isinstance(value, _Chumpy):
         value = value.x
-    return np.asarray(value.todense() if sparse.issparse(value) else value)
+    if not sparse.issparse(value):
+        return np.asarray(value)
+    try:  # places of a damaged one may lie outside of it, and SciPy writes there unless it is asked to look
+        looked_at = type(value)((value.data, value.indices, value.indptr), shape=value.shape)
+        looked_at.check_format(full_check=True)
+    except (ValueError, TypeError, AttributeError, LookupError, OverflowError) as error:
+        raise UserError(f"{path}: expected a sparse matrix, but it is damaged ({reason(error)}).") from error
+    # A few numbers may stand for a matrix of any size.
+    require_room(path, math.prod(looked_at.shape) * looked_at.dtype.itemsize, "a sparse matrix")
+    return np.asarray(looked_at.todense())
 
 
 def _checked(path: Path, raw: Mapping[str, Any]) -> dict[str, Tensor]:
@@ -221,6 +233,12 @@ def _checked(path: Path, raw: Mapping[str, Any]) -> dict[str, Tensor]:
             raise UserError(f"{path}: expected '{name}' of shape {list(shape)}, got {list(arrays[name].shape)}.")
         if not np.isfinite(arrays[name].astype(np.float64)).all():
             raise UserError(f"{path}: expected finite numbers in '{name}'.")
+    size = float(np.linalg.norm(np.ptp(arrays["vertices"].astype(np.float64), axis=0)))
+    reach = max(float(np.abs(arrays[name].astype(np.float64)).max()) for name in ("vertices", "joints", "weights"))
+    if not size > LEAST_SIZE or not reach < LARGEST:
+        raise UserError(
+            f"{path}: expected vertices of some size and numbers up to {LARGEST:g}, got {size:.3g} and {reach:.3g}."
+        )
     parents, faces = arrays["parents"].astype(np.int64), arrays["faces"].astype(np.int64)
     parents = np.where((parents >= 0) & (parents < joints), parents, -1)
     if faces.min() < 0 or faces.max() >= count:

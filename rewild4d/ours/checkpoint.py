@@ -32,7 +32,9 @@ def load_checkpoint(folder: Path | None, identity: str) -> dict[str, Any] | None
     if folder is None or not (path := folder / NAME).exists():
         return None
     content = load_tensors(path, "checkpoint (remove it to start anew)")
-    if content.get("digest") != identity:
+    if not isinstance(content, dict) or not {"digest", "state"} <= content.keys():
+        raise UserError(f"{path}: expected a checkpoint (remove it to start anew), got something else.")
+    if content["digest"] != identity:
         logger.warning("%s: is of another configuration, clip, prior or seed; starting anew.", path)
         return None
     return content["state"]

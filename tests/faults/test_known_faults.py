@@ -2,6 +2,7 @@
 
 import io
 import json
+import pickle
 import shutil
 import zlib
 from collections.abc import Callable
@@ -12,10 +13,13 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from fault_readers import READERS, TINY, features, reconstruction
+from fault_readers import READERS, TINY, features, pickled_template, reconstruction
 from mutations import LONGEST_MESSAGE
+from prior_files import a_prior
+from scipy import sparse
 
 from rewild4d.baselines.external import External
+from rewild4d.baselines.gart_smal import template_prior
 from rewild4d.baselines.prior_only import PriorOnly
 from rewild4d.datasets.artemis.files import read_parents
 from rewild4d.datasets.artemis.volume import _tensor
@@ -24,7 +28,7 @@ from rewild4d.errors import UserError
 from rewild4d.io.meshes import read_mesh
 from rewild4d.io.ply import read_surface
 from rewild4d.metrics.sets import read_features
-from rewild4d.ours.checkpoint import CONFIG
+from rewild4d.ours.checkpoint import CONFIG, load_checkpoint
 from rewild4d.ours.reconstruction import STATE, load_reconstruction
 from rewild4d.priors.io import load_prior
 
@@ -123,6 +127,20 @@ def test_descriptions_of_features(about: str, sentence: str, tmp_path: Path) -> 
         read_features(path)
 
 
+def test_a_sparse_matrix_whose_numbers_lie_outside(tmp_path: Path) -> None:
+    """SciPy itself would write there: the process ended."""
+    kept = pickle.loads(pickled_template(tmp_path).read_bytes())
+    prior = a_prior([0.0, 0.3], [0.0, -0.3])
+    kept["J_regressor"].indices[:] = 10**8
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(kept, protocol=2))
+    with pytest.raises(UserError, match=r"a\.pkl: expected a sparse matrix, but it is damaged"):
+        template_prior(tmp_path / "a.pkl", prior)
+    kept["J_regressor"] = sparse.csc_matrix(([1.0], ([0], [0])), shape=(10**6, 10**6))
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(kept, protocol=2))
+    with pytest.raises(UserError, match=r"expected a sparse matrix of at most 1 GiB .* got 7\.45e\+03 GiB"):
+        template_prior(tmp_path / "a.pkl", prior)
+
+
 def changed_state(name: str, value: Any) -> Callable[[dict[str, Any]], Any]:
     def change(state: dict[str, Any]) -> Any:
         return state | {"model": state["model"] | {name: value}}
@@ -154,6 +172,13 @@ def test_a_state_that_is_not_ours(change: Callable[[dict[str, Any]], Any], sente
     torch.save(change(torch.load(path)), path)
     with pytest.raises(UserError, match=sentence):
         load_reconstruction(tmp_path, CPU)
+
+
+@pytest.mark.parametrize("content", [[], {}, torch.zeros(1), {"digest": "a"}])
+def test_a_checkpoint_that_is_none(content: Any, tmp_path: Path) -> None:
+    torch.save(content, tmp_path / "checkpoint.pt")
+    with pytest.raises(UserError, match=r"checkpoint\.pt: expected a checkpoint .*, got something else"):
+        load_checkpoint(tmp_path, "a")
 
 
 @pytest.mark.parametrize(

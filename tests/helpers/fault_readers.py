@@ -3,6 +3,7 @@
 Another reader is one more entry of `READERS`: a function that writes its file into a folder, and one that reads it.
 """
 
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +14,9 @@ from artemis_animals import write_animal
 from mutations import Reader
 from prior_files import a_prior
 from rig_files import build
+from scipy import sparse
 
+from rewild4d.baselines.gart_smal import template_prior
 from rewild4d.datasets.artemis import files, volume
 from rewild4d.datasets.rigs.reader import clips, content, load_rig
 from rewild4d.datasets.video.footage import open_footage
@@ -92,6 +95,34 @@ def prior(folder: Path) -> Path:
     return path
 
 
+def smal_arrays() -> dict[str, np.ndarray]:
+    """A tetrahedron with two joints as a template in SMAL's axes."""
+    shares = np.array([[1.0, 0], [1, 0], [0, 1], [0.5, 0.5]])
+    joints = np.array([[0.0, 0, 0], [1, 0, 0]])
+    return {
+        "vertices": CORNERS * 1.0,
+        "faces": FACES,
+        "weights": shares,
+        "joints": joints,
+        "parents": np.array([-1, 0]),
+    }
+
+
+def template(folder: Path) -> Path:
+    path = folder / "template.npz"
+    np.savez(path, **smal_arrays())
+    return path
+
+
+def pickled_template(folder: Path) -> Path:
+    found = smal_arrays()
+    parents, regressor = np.stack((found["parents"], np.arange(2))), sparse.csc_matrix(np.eye(4)[:2])
+    kept = {"v_template": found["vertices"], "f": found["faces"], "weights": found["weights"]}
+    path = folder / "template.pkl"
+    path.write_bytes(pickle.dumps({**kept, "J_regressor": regressor, "kintree_table": parents}, protocol=2))
+    return path
+
+
 def features(folder: Path) -> Path:
     path = folder / "features.npz"
     side = Features(torch.rand(3, 4).double(), torch.zeros(3, dtype=torch.int64), "toy", "0", "none")
@@ -152,6 +183,10 @@ def read_ours(path: Path) -> object:
     return load_reconstruction(path.parent, torch.device("cpu")).at(0.5)
 
 
+def read_template(path: Path) -> object:
+    return template_prior(path, a_prior([0.0, 0.3], [0.0, -0.3]))
+
+
 def read_surface(path: Path) -> object:
     return ply.read_surface(path, 20, 0), ply.is_mesh(path)
 
@@ -169,6 +204,8 @@ READERS = {
     "OBJ": Reader(textured_obj, meshes.read_mesh),
     "glb": Reader(glb, read_rig),
     "prior": Reader(prior, load_prior),
+    "D-SMAL": Reader(template, read_template),
+    "SMAL pickle": Reader(pickled_template, read_template),
     "features": Reader(features, read_features),
     "Artemis cameras": Reader(of_animal("CamPose.inf"), files.read_cameras),
     "Artemis intrinsics": Reader(of_animal("Intrinsic.inf"), lambda path: files.read_intrinsics(path, 4)),
