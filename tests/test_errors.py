@@ -1,5 +1,6 @@
 """Messages: short, on one line, with the path whole; and what JSON and TOML that cannot be read say."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -90,10 +91,20 @@ def test_numbers_of_too_many_digits_and_deep_nesting_are_told() -> None:
 def test_files_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="a: expected a thing, but there is no such file"):
         read_json(tmp_path / "a", "a thing")
-    with pytest.raises(UserError, match="expected a thing, but it cannot be read: Is a directory"):
+    with pytest.raises(UserError, match="expected a thing, but: Is a directory"):
         read_text(tmp_path, "a thing")
-    with pytest.raises(UserError, match="expected a thing, but it cannot be read: File name too long"):
+    with pytest.raises(UserError, match="expected a thing, but there is no such file"):
         read_text(tmp_path / (300 * "x"), "a thing")
+
+
+def test_devices_and_texts_that_fill_the_memory_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UserError, match="pipe: expected a thing, but: it is a device or a pipe"):
+        read_text(tmp_path / "pipe", "a thing")
+    monkeypatch.setenv("REWILD4D_LARGEST_GIB", "0.000001")
+    (tmp_path / "long").write_text("x" * 2000)
+    with pytest.raises(UserError, match="long: expected a thing of at most 1e-06 GiB once read"):
+        read_text(tmp_path / "long", "a thing")
 
 
 def test_marks_say_the_encoding(tmp_path: Path) -> None:

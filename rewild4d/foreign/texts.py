@@ -10,6 +10,7 @@ from typing import Any, TypeVar, overload
 import msgspec
 
 from rewild4d.errors import UserError, reason
+from rewild4d.foreign.reading import require_there
 
 T = TypeVar("T")
 _MARKS = {
@@ -29,12 +30,12 @@ def read_bytes(file: Path | Traversable, expected: str) -> bytes:
         expected: what it should be, as a sentence names it: "a keypoint file".
 
     Raises:
-        UserError: it cannot be read.
+        UserError: it is missing, no regular file, too large (`reading.largest`), or cannot be read.
     """
+    if isinstance(file, Path):
+        require_there(file, expected)
     try:
         return file.read_bytes()
-    except FileNotFoundError as error:
-        raise UserError(f"{file}: expected {expected}, but there is no such file.") from error
     except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
         raise UserError(f"{file}: expected {expected}, but it cannot be read: {reason(error)}.") from error
 
