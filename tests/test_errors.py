@@ -103,7 +103,7 @@ def test_devices_and_texts_that_fill_the_memory_are_not_read(tmp_path: Path, mon
         read_text(tmp_path / "pipe", "a thing")
     monkeypatch.setenv("REWILD4D_LARGEST_GIB", "0.000001")
     (tmp_path / "long").write_text("x" * 2000)
-    with pytest.raises(UserError, match="long: expected a thing of at most 1e-06 GiB once read"):
+    with pytest.raises(UserError, match="long: expected a thing of at most 9.99e-07 GiB once read"):
         read_text(tmp_path / "long", "a thing")
 
 
