@@ -50,7 +50,13 @@ class _Stage(NamedTuple):
 
 
 class Moment:
-    """One side at one time: all points, that are matched to, and those that are matched."""
+    """One side at one time: all points, that are matched to, and those that are matched.
+
+    Examples:
+        >>> line = np.linspace(0, 1, 5)[:, None] * np.array([1.0, 0, 0])
+        >>> len(Moment(np.concatenate((line, line)), even=True).queries)
+        5
+    """
 
     def __init__(self, points: Points, even: bool) -> None:
         self.all = Cloud(points)

@@ -23,9 +23,9 @@ from pathlib import Path
 STAGES = {
     "prior": "rewild4d.running.runner:make_prior",
     "fit": "rewild4d.running.runner:Job._fit",
-    "checkpoint": "rewild4d.ours.fit:save_checkpoint",
-    "evaluation": "rewild4d.running.runner:evaluate",
-    "pictures": "rewild4d.running.runner:save_pictures",
+    "checkpoint": "rewild4d.ours.training:save_checkpoint",
+    "evaluation": "rewild4d.running.scoring:evaluate",
+    "pictures": "rewild4d.running.scoring:save_pictures",
     "record": "rewild4d.running.runner:write_record",
     "collect": "rewild4d.leaderboard.collect:collect",
     "build": "rewild4d.leaderboard.site:build_site",

@@ -122,7 +122,7 @@ def test_known_files_of_another_network_are_not_kept(tiny: Tiny, monkeypatch: py
 def test_a_cache_that_cannot_be_written(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
     given = tiny.put("given", "tiny.ckpt")
     monkeypatch.setattr(
-        "tempfile.mkstemp", lambda **_: (_ for _ in ()).throw(OSError(errno.EROFS, "Read-only file system"))
+        "rewild4d.files._begin", lambda _: (_ for _ in ()).throw(OSError(errno.EROFS, "Read-only file system"))
     )
     with pytest.raises(UserError, match="tiny.safetensors: expected a folder that can be written, but: Read-only"):
         import_weights([given], quiet)

@@ -90,5 +90,5 @@ def test_the_content_of_a_rig_includes_the_files_beside_it(tmp_path: Path) -> No
     (tmp_path / "the data.bin").write_bytes(b"\1" + data[1:])
     assert content(tmp_path / "rig.gltf") == content(tmp_path / "rig.gltf") != known
     (tmp_path / "the data.bin").unlink()
-    with pytest.raises(UserError, match=r"expected the file .*the data\.bin beside it"):
+    with pytest.raises(UserError, match=r"the data\.bin: expected the file that rig\.gltf names, but: No such file"):
         content(tmp_path / "rig.gltf")
