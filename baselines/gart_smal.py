@@ -16,6 +16,7 @@ import copyreg
 import io
 import math
 import pickle
+import pickletools
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -150,14 +151,35 @@ def _encode(text: str, encoding: str = "latin1") -> bytes:
     return text.encode(encoding)
 
 
+def _empty_array(_: object, shape: Any, __: object) -> np.ndarray:
+    """Begin an array as NumPy's reduction does: without values, which follow; a pickle may not ask for more room."""
+    if shape != (0,):
+        raise pickle.UnpicklingError(f"it begins an array of shape {str(shape)[:40]}")
+    return np.zeros(0, np.int8)
+
+
+class _Csc(sparse.csc_matrix):  # type: ignore[misc]
+    """A matrix that a pickle fills; calling the class, which may take any room, is not let through."""
+
+    def __init__(self, *_: Any) -> None:
+        raise pickle.UnpicklingError("it makes a sparse matrix of a size")
+
+
+class _Csr(sparse.csr_matrix):  # type: ignore[misc]
+    """The same by rows."""
+
+    def __init__(self, *_: Any) -> None:
+        raise pickle.UnpicklingError("it makes a sparse matrix of a size")
+
+
 LET_THROUGH: dict[tuple[str, str], Any] = {
-    # numpy moved these functions between modules; the reduction of an array and of a number names the present ones.
-    ("numpy", "_reconstruct"): np.zeros(0).__reduce__()[0],
+    ("numpy", "_reconstruct"): _empty_array,
+    # numpy moved this function between modules; the reduction of a number names the present one.
     ("numpy", "scalar"): np.float64(0).__reduce__()[0],
-    ("numpy", "ndarray"): np.ndarray,
+    ("numpy", "ndarray"): None,
     ("numpy", "dtype"): np.dtype,
-    ("scipy", "csc_matrix"): sparse.csc_matrix,
-    ("scipy", "csr_matrix"): sparse.csr_matrix,
+    ("scipy", "csc_matrix"): _Csc,
+    ("scipy", "csr_matrix"): _Csr,
     ("chumpy", "Ch"): _Chumpy,
     ("_codecs", "encode"): _encode,
     ("copyreg", "_reconstructor"): copyreg._reconstructor,  # type: ignore[attr-defined]
@@ -170,10 +192,10 @@ class _Careful(pickle.Unpickler):
     """Unpickler of arrays, sparse matrices and chumpy variables alone."""
 
     def find_class(self, module: str, name: str) -> Any:
-        known = LET_THROUGH.get((module.split(".")[0], name))
-        if known is None:
+        place = (module.split(".")[0], name)
+        if place not in LET_THROUGH:
             raise pickle.UnpicklingError(f"it holds a {module}.{name}, which is not let through")
-        return known
+        return LET_THROUGH[place]
 
 
 def _read(path: Path) -> Mapping[str, Any]:
@@ -183,6 +205,7 @@ def _read(path: Path) -> Mapping[str, Any]:
         content = path.read_bytes()
         if content[:2] == b"PK":
             return arrays_of(path, content, "a D-SMAL file (npz or SMAL pickle)")
+        _require_few_places(content)
         raw = _Careful(io.BytesIO(content), encoding="latin1").load()
     except FileNotFoundError as error:
         raise UserError(f"{wanted}, but there is no such file.") from error
@@ -199,13 +222,21 @@ def _read(path: Path) -> Mapping[str, Any]:
     return found
 
 
+def _require_few_places(content: bytes) -> None:
+    """Refuse a pickle that numbers its values beyond their count: the unpickler makes room for every number below."""
+    places = (argument for code, argument, _ in pickletools.genops(content) if code.name.endswith("PUT"))
+    if any(int(place or 0) > len(content) for place in places):
+        raise pickle.UnpicklingError("it numbers more values than it can hold")
+
+
 def _array(path: Path, value: Any) -> np.ndarray:
     if isinstance(value, _Chumpy):
         value = value.x
     if not sparse.issparse(value):
         return np.asarray(value)
     try:  # places of a damaged one may lie outside of it, and SciPy writes there unless it is asked to look
-        looked_at = type(value)((value.data, value.indices, value.indptr), shape=value.shape)
+        kind = sparse.csc_matrix if isinstance(value, _Csc) else sparse.csr_matrix
+        looked_at = kind((value.data, value.indices, value.indptr), shape=value.shape)
         looked_at.check_format(full_check=True)
     except (ValueError, TypeError, AttributeError, LookupError, OverflowError) as error:
         raise UserError(f"{path}: expected a sparse matrix, but it is damaged ({reason(error)}).") from error
@@ -229,8 +260,9 @@ def _checked(path: Path, raw: Mapping[str, Any]) -> dict[str, Tensor]:
         "parents": (joints,),
     }  # fmt: skip
     for name, shape in wanted.items():
-        if arrays[name].shape != shape or not np.issubdtype(arrays[name].dtype, np.number):
-            raise UserError(f"{path}: expected '{name}' of shape {list(shape)}, got {list(arrays[name].shape)}.")
+        found = arrays[name]
+        if found.shape != shape or not found.size or not np.issubdtype(found.dtype, np.number):
+            raise UserError(f"{path}: expected '{name}' of shape {list(shape)}, got {list(found.shape)}.")
         if not np.isfinite(arrays[name].astype(np.float64)).all():
             raise UserError(f"{path}: expected finite numbers in '{name}'.")
     size = float(np.linalg.norm(np.ptp(arrays["vertices"].astype(np.float64), axis=0)))
