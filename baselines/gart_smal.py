@@ -182,8 +182,9 @@ LET_THROUGH: dict[tuple[str, str], Any] = {
     ("scipy", "csr_matrix"): _Csr,
     ("chumpy", "Ch"): _Chumpy,
     ("_codecs", "encode"): _encode,
-    ("copyreg", "_reconstructor"): copyreg._reconstructor,  # type: ignore[attr-defined]
-    ("builtins", "object"): object,
+    # Python 2 had other names for these two modules.
+    **dict.fromkeys((("copyreg", "_reconstructor"), ("copy_reg", "_reconstructor")), copyreg._reconstructor),  # type: ignore[attr-defined]
+    **dict.fromkeys((("builtins", "object"), ("__builtin__", "object")), object),
 }
 """What a pickle may name, by the names of the top package and of the object."""
 
