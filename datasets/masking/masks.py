@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
+from rewild4d.datasets.masking.coloured import color_numbers, numbered, object_colors
 from rewild4d.datasets.masking.meaning import Census, Meaning
 from rewild4d.errors import UserError
 from rewild4d.files import natural
@@ -72,12 +73,14 @@ class MaskFiles:
         is_indexed: whether files with a palette hold numbers of objects; otherwise the palette's greys count.
         meaning: of the values of all files.
         stored: width and height of the video's frames before their pixels were made square; masks may have that shape.
+        colors: of the objects, where files tell them apart by colour (`coloured`).
     """
 
     files: tuple[Path | None, ...]
     is_indexed: bool = False
     meaning: Meaning = Meaning()
     stored: tuple[int, int] | None = None
+    colors: tuple[int, ...] = ()
 
     @property
     def ids(self) -> tuple[int, ...]:
@@ -98,7 +101,8 @@ class MaskFiles:
         file = self.files[index]
         if file is None:
             return None
-        mask = self.meaning.mask(stored_values(file, self.is_indexed), object_id)
+        values = color_numbers(file, self.colors) if self.colors else stored_values(file, self.is_indexed)
+        mask = self.meaning.mask(values, object_id)
         return fit_size(mask, size, str(file), self.stored)
 
 
@@ -113,6 +117,8 @@ def open_masks(files: Sequence[Path | None]) -> MaskFiles:
     census = Census(any(file.suffix.lower() in LOSSY for file in there))
     for file in there:
         census.add(stored_values(file, indexed))
+    if not indexed and not census.is_lossy and (colors := object_colors(there)):
+        return MaskFiles(tuple(files), meaning=numbered(colors), colors=colors)
     return MaskFiles(tuple(files), indexed, census.indexed() if indexed else census.meaning())
 
 
