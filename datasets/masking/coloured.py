@@ -8,9 +8,10 @@ from PIL import Image, ImageOps
 
 from rewild4d.datasets.masking.meaning import MOST_OBJECTS, Meaning
 
-BLACK, GREY = 31, 8
-"""A colour without a channel above the first is background; one whose channels differ by no more than the second is
-grey."""
+BLACK = 31
+"""Colours without a channel above this are background: a JPEG's black is not quite black."""
+FILE_TINT = 8
+"""Channels of an image file that differ by no more are grey: conversion between colour spaces tints it a little."""
 
 
 def object_colors(files: Sequence[Path]) -> tuple[int, ...]:
@@ -31,7 +32,7 @@ def object_colors(files: Sequence[Path]) -> tuple[int, ...]:
         if len(found) > MOST_OBJECTS:
             return ()
     colors = tuple(color for color in sorted(found) if max(_channels(color)) > BLACK)
-    tinted = sum(max(_channels(color)) - min(_channels(color)) > GREY for color in colors)
+    tinted = sum(max(_channels(color)) - min(_channels(color)) > FILE_TINT for color in colors)
     return colors if tinted > 1 and len(colors) - tinted < 2 else ()
 
 

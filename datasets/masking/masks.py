@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
-from rewild4d.datasets.masking.coloured import color_numbers, numbered, object_colors
+from rewild4d.datasets.masking.coloured import BLACK, FILE_TINT, color_numbers, numbered, object_colors
 from rewild4d.datasets.masking.meaning import Census, Meaning
 from rewild4d.errors import UserError
 from rewild4d.files import natural
@@ -22,12 +22,8 @@ from rewild4d.foreign.reading import picture_size
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 LOSSY = (".jpg", ".jpeg", ".webp")
-BLACK = 31
-"""Colours without a channel above this are background: a JPEG's black is not quite black."""
 NOISE = 0.04
 """Parts smaller than this share of the largest one do not widen the animal's box."""
-FILE_TINT = 8
-"""The same of an image file: conversion between colour spaces tints it a little."""
 FILM_TINT = 40
 """Largest difference of two channels where a film of masks is grey: compression tints it."""
 CUT_SHARE = 0.1
