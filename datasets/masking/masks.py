@@ -118,14 +118,6 @@ def open_masks(files: Sequence[Path | None]) -> MaskFiles:
     return MaskFiles(tuple(files), indexed, census.indexed() if indexed else census.meaning())
 
 
-def read_values(file: Path) -> np.ndarray:
-    """Return the shades of one mask file, uint8 [h, w]; arguments and errors as of `stored_values`."""
-    values = stored_values(file)
-    most = values.max(initial=0)
-    whole = 65535 if most > 255 else 1 if values.dtype.kind == "f" and most <= 1 else 255
-    return Meaning(white=whole).mask(values, None)
-
-
 def stored_values(file: Path, indexed: bool = False) -> np.ndarray:
     """Return the values of a mask file, [h, w]: as they are stored, of a palette its greys or its indices.
 

@@ -17,11 +17,11 @@ import pytest
 import torch
 from fault_readers import read_frame
 from mutations import measured
+from one_mask import read_values
 
 from rewild4d.datasets.artemis.files import read_parents
 from rewild4d.datasets.artemis.volume import _tensor
 from rewild4d.datasets.images import read_picture
-from rewild4d.datasets.masking.masks import read_values
 from rewild4d.datasets.video.footage import open_footage
 from rewild4d.datasets.video.video_file import video_facts
 from rewild4d.errors import UserError

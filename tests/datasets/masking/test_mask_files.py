@@ -7,9 +7,10 @@ import moving
 import numpy as np
 import pytest
 from films import SELECTION
+from one_mask import read_values
 from PIL import Image
 
-from rewild4d.datasets.masking.masks import list_images, open_masks, read_values
+from rewild4d.datasets.masking.masks import list_images, open_masks
 from rewild4d.datasets.video.davis import Davis
 from rewild4d.datasets.video.online import Online
 from rewild4d.errors import UserError
