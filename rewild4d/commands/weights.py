@@ -195,7 +195,7 @@ def _pip(archive: Archive, scratch: Path, timeout: float) -> str:
     """
     done, requirements, log = scratch / "done", scratch / "requirements.txt", scratch / "pip.log"
     write_text(requirements, f"{archive.requirement} --hash=sha256:{archive.sha256}\n")
-    done.mkdir()
+    done.mkdir(exist_ok=True)
     command = [sys.executable, "-m", "pip", "download", "--disable-pip-version-check", "--no-input", "--no-cache-dir",
                "--no-deps", "--require-hashes", "--dest", str(done), "--requirement", str(requirements)]  # fmt: skip
     places = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(scratch))

