@@ -12,10 +12,10 @@ animal too, as in the original. Frames without a camera in the world get the pri
 the frames, adds the silhouette loss, and sees each frame flipped as well, at time -t with the mirrored camera. It works
 in the object frame, where mirroring is defined, with the root motion that `ours` gets.
 
-Differences from the original: time is (frame + 1) / T, so that t and -t differ; the heads start at zero; harmonics
-rotate with their Gaussian; image gradients for densification are in units of the animal's box, and the number of
-Gaussians is capped; every Gaussian is blurred by at least half an input pixel, as in `ours`; the schedule is in
-fractions; the network computes in bfloat16 on CPUs that have it.
+Differences from the original: time runs from one frame above zero to one, so that t and -t differ; the heads start
+at zero; harmonics rotate with their Gaussian; image gradients for densification are in units of the animal's box, and
+the number of Gaussians is capped; every Gaussian is blurred by at least half an input pixel, as in `ours`; the
+schedule is in fractions; the network computes in bfloat16 on CPUs that have it.
 """
 
 from pathlib import Path
@@ -87,12 +87,11 @@ class D3dgsTraining(SplatTraining):
 
     def drawn_losses(self, index: int) -> tuple[dict[str, Tensor], RasterInfo, Target]:
         progress, motion = index / self.config.iterations, self.config.motion
-        frames = self.supervision.frames
-        frame = int(torch.randint(frames, (), generator=self.generator))
+        frame = int(torch.randint(self.supervision.frames, (), generator=self.generator))
         view = -1 if self.mirrored and float(torch.rand((), generator=self.generator)) < self.mirrored else 1
-        noise = torch.randn((), generator=self.generator) * motion.noise * fade(progress, motion.noise_until)
-        target = self.supervision.target(Key(1, view, frame))
-        time = view * (frame + 1 + noise) / frames
+        noise = float(torch.randn((), generator=self.generator)) * motion.noise * fade(progress, motion.noise_until)
+        key = Key(1, view, frame)
+        target, time = self.supervision.target(key), view * self.supervision.code_times([key], noise)[0]
         shape = self.model.canonical() if progress < motion.warm_up else self.model.deformed(time)
         rgb, alpha, info = self.render(shape, target, progress)
         return self.image_losses(rgb, alpha, target), info, target
@@ -108,7 +107,7 @@ class D3dgsReconstruction:
     def at(self, time: float) -> Splats:
         """Return the Gaussians at a time in seconds in the world; the network interpolates between frames."""
         position = self.root.position(time)
-        shape = self.model.deformed(torch.tensor((position + 1) / len(self.root.times)))
+        shape = self.model.deformed(torch.tensor(self.root.code_time(time)))
         return self.root.in_world(self.model.gaussians.splats_at(*shape), position)
 
     def camera(self, time: float) -> Camera | None:

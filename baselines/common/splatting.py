@@ -15,13 +15,13 @@ from torch.optim import Optimizer
 
 from rewild4d.baselines.common.splatting_config import ImageLoss, SplatConfig
 from rewild4d.contracts import Log
-from rewild4d.ours.canonical import Gaussians, attributes
+from rewild4d.ours.canonical import Gaussians, attributes, start_surface
 from rewild4d.ours.checkpoint import load_checkpoint
 from rewild4d.ours.config import Canonical
 from rewild4d.ours.losses.images import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.symmetry import Target
 from rewild4d.ours.training import GaussianTraining, run_steps
-from rewild4d.priors.motion import colors_from_frames, pose_gaussians, quats_from_normals, sample_surface
+from rewild4d.priors.motion import colors_from_frames, pose_gaussians, quats_from_normals
 from rewild4d.rasterizer import RasterInfo, rasterize
 from rewild4d.types import Camera, Clip, Prior
 
@@ -154,9 +154,9 @@ def surface_gaussians(
     Returns:
         The five attributes of `Gaussians` by name.
     """
-    sample = sample_surface(prior, config.samples, generator)
+    sample = start_surface(prior, config, generator)
     rest = torch.eye(4).expand(len(prior.parents), 4, 4) if transforms is None else transforms
-    scales = sample.radius * torch.tensor((1.0, 1.0, config.thickness)).expand(config.samples, 3)
+    scales = sample.radius * torch.tensor((1.0, 1.0, config.thickness)).expand(len(sample.points), 3)
     rgb = colors_from_frames(prior, sample, clip.frames)
     splats = pose_gaussians(sample, quats_from_normals(sample.normals), scales, rgb, rest)
     return attributes(splats.means, splats.quats, scales.log(), rgb, config)

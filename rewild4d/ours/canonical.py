@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 from rewild4d.harmonics import C0, basis, rotated
 from rewild4d.ours.config import Canonical
 from rewild4d.ours.fused.harmonics import COLORS, seen_rgb
-from rewild4d.priors.motion import quats_from_normals, sample_surface
+from rewild4d.priors.motion import SurfaceSample, quats_from_normals, sample_surface, surface_vertices
 from rewild4d.transforms import quat_multiply, quat_to_matrix
 from rewild4d.types import OBJECT_DIAGONAL, Prior, Splats
 
@@ -43,7 +43,7 @@ class Gaussians(nn.Module):
         super().__init__()
         for name in NAMES:
             self.register_parameter(name, nn.Parameter(values[name].detach().clone().float().contiguous()))
-        self.max_log_scale = math.log(max_scale * OBJECT_DIAGONAL)
+        self.max_log_scale = math.log(max_scale * OBJECT_DIAGONAL) if max_scale else math.inf
         self.register_buffer("blur", torch.zeros(()))
 
     @classmethod
@@ -115,8 +115,13 @@ class Gaussians(nn.Module):
         return Splats(means, quats, scales, self.opacities(), self.splat_colors(quats))
 
 
+def start_surface(prior: Prior, config: Canonical, generator: torch.Generator) -> SurfaceSample:
+    """Return the points of the rest surface that the settings start from."""
+    return surface_vertices(prior) if config.start == "vertices" else sample_surface(prior, config.samples, generator)
+
+
 def initial_gaussians(
-    prior: Prior, count: int, config: Canonical, generator: torch.Generator, shape: bool = True
+    prior: Prior, config: Canonical, generator: torch.Generator, shape: bool = True
 ) -> dict[str, Tensor]:
     """Place flat Gaussians on the rest surface (METHOD section 3): radius sqrt(area / pi n), normal along the third
     axis.
@@ -125,8 +130,7 @@ def initial_gaussians(
 
     Args:
         prior: its rest surface is sampled.
-        count: number of Gaussians.
-        config: thickness and opacity at the start.
+        config: number, thickness and opacity at the start.
         generator: the only source of randomness.
         shape: False uses only the prior's bounding box.
 
@@ -134,15 +138,15 @@ def initial_gaussians(
         The five attributes by name; colours are mid-grey.
     """
     if shape:
-        surface = sample_surface(prior, count, generator)
+        surface = start_surface(prior, config, generator)
         means, quats = surface.points, quats_from_normals(surface.normals)
         scales = surface.radius * torch.tensor((1.0, 1.0, config.thickness))
     else:
         low, high = prior.vertices.float().aminmax(dim=0)
-        means = low + (high - low) * torch.rand(count, 3, generator=generator)
-        quats = normalize(torch.randn(count, 4, generator=generator), dim=-1)
-        scales = 0.5 * ((high - low).prod() / count) ** (1 / 3) * torch.ones(3)
-    return attributes(means, quats, scales.log().expand(count, 3), 0.5, config)
+        means = low + (high - low) * torch.rand(config.samples, 3, generator=generator)
+        quats = normalize(torch.randn(config.samples, 4, generator=generator), dim=-1)
+        scales = 0.5 * ((high - low).prod() / config.samples) ** (1 / 3) * torch.ones(3)
+    return attributes(means, quats, scales.log().expand(len(means), 3), 0.5, config)
 
 
 def attributes(

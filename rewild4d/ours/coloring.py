@@ -22,7 +22,7 @@ def initial_colors(model: Model, supervision: Supervision) -> Tensor:
     total, count = torch.zeros_like(own.means), torch.zeros_like(own.means[:, :1])
     for frame in range(supervision.frames):
         key = Key(1, 1, frame)
-        pose = model.pose(torch.tensor([(frame + 1) / supervision.frames]), [key])
+        pose = model.pose(supervision.code_times([key]), [key])
         posed = model.skin(weights, pose.quats[0], model.transforms(pose)[0])[1]
         colours, seen = project_colors(posed.means, quat_to_matrix(posed.quats)[..., 2], supervision.target(key))
         total, count = total + colours * seen[:, None], count + seen[:, None]

@@ -39,8 +39,10 @@ class Canonical(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """Degree of the spherical harmonics of colour, 0 to 3 (paper: 3)."""
     sh_every: Positive = 0.05
     """Fraction after which one more degree joins (1k of 20k)."""
-    max_scale: Positive = 0.05
-    """Largest standard deviation, times the rest diagonal."""
+    start: Literal["surface", "vertices"] = "surface"
+    """Start `samples` points of the prior's rest surface, or one Gaussian at each of its vertices (paper)."""
+    max_scale: Weight = 0.05
+    """Largest standard deviation, times the rest diagonal; 0 for none (paper)."""
 
 
 class Skinning(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -67,6 +69,9 @@ class Skinning(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Part anchors and pose network (section 4)."""
 
+    anchors: bool = True
+    """Part anchors; False removes them everywhere ("w/o Part Anchors"): joints' features come from the time code alone,
+    and the deformation's query has the skinning weights themselves."""
     anchor_size: Count = 8
     """Length of a part anchor (paper)."""
     anchor_std: Weight = 1.0
@@ -76,7 +81,8 @@ class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     octave_frames: Whole = 24
     """Frames that `frequencies` octaves suffice for; each doubling of the clip adds an octave; 0 adds none."""
     encoding: Literal["group", "view"] = "group"
-    """Sign that multiplies time in the code: the group's m, or the image's v ("w/o Symm. Enc."); unused if `tied`."""
+    """Sign that multiplies time in the code: the group's m (paper), or the image's v ("w/o Symm. Enc."); unused if
+    `tied`."""
     explicit_group: bool = False
     """Append the group sign m to the code."""
     width: Count = 128
@@ -103,8 +109,6 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     enabled: bool = True
     """False is the paper's "w/o Deform" ablation."""
-    anchors: bool = True
-    """Query with skinning weights times part anchors; False: with the weights themselves ("w/o Part Anchors")."""
     width: Count = 64
     """Hidden width."""
     heads: Count = 4
@@ -120,7 +124,7 @@ class Deform(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     sampled: Whole = 2000
     """Gaussians sampled for the gradients of the network's parameters (ours/fused/sampled_rows.py); 0 uses all."""
     ramp_start: Weight = 0.05
-    """Fraction at which the deformation starts to fade in."""
+    """Fraction at which the deformation starts to fade in (paper: it acts from the start)."""
     ramp_end: Weight = 0.15
     """Fraction at which it acts in full."""
     detach_features: bool = False
@@ -136,11 +140,12 @@ class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     shape: bool = True
     """Start on the prior's rest surface; False: anywhere in its box ("w/o Shape Prior"; skinning and poses keep it)."""
     blend: bool = False
-    """Blend the prior's poses into the network's (paper)."""
-    blend_until: Share = 0.35
-    """Fraction at which the blend reaches zero (7k of 20k)."""
+    """Blend the prior's poses into the network's; for footage see `Footage` (paper: there alone)."""
+    blend_until: Weight = 0.35
+    """Fraction at which the blend reaches zero (paper: 7k of 20k)."""
     pull: Weight = 0.3
-    """Weight of the squared distance to the prior's poses, falling linearly to zero (paper: open)."""
+    """Weight of the squared distance to the prior's poses, falling linearly to zero (paper: for footage alone, weight
+    open)."""
     pull_until: Weight = 1.0
     """Fraction at which the pull ends (paper: 4k of 20k); above 1 it is still on at the end."""
 
@@ -184,14 +189,17 @@ class Loss(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     silhouette: Weight = 0.1
     """Weight of BCE + Dice of the deformed branch (paper)."""
     random_background: bool = True
-    """Compose render and target over one random colour a step, so that floaters cannot hide."""
+    """Compose render and target over one random colour a step, so that floaters cannot hide; False: over white."""
+    mean_over: Literal["box", "image"] = "box"
+    """Area that sums over pixels are divided by: the animal's box, so that the frame's margins change no weight, or the
+    image ("standard" losses, as the paper calls them)."""
 
 
 class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Regularizers: the paper's three, and a skeleton's (sections 6, 9, 11.6)."""
+    """Regularizers: the paper's three, then some that it does not have (sections 6, 9, 11.6)."""
 
     until: Weight = 0.5
-    """Fraction at which the paper's three end (10k of 20k)."""
+    """Fraction at which the paper's three end (paper: 10k of 20k)."""
     tv: Weight = 10.0
     """Weight of the total variation of the skinning probabilities (paper)."""
     tv_delta: Positive = 0.05
@@ -199,9 +207,9 @@ class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     tv_every: Count = 1
     """Steps between evaluations, weight multiplied accordingly (the next two likewise)."""
     compact: Weight = 0.1
-    """Weight of the compactness of the parts (paper)."""
-    compact_power: Positive = 2.0
-    """Exponent on the skinning weights."""
+    """Weight of the compactness of the parts, mean over canonical and posed centres (paper)."""
+    compact_alpha: Weight = 2.0
+    """Factor in the exponent that makes large parts count less (paper)."""
     compact_every: Count = 4
     """Steps between evaluations."""
     smooth: Weight = 0.1
@@ -258,8 +266,8 @@ class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """Fraction over which the networks' rates rise from zero, since Adam's first steps would undo the warm-up."""
     deform: Rate = (8e-4, 1.6e-6)
     """Deformation network; for footage see `Footage`."""
-    clip: Positive = 1.0
-    """Bound on the gradient norm of the networks."""
+    clip: Weight = 1.0
+    """Bound on the gradient norm of the networks; 0 for none."""
 
 
 class Density(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -284,20 +292,20 @@ class Density(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class Footage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Values that replace others for footage of unknown cameras.
-
-    One camera follows the animal, so poses need less smoothing than between cameras that stand apart; and the prior's
-    cameras are guesses, so its poses are held for a shorter time. Measurements: docs/experiments/.
-    """
+    """Values that replace others for footage of unknown cameras (docs/experiments/films.md)."""
 
     use: bool = True
-    """False: the values below are not used (the paper has none of them)."""
+    """False: the values below are not used."""
     steps_per_frame: Whole = 250
     """Instead of `steps_per_frame`."""
     temporal: Weight = 5.0
     """Instead of `geometry.temporal`."""
     rigid: Weight = 0.2
     """Instead of `geometry.rigid`."""
+    blend: bool = False
+    """Instead of `prior.blend`."""
+    pull: Weight = 0.3
+    """Instead of `prior.pull`."""
     pull_until: Weight = 0.35
     """Instead of `prior.pull_until`."""
     pose: Rate = (7e-4, 1e-5)
@@ -322,11 +330,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     short_iterations: Count = 10_000
     """Most steps on a short clip (paper)."""
     mirrored: Share = 0.5
-    """Share of the steps that see a mirror image (paper: half). Mirror images teach the side that no camera saw, and
-    pull what cameras did see towards its mirror image."""
+    """Share of the steps that see a mirror image (paper: half)."""
     cameras: Literal["both", "own"] = "both"
-    """Cameras of an image: those of both groups (paper), or only those fitted to it ("own", m = v): frames from the
-    first group's, mirror images from the second's. Equal views where cameras are known."""
+    """Cameras of an image: those of both groups (paper), or only those fitted to it ("own", m = v). Equal views where
+    cameras are known."""
     checkpoint_every: Count = 500
     """Steps between checkpoints, where a work folder is given."""
     canonical: Canonical = Canonical()

@@ -57,13 +57,13 @@ class Training(GaussianTraining):
         """Compute all weighted losses of a view at an iteration, and the render info of the deformed branch."""
         config, model = self.config, self.model
         progress = index / config.iterations
-        keys, own = neighbour_keys([key], self.supervision.frames, config.geometry)
+        keys, own, gaps = neighbour_keys([key], self.supervision.positions, config.geometry)
         poses = model.pose(self._times(keys, progress), keys)
         network_pose = poses
         if config.prior.blend:
             prior_pose = self.supervision.prior_pose(keys)
             poses = blend_poses(poses, *prior_pose, fade(progress, config.prior.blend_until))
-        pose, transforms, skeleton = posture(model, poses, own, config.geometry)
+        pose, transforms, skeleton = posture(model, poses, own, config.geometry, gaps)
         probabilities = model.field.probabilities()
         delta = config.geometry.tv_delta if self._varies(index) else None
         weights, variation = model.field.sample_and_vary(probabilities, model.gaussians.means, delta)
@@ -91,11 +91,10 @@ class Training(GaussianTraining):
         return losses, info
 
     def _times(self, keys: list[Key], progress: float) -> Tensor:
-        """Return (i + 1) / T, jittered early on by a share of a frame that neighbours share."""
-        frames, pose = self.supervision.frames, self.config.pose
+        """Return times for the code, jittered early on by a share of a frame that neighbours share."""
+        pose = self.config.pose
         noise = float(torch.randn((), generator=self.generator)) * pose.time_noise
-        noise *= fade(progress, pose.time_noise_until)
-        return torch.tensor([(key.frame + 1 + noise) / frames for key in keys])
+        return self.supervision.code_times(keys, noise * fade(progress, pose.time_noise_until))
 
     def _render(
         self, posed: Posed, opacities: Tensor, features: Tensor, target: Target, detach_scales: bool = False
@@ -135,7 +134,7 @@ class Training(GaussianTraining):
         losses: dict[str, Tensor] = {}
         if index < config.until * self.config.iterations:
             if config.compact and index % config.compact_every == 0:
-                both = compact_loss((own.means, posed.means), weights, opacities, config.compact_power)
+                both = compact_loss((own.means, posed.means), weights, config.compact_alpha)
                 losses["compact"] = config.compact * config.compact_every * both
             if config.smooth and index % config.smooth_every == 0:
                 smooth = smooth_loss(deformed, opacities, config.smooth_size, self.generator)
@@ -150,7 +149,8 @@ class Training(GaussianTraining):
 
     def check_gradients(self, index: int) -> None:
         """Clip the networks' gradients; raise a FloatingPointError where a gradient is not finite."""
-        norms = [clip_gradients(self.groups[name], self.config.rates.clip) for name in ("pose", "deform")]
+        limit = self.config.rates.clip or math.inf
+        norms = [clip_gradients(self.groups[name], limit) for name in ("pose", "deform")]
         if not all(map(math.isfinite, norms)) or not all_finite(list(self.model.gaussians.parameters())):
             require_finite(self.model, index)
 
@@ -164,7 +164,7 @@ def train(
         UserError: the clip or the prior cannot be used.
     """
     generator = torch.Generator().manual_seed(seed)
-    supervision = Supervision(clip, prior, config.image_size, device)
+    supervision = Supervision(clip, prior, config.image_size, device, config.loss.mean_over)
     small = Supervision(clip, prior, min(config.image_size, config.warmup.size), device)
     model = build_model(config, prior, generator).to(device)
     warmup = WarmUp(model, small, prior, config, generator)

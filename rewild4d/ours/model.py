@@ -41,7 +41,7 @@ class Model(nn.Module):
         self.config = config
         self.gaussians, self.field = gaussians, field
         self.network = PoseNetwork(len(parents), config.pose, generator)
-        parts = config.pose.anchor_size if config.deform.anchors else len(parents)
+        parts = config.pose.anchor_size if config.pose.anchors else len(parents)
         self.deform = DeformNetwork(parts, config.pose.width, config.deform, generator)
         self.register_buffer("pivots", pivots)
         self.register_buffer("mirror", mirror)
@@ -85,8 +85,7 @@ class Model(nn.Module):
         if strength == 0 or not self.config.deform.enabled:
             return posed
         features = pose.features[0].detach() if self.config.deform.detach_features else pose.features[0]
-        anchors = self.network.anchors if self.config.deform.anchors else None
-        return self.deform(features, weights, anchors, posed, strength, offset)
+        return self.deform(features, weights, self.network.anchors, posed, strength, offset)
 
     def moved(self, pose: Pose, weights: Tensor, strength: float) -> tuple[Posed, Posed]:
         """Return skinned Gaussians of the appearance branch at a pose of one code, and the same deformed."""
@@ -96,7 +95,7 @@ class Model(nn.Module):
 
 def build_model(config: Config, prior: Prior, generator: torch.Generator) -> Model:
     """Build the initial model: Gaussians on the prior's rest surface, the field filled from its weights."""
-    values = initial_gaussians(prior, config.canonical.samples, config.canonical, generator, config.prior.shape)
+    values = initial_gaussians(prior, config.canonical, generator, config.prior.shape)
     field = build_field(prior.vertices.float(), prior.weights.float(), prior.mirror.long(), config.skinning)
     skeleton = (prior.bones[:, 0].float(), prior.parents.long(), prior.mirror.long())
     return Model(config, Gaussians(values, config.canonical.max_scale), field, *skeleton, generator)

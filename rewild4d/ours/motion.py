@@ -38,6 +38,13 @@ class Root:
         """Return `frame_position` of a time in seconds."""
         return frame_position(self.times, time)
 
+    def code_time(self, time: float) -> float:
+        """Return a time in seconds, no earlier than the first frame and no later than the last, for the time code, as
+        `Supervision.code_times` has it at the frames."""
+        first, last = float(self.times[0]), float(self.times[-1])
+        step = float(self.times.diff().median())
+        return (min(max(time, first), last) - first + step) / (last - first + step)
+
     def in_world(self, splats: Splats, position: float) -> Splats:
         """Transform Gaussians at a position from the method's frame to the world."""
         matrix = interpolate_similarity(self.object_to_world, position)

@@ -59,18 +59,25 @@ def time_code(time: Tensor, group: Tensor, view: Tensor, frequencies: int, expli
 class PoseNetwork(nn.Module):
     """Anchors + code -> self-attention over the parts -> one rotation and translation per joint.
 
-    The head starts at zero, so every pose starts as the rest pose.
+    The head starts at zero, so every pose starts as the rest pose. Without anchors one linear layer makes the tokens of
+    all parts from the code alone.
 
     Attributes:
-        anchors: one learnable vector per part, [J, D].
+        anchors: one learnable vector per part, [J, D], or None.
     """
+
+    anchors: nn.Parameter | None
 
     def __init__(self, joints: int, config: PoseConfig, generator: torch.Generator) -> None:
         super().__init__()
-        self.config = config
+        self.config, self.joints = config, joints
         code = 2 + 2 * config.frequencies + config.explicit_group
-        self.anchors = nn.Parameter(config.anchor_std * torch.randn(joints, config.anchor_size, generator=generator))
-        self.embed = nn.Linear(config.anchor_size + code, config.width)
+        if config.anchors:
+            start = config.anchor_std * torch.randn(joints, config.anchor_size, generator=generator)
+            self.anchors, self.embed = nn.Parameter(start), nn.Linear(config.anchor_size + code, config.width)
+        else:
+            self.register_parameter("anchors", None)
+            self.embed = nn.Linear(code, joints * config.width)
         self.blocks = nn.ModuleList(Block(config.width, config.heads) for _ in range(config.blocks))
         self.norm = nn.LayerNorm(config.width)
         self.head = nn.Linear(config.width, 7)
@@ -82,22 +89,23 @@ class PoseNetwork(nn.Module):
     def forward(self, code: Tensor, flipped: Sequence[bool] | None = None, mirror: Tensor | None = None) -> Pose:
         """Compute poses of codes [B, E], with left and right exchanged by ``mirror`` [J] where ``flipped`` [B]."""
         if (
-            POSE_NETWORK.takes(self.anchors, owner=self)
+            self.anchors is not None
+            and POSE_NETWORK.takes(self.anchors, owner=self)
             and fits_sizes(self.config.width, self.config.heads)
             and not code.requires_grad
         ):
-            return self._fused(code, flipped, mirror)
+            return self._fused(self.anchors, code, flipped, mirror)
         pose = self._plain(code)
         if flipped is None or mirror is None:
             return pose
         pick = torch.tensor(flipped, device=code.device)[:, None, None]
         return Pose(*(torch.where(pick, other, own) for own, other in zip(pose, pose.mirrored(mirror), strict=True)))
 
-    def _fused(self, code: Tensor, flipped: Sequence[bool] | None, mirror: Tensor | None) -> Pose:
-        config, (joints, anchor) = self.config, self.anchors.shape
+    def _fused(self, anchors: Tensor, code: Tensor, flipped: Sequence[bool] | None, mirror: Tensor | None) -> Pose:
+        config, (joints, anchor) = self.config, anchors.shape
         # The modules' own generator of parameters takes longer than a layer.
         layers = (each for layer in self._layers for each in layer._parameters.values() if each is not None)
-        parameters = [self.anchors, *layers]
+        parameters = [anchors, *layers]
         network = (config.width, config.heads, config.blocks, config.reach * OBJECT_DIAGONAL)
         sizes = sizes_of(joints, anchor, anchor + code.shape[1], *network, len(code))
         if flipped is None or mirror is None:
@@ -105,9 +113,7 @@ class PoseNetwork(nn.Module):
         return Pose(*poses(sizes, parameters, code, np.array(flipped), mirror.numpy()))
 
     def _plain(self, code: Tensor) -> Pose:
-        batch, joints = code.shape[0], self.anchors.shape[0]
-        tokens = torch.cat((self.anchors.expand(batch, joints, -1), code[:, None].expand(batch, joints, -1)), dim=-1)
-        hidden = self.embed(tokens)
+        hidden = self._tokens(code)
         for block in self.blocks:
             hidden = block(hidden)
         features = self.norm(hidden)
@@ -115,6 +121,13 @@ class PoseNetwork(nn.Module):
         identity = out.new_tensor((1.0, 0.0, 0.0, 0.0))
         quats = nn.functional.normalize(identity + out[..., :4], dim=-1)
         return Pose(quats, out[..., 4:] * (self.config.reach * OBJECT_DIAGONAL), features)
+
+    def _tokens(self, code: Tensor) -> Tensor:
+        """Embed codes [B, E] as a token for each part, [B, J, K]."""
+        if self.anchors is None:
+            return self.embed(code).unflatten(1, (self.joints, -1))
+        anchors = self.anchors.expand(len(code), self.joints, -1)
+        return self.embed(torch.cat((anchors, code[:, None].expand(-1, self.joints, -1)), dim=-1))
 
 
 class Block(nn.Module):

@@ -1,5 +1,6 @@
 """The result of a fit: a function from time to Gaussians in the world."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ class OursReconstruction:
     def at(self, time: float) -> Splats:
         """Return the Gaussians at a time in seconds in the world; networks and root interpolate between frames."""
         position = self.root.position(time)
-        pose = self._pose(torch.tensor([position]))
+        pose = self._pose([time])
         strength = ramp(1.0, self.config.deform.ramp_start, self.config.deform.ramp_end)
         _, moved = self.model.moved(pose, self.weights, strength)
         own = self.model.gaussians
@@ -63,7 +64,7 @@ class OursReconstruction:
     def articulation(self, time: float) -> tuple[Tensor, Tensor]:
         """Return rest -> posed transforms, [J, 4, 4], without the deformation, and object_to_world, [4, 4]."""
         position = self.root.position(time)
-        pose = self._pose(torch.tensor([position]))
+        pose = self._pose([time])
         return self.model.transforms(pose)[0], interpolate_similarity(self.root.object_to_world, position)
 
     @torch.no_grad()
@@ -73,7 +74,7 @@ class OursReconstruction:
         These are angles against the parent in degrees and shifts over the rest diagonal (mean and standard deviation
         over the frames, a list over the joints), the number of Gaussians and their mean opacity.
         """
-        pose = self._pose(torch.arange(len(self.root.times), dtype=torch.float32))
+        pose = self._pose(self.root.times.tolist())
         angles = relative_angles(pose.quats, self.parents)
         shifts = pose.shifts.norm(dim=-1) / OBJECT_DIAGONAL
         figures: dict[str, float | list[float]] = {}
@@ -89,9 +90,9 @@ class OursReconstruction:
         state = {"model": self.model.state_dict(), **self.root.state(), "cameras": cameras}
         save_fitted(folder, STATE, state, self.config)
 
-    def _pose(self, positions: Tensor) -> Pose:
-        times = (positions.float() + 1) / len(self.root.times)
-        return self.model.pose(times, [Key(1, 1, 0)] * len(positions))
+    def _pose(self, times: Sequence[float]) -> Pose:
+        codes = torch.tensor([self.root.code_time(time) for time in times])
+        return self.model.pose(codes, [Key(1, 1, 0)] * len(times))
 
 
 def _camera_state(camera: Camera | None) -> dict[str, Tensor | list[int]] | None:
@@ -118,7 +119,7 @@ def _from_state(path: Path, state: dict[str, Any], config: Config, device: torch
     require_tensors(path, state, {"times": ("T",), "object_to_world": ("T", 4, 4)}, sizes)
     saved: Any = state.get("model")
     require_tensors(path, saved, _shapes(config), sizes)
-    parts = config.pose.anchor_size if config.deform.anchors else sizes["J"]
+    parts = config.pose.anchor_size if config.pose.anchors else sizes["J"]
     inputs = parts + 3 * (1 + 2 * config.deform.frequencies) + 4 + 3
     require_tensors(path, saved, {"deform.query.weight": (config.deform.width, inputs)}, {})
     require_skeleton(path, saved["parents"], saved["mirror"])
@@ -147,11 +148,13 @@ def _shapes(config: Config) -> dict[str, Shape]:
     pose, deform = config.pose, config.deform
     code = 2 + 2 * pose.frequencies + pose.explicit_group
     last = f"network.blocks.{pose.blocks - 1}.down.bias"
+    embed: dict[str, Shape] = {
+        "network.anchors": ("J", pose.anchor_size), "network.embed.weight": (pose.width, pose.anchor_size + code),
+    } if pose.anchors else {"network.embed.weight": ("E", code)}  # fmt: skip
     return {
         "gaussians.means": ("n", 3), "gaussians.quats": ("n", 4), "gaussians.log_scales": ("n", 3),
         "gaussians.logit_opacities": ("n",), "gaussians.colors": ("n", "C", 3), "field.logits": ("V", "J"),
         "field.origin": (3,), "field.pitch": (3,), "field.mirror": ("J",), "pivots": ("J", 3), "parents": ("J",),
-        "mirror": ("J",), "network.anchors": ("J", pose.anchor_size),
-        "network.embed.weight": (pose.width, pose.anchor_size + code), last: (pose.width,),
+        "mirror": ("J",), **embed, last: (pose.width,),
         "deform.project.weight": (deform.width, deform.width),
     }  # fmt: skip

@@ -23,11 +23,11 @@ def for_clip_of_ours(config: Config, frames: int, *, filmed: bool = False) -> Co
     The result stays the same for a clip of any length.
     """
     config = _for_footage(config) if filmed and config.footage.use else config
+    config = _for_short(config) if frames <= config.short_frames else config
     pose = config.pose
     doublings = math.log2(frames / pose.octave_frames) if pose.octave_frames else 0.0
     pose = msgspec.structs.replace(pose, frequencies=pose.frequencies + max(0, round(doublings)), octave_frames=0)
-    steps = min(config.iterations, config.short_iterations) if frames <= config.short_frames else config.iterations
-    return for_clip(msgspec.structs.replace(config, iterations=steps, short_frames=0, pose=pose), frames)
+    return for_clip(msgspec.structs.replace(config, short_frames=0, pose=pose), frames)
 
 
 def _for_footage(config: Config) -> Config:
@@ -36,10 +36,24 @@ def _for_footage(config: Config) -> Config:
         config,
         steps_per_frame=own.steps_per_frame,
         geometry=replace(config.geometry, temporal=own.temporal, rigid=own.rigid),
-        prior=replace(config.prior, pull_until=own.pull_until),
+        prior=replace(config.prior, blend=own.blend, pull=own.pull, pull_until=own.pull_until),
         rates=replace(config.rates, pose=own.pose, deform=own.deform),
         cameras=own.cameras,
         footage=replace(own, use=False),
+    )
+
+
+def _for_short(config: Config) -> Config:
+    """Take the steps of a short clip; what the paper counts in steps ends at the same step."""
+    steps, replace = min(config.iterations, config.short_iterations), msgspec.structs.replace
+    longer = config.iterations / steps
+    prior, geometry = config.prior, config.geometry
+    ends = {"blend_until": prior.blend_until * longer, "pull_until": prior.pull_until * longer}
+    return replace(
+        config,
+        iterations=steps,
+        prior=replace(prior, **ends),
+        geometry=replace(geometry, until=geometry.until * longer),
     )
 
 

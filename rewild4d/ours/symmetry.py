@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,8 +34,8 @@ class Target:
         rgb: premultiplied, [3, h, w].
         mask: [1, h, w].
         camera: in the object frame.
-        side: side of a padded square box around the animal, pixels; image losses are divided by its area, so that the
-            frame's margins do not change a weight.
+        side: square root of the area that image losses are divided by, pixels: side of a padded square box around the
+            animal, so that the frame's margins do not change a weight, or of a square as large as the image.
     """
 
     rgb: Tensor
@@ -54,14 +54,18 @@ class Supervision:
 
     Attributes:
         frames: number of frames T.
+        positions: of the frames in the video, held-out ones counted (`frame_positions`), float64, [T].
         reduction: side of a training pixel in pixels of the clip.
         prior_quats: rotation of each joint, for v = +1 and v = -1, [2, T, J, 4].
         prior_shifts: translation about the rest pivot, [2, T, J, 3].
     """
 
-    def __init__(self, clip: Clip, prior: Prior, size: int, device: torch.device) -> None:
+    def __init__(
+        self, clip: Clip, prior: Prior, size: int, device: torch.device, mean_over: Literal["box", "image"] = "box"
+    ) -> None:
         rows = match_times(clip, prior)
         self.frames = len(clip.frames)
+        self.positions = frame_positions(torch.tensor(clip.times, dtype=torch.float64))
         longest = max(clip.frames[0].mask.shape[-2:])
         self.reduction = max(1.0, longest / size)
         self._targets: dict[Key, Target] = {}
@@ -71,7 +75,8 @@ class Supervision:
                 _check_camera(cameras[row], frame.mask).resized(mask.shape[2], mask.shape[1])
                 for cameras in (prior.cameras, prior.cameras_flip)
             )
-            side = animal_side(mask, clip.name, index)
+            box = animal_side(mask, clip.name, index)
+            side = box if mean_over == "box" else math.sqrt(mask.shape[1] * mask.shape[2])
             image, mirrored = (rgb, mask), (rgb.flip(-1), mask.flip(-1))
             choices = {
                 (1, 1): (image, plain),
@@ -97,6 +102,11 @@ class Supervision:
         frame = torch.tensor([key.frame for key in keys])
         return self.prior_quats[side, frame], self.prior_shifts[side, frame]
 
+    def code_times(self, keys: list[Key], noise: float = 0.0) -> Tensor:
+        """Return the times of views for the time code, all later by a share ``noise`` of a frame, in (0, 1], [B]."""
+        last = float(self.positions[-1])
+        return torch.tensor([(float(self.positions[key.frame]) + 1 + noise) / (last + 1) for key in keys])
+
     def pixel(self) -> float:
         """Return the side of a pixel at the object frame's origin, median over the frames, in object units."""
         cameras = [self._targets[Key(1, 1, index)].camera for index in range(self.frames)]
@@ -119,6 +129,12 @@ class Supervision:
         group, frame = (int(torch.randint(count, (), generator=generator)) for count in (2, self.frames))
         view = -1 if float(torch.rand((), generator=generator)) < mirrored else 1
         return Key(view if cameras == "own" else 1 - 2 * group, view, frame)
+
+
+def frame_positions(times: Tensor) -> Tensor:
+    """Return seconds since the first frame over the usual (median) step: where each frame is in the video, from 0, with
+    frames between that the clip lacks, [T] -> [T]."""
+    return (times - times[0]) / times.diff().median()
 
 
 def match_times(clip: Clip, prior: Prior) -> list[int]:

@@ -51,11 +51,10 @@ class WarmUp:
         copied = index < stage.regress
         count = stage.copies if copied else stage.views
         keys = [self.supervision.draw(self.generator, cameras=self.config.cameras) for _ in range(count)]
-        own = list(range(len(keys)))
+        own, gaps = list(range(len(keys))), None
         if not copied:
-            keys, own = neighbour_keys(keys, self.supervision.frames, self.config.geometry)
-        times = torch.tensor([(key.frame + 1) / self.supervision.frames for key in keys])
-        pose = self.model.pose(times, keys)
+            keys, own, gaps = neighbour_keys(keys, self.supervision.positions, self.config.geometry)
+        pose = self.model.pose(self.supervision.code_times(keys), keys)
         distance = pose_distance(pose, *self.supervision.prior_pose(keys))
         if copied:
             loss, figures = distance, {}
@@ -63,11 +62,12 @@ class WarmUp:
             transforms = self.model.transforms(pose)
             silhouette = torch.stack([self._silhouette(keys[row], transforms[row], progress) for row in own]).mean()
             loss = silhouette + stage.pull * (1 - progress) * distance
-            loss = loss + skeleton_losses(self.model, pose, transforms, self.config.geometry, len(keys) > len(own))
+            loss = loss + skeleton_losses(self.model, pose, transforms, self.config.geometry, gaps)
             figures = {"silhouette": float(silhouette.detach())}
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        nn.utils.clip_grad_norm_(self.model.network.parameters(), self.config.rates.clip, error_if_nonfinite=True)
+        limit = self.config.rates.clip or math.inf
+        nn.utils.clip_grad_norm_(self.model.network.parameters(), limit, error_if_nonfinite=True)
         self.optimizer.step()
         return {"loss": float(loss.detach()), "prior_distance": float(distance.detach())} | figures
 

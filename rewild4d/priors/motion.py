@@ -25,7 +25,7 @@ from rewild4d.types import Camera, Frame, Prior, Splats
 
 @dataclass(frozen=True)
 class SurfaceSample:
-    """Area-uniform points on a prior's rest mesh.
+    """Points on a prior's rest mesh.
 
     Attributes:
         points: object frame, [n, 3].
@@ -52,6 +52,16 @@ def sample_surface(prior: Prior, count: int, generator: torch.Generator) -> Surf
     weights = (barycentric[..., None] * prior.weights[prior.faces[face]]).sum(1)
     radius = math.sqrt(float(area.sum()) / (math.pi * count))
     return SurfaceSample(points, normalize(cross[face], dim=-1), weights / weights.sum(-1, keepdim=True), radius)
+
+
+def surface_vertices(prior: Prior) -> SurfaceSample:
+    """Return the rest mesh's vertices that a face has, with the mean of their faces' normals, weighted by area."""
+    corners = prior.vertices[prior.faces].float()
+    cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = torch.zeros_like(prior.vertices).index_add_(0, prior.faces.flatten(), cross.repeat_interleave(3, dim=0))
+    used = prior.faces.unique()
+    radius = math.sqrt(float(cross.norm(dim=-1).sum()) / (2 * math.pi * len(used)))
+    return SurfaceSample(prior.vertices[used], normalize(normals[used], dim=-1), prior.weights[used], radius)
 
 
 def quats_from_normals(normals: Tensor) -> Tensor:

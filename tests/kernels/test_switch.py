@@ -159,13 +159,13 @@ def test_one_kernel_can_be_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ZeroDivisionError
 
     monkeypatch.setattr(regularizers, "compactness", broken)
-    clouds, weights, opacities = (torch.rand(40, 3),), torch.full((40, 2), 0.5), torch.ones(40)
+    clouds, weights = (torch.rand(40, 3),), torch.full((40, 2), 0.5)
     with pytest.raises(ZeroDivisionError):
-        regularizers.compact_loss(clouds, weights, opacities, 1.0)
+        regularizers.compact_loss(clouds, weights, 2.0)
     with without_kernels("compactness"):
-        assert regularizers.compact_loss(clouds, weights, opacities, 1.0) > 0
+        assert regularizers.compact_loss(clouds, weights, 2.0) > 0
     with pytest.raises(ZeroDivisionError):
-        regularizers.compact_loss(clouds, weights, opacities, 1.0)
+        regularizers.compact_loss(clouds, weights, 2.0)
 
 
 def test_children_get_the_mode(monkeypatch: pytest.MonkeyPatch) -> None:

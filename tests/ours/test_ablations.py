@@ -38,7 +38,7 @@ def training(case: Case, **changes: object) -> Training:
 
 
 def test_without_a_shape_prior_gaussians_fill_the_box(case: Case) -> None:
-    start = initial_gaussians(case.prior, 4000, Canonical(opacity=0.1), generator(), shape=False)
+    start = initial_gaussians(case.prior, Canonical(samples=4000, opacity=0.1), generator(), shape=False)
     low, high = case.prior.vertices.aminmax(dim=0)
     assert ((start["means"] >= low) & (start["means"] <= high)).all()
     # Uniform: the mean is the middle and the deviation the side over the root of twelve.
@@ -47,7 +47,7 @@ def test_without_a_shape_prior_gaussians_fill_the_box(case: Case) -> None:
     assert float(start["logit_opacities"].sigmoid().mean()) == pytest.approx(0.1)
     side = ((high - low).prod() / 4000) ** (1 / 3)
     torch.testing.assert_close(start["log_scales"].exp(), (0.5 * side).expand(4000, 3))
-    on = initial_gaussians(case.prior, 4000, Canonical(), generator())
+    on = initial_gaussians(case.prior, Canonical(samples=4000), generator())
     assert torch.equal(model(case, prior=PriorUse(shape=False)).gaussians.means, drawn_in_box(case))
     inside = ((start["means"][:, None, :] - on["means"][None, :400]).norm(dim=-1).amin(1) > 0.3).float().mean()
     assert inside > 0.2, "a good part lies far from the surface"
@@ -60,8 +60,8 @@ def drawn_in_box(case: Case) -> torch.Tensor:
     return low + (high - low) * torch.rand(200, 3, generator=generator())
 
 
-def test_without_part_anchors_the_query_holds_the_weights(case: Case) -> None:
-    whole, without = model(case), model(case, deform=Deform(anchors=False))
+def test_without_part_anchors_there_are_none_anywhere(case: Case) -> None:
+    whole, without = model(case), model(case, pose=Pose(anchors=False))
     assert without.deform.inputs - whole.deform.inputs == 20 - 8
     weights = without.field.sample(without.field.probabilities(), without.gaussians.means)
     seen: list[tuple[torch.Tensor, torch.Tensor | None]] = []
@@ -71,8 +71,11 @@ def test_without_part_anchors_the_query_holds_the_weights(case: Case) -> None:
     assert torch.equal(seen[0][0], weights)
     assert seen[0][1] is None
     moved.means.sum().backward()
-    assert without.network.anchors.grad is not None, "the pose network keeps its anchors"
-    # The anchors reach the deformation through the parts' features alone.
+    assert not any("anchors" in name for name, _ in without.named_parameters())
+    assert without.network.embed.weight.shape == (20 * without.config.pose.width, whole.network.embed.in_features - 8)
+    features = pose.features[0].detach()
+    assert (features[0] - features[1]).abs().max() > 1e-3, "parts differ by the layer that makes their tokens"
+    assert without.network.embed.weight.grad is not None, "the time code reaches the deformation"
     weights = whole.field.sample(whole.field.probabilities(), whole.gaussians.means)
     whole.deform.register_forward_pre_hook(lambda _, given: seen.append(given[1:3]))
     whole.moved(whole.pose(torch.tensor([0.5]), [Key(1, 1, 0)]), weights, 1.0)

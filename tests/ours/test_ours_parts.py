@@ -159,19 +159,19 @@ def test_tied_field_is_its_own_mirror_image() -> None:
 def test_compact_loss_is_the_two_small_eigenvalues() -> None:
     points = torch.randn(60, 3, generator=generator()) * torch.tensor((3.0, 1.0, 0.5))
     points.requires_grad_()
-    weights, opacities = torch.rand(60, 4, generator=generator()), torch.rand(60, generator=generator())
+    weights = torch.rand(60, 4, generator=generator())
     weights = weights / weights.sum(-1, keepdim=True)
     weights[:, 3] = 0
-    loss = compact_loss([points], weights, opacities, 2.0)
+    loss = compact_loss([points], weights, 2.0)
 
     def by_eigenvalues(points: Tensor) -> Tensor:
-        total = points.new_zeros(())
+        total, mass = points.new_zeros(()), weights.sum(0)
         for joint in range(3):
-            share = weights[:, joint] ** 2 * opacities
-            share = share / share.sum()
+            share = weights[:, joint] / mass[joint]
             centered = points - share @ points
-            total = total + torch.linalg.eigvalsh((centered * share[:, None]).T @ centered)[:2].sum()
-        return total / 3
+            small = torch.linalg.eigvalsh((centered * share[:, None]).T @ centered)[:2]
+            total = total + torch.exp(-2 * mass[joint] / mass.max()) * small.sum()
+        return total / 4  # a part without mass has no spread
 
     expected = by_eigenvalues(points)
     torch.testing.assert_close(loss, expected)

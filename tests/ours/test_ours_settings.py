@@ -45,8 +45,19 @@ def test_settings_follow_whether_the_cameras_are_known() -> None:
     assert made.iterations == 24 * 250
     assert made.geometry.still == standard.geometry.still
     assert for_clip_of_ours(made, 24, filmed=True) == made
-    for preset in (quick, paper):
-        assert for_clip_of_ours(preset, 24, filmed=True) == for_clip_of_ours(preset, 24)
+    assert for_clip_of_ours(quick, 24, filmed=True) == for_clip_of_ours(quick, 24)
+    known, film = (for_clip_of_ours(paper, 24, filmed=filmed) for filmed in (False, True))
+    assert (known.prior.blend, known.prior.pull) == (False, 0.0), "the paper: both off on Artemis"
+    assert film.prior == msgspec.structs.replace(known.prior, blend=True, pull=1.0, pull_until=0.2)
+    assert (film.prior.blend_until, film.prior.pull_until) == (7_000 / 20_000, 4_000 / 20_000)
+    rest = {"prior": known.prior, "footage": known.footage}
+    assert msgspec.structs.replace(film, **rest) == known, "and nothing else differs"
+
+
+def test_a_short_run_of_the_paper_ends_its_stages_at_the_same_steps() -> None:
+    short = for_clip_of_ours(load_preset("ours", Config, "paper"), 12, filmed=True)
+    ends = short.prior.blend_until, short.prior.pull_until, short.geometry.until
+    assert [end * short.iterations for end in ends] == [7_000, 4_000, 10_000]
 
 
 def test_own_cameras_change_nothing_where_cameras_are_known(toy: tuple[Clip, Prior]) -> None:

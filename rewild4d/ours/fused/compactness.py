@@ -16,28 +16,12 @@ from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
 from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.threads import run_tickets
 
-COMPACTNESS = Kernel("compactness", "c5224f5d75ac", "rewild4d.ours.losses.regularizers:compact_loss")
+COMPACTNESS = Kernel("compactness", "98fbbed85ba8", "rewild4d.ours.losses.regularizers:compact_loss")
 
 CHUNK = 16 * BLOCK
 """Gaussians of a unit of work; sums run over units, so they do not depend on the number of threads."""
-
-
-@kernel
-def _mass_block(
-    begin: int, end: int, weights: np.ndarray, opacities: np.ndarray, power: float, mass: np.ndarray
-) -> None:
-    """Set the Gaussians' masses in the parts, [J, BLOCK]."""
-    joints = weights.shape[1]
-    read_columns(weights, begin, end, mass, BLOCK)
-    if power != 2:
-        for i in range(joints * BLOCK):
-            mass[i] = mass[i] ** power
-    opaque = np.zeros(BLOCK, np.float32)
-    opaque[: end - begin] = opacities[begin:end]
-    for joint in range(joints):
-        for index in range(joint * BLOCK, (joint + 1) * BLOCK, LANES):
-            weight, opacity = load(mass, index), load(opaque, index - joint * BLOCK)
-            store(mass, index, weight * weight * opacity if power == 2 else weight * opacity)
+LEAST_MASS = 1e-12
+"""Keeps the centre of a part without any mass finite."""
 
 
 @kernel
@@ -49,9 +33,7 @@ def _scratch(joints: int) -> tuple:
 
 
 @kernel
-def _moments(
-    tickets: np.ndarray, clouds: tuple, weights: np.ndarray, opacities: np.ndarray, power: float, sums: np.ndarray
-) -> None:
+def _moments(tickets: np.ndarray, clouds: tuple, weights: np.ndarray, sums: np.ndarray) -> None:
     """Sum each part's mass, first and second moments by chunk: 10 of 16 numbers, [clouds, chunks, J.. x 16]."""
     count, joints = weights.shape
     mass, points, moments, transposed = _scratch(joints)
@@ -61,7 +43,7 @@ def _moments(
             return
         for begin in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count), BLOCK):
             end = min(begin + BLOCK, count)
-            _mass_block(begin, end, weights, opacities, power, mass)
+            read_columns(weights, begin, end, mass, BLOCK)
             for cloud in range(len(clouds)):
                 read_columns(clouds[cloud], begin, end, points, BLOCK)
                 for lane in range(0, BLOCK, LANES):
@@ -75,10 +57,7 @@ def _moments(
 
 
 @kernel
-def _pull(
-    tickets: np.ndarray, clouds: tuple, weights: np.ndarray, opacities: np.ndarray, power: float, rows: np.ndarray,
-    grads: tuple,
-) -> None:  # fmt: skip
+def _pull(tickets: np.ndarray, clouds: tuple, weights: np.ndarray, rows: np.ndarray, grads: tuple) -> None:
     """Set the gradients of the points: mass-weighted sums of linear functions, rows [clouds, J x 16] of 3 x 4."""
     count, joints = weights.shape
     mass, points, made, own = _scratch(joints)
@@ -87,7 +66,7 @@ def _pull(
         if begin >= count:
             return
         end = min(begin + BLOCK, count)
-        _mass_block(begin, end, weights, opacities, power, mass)
+        read_columns(weights, begin, end, mass, BLOCK)
         for cloud in range(len(clouds)):
             read_columns(clouds[cloud], begin, end, points, BLOCK)
             own[:] = 0
@@ -100,33 +79,33 @@ def _pull(
             write_columns(made, BLOCK, grads[cloud], begin, end)
 
 
-def compactness(clouds: Sequence[Tensor], weights: Tensor, opacities: Tensor, power: float) -> Tensor:
+def compactness(clouds: Sequence[Tensor], weights: Tensor, alpha: float) -> Tensor:
     """Compute `compact_loss`; float32 on the CPU, gradients for the clouds only."""
-    return _Compactness.apply(weights, opacities, power, *clouds)
+    return _Compactness.apply(weights, alpha, *clouds)
 
 
 class _Compactness(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, weights: Tensor, opacities: Tensor, power: float, *clouds: Tensor) -> Tensor:
-        points, given = tuple(map(array, clouds)), (*map(array, (weights, opacities)), power)
+    def forward(ctx: Any, weights: Tensor, alpha: float, *clouds: Tensor) -> Tensor:
+        points, given = tuple(map(array, clouds)), array(weights)
         joints, chunks = weights.shape[1], max(1, -(-len(weights) // CHUNK))
         room = -(-joints // LANES) * LANES
         sums = np.zeros((len(clouds), chunks, room * LANES), np.float32)
-        run_tickets(_moments, points, *given, sums)
+        run_tickets(_moments, points, given, sums)
         total = sums.sum(axis=1, dtype=np.float64).reshape(len(clouds), room, LANES)[:, :joints]
-        used = total[..., 0] >= 1
-        mass, parts = np.where(used, total[..., 0], 1.0), np.maximum(1, used.sum(axis=-1, keepdims=True))
+        mass = np.maximum(total[..., 0], LEAST_MASS)
+        gamma = np.exp(-alpha * mass / mass.max(axis=-1, keepdims=True))
         center = total[..., 1:4] / mass[..., None]
         second = total[..., (4, 5, 6, 5, 7, 8, 6, 8, 9)].reshape(-1, joints, 3, 3) / mass[..., None, None]
         covariance = second - center[..., :, None] * center[..., None, :]
         top = np.linalg.eigh(covariance)[1][..., -1]
         across = np.eye(3) - top[..., :, None] * top[..., None, :]
-        share = used / (mass * parts * len(clouds))
+        share = gamma / (mass * joints * len(clouds))
         rows = np.zeros((len(clouds), joints, LANES), np.float32)
         grads = np.concatenate((across, -(across @ center[..., :, None])), axis=-1)
         rows[..., :12] = (2 * share[..., None, None] * grads).reshape(-1, joints, 12)
         ctx.points, ctx.given, ctx.rows = points, given, rows.reshape(len(clouds), -1)
-        value = (used / parts * (across * covariance).sum(axis=(-1, -2))).sum() / len(clouds)
+        value = (gamma * (across * covariance).sum(axis=(-1, -2))).mean()
         return torch.tensor(value, dtype=torch.float32)
 
     @staticmethod
@@ -134,5 +113,5 @@ class _Compactness(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         made = [torch.empty(each.shape, dtype=torch.float32) for each in ctx.points]
         rows, grads = ctx.rows * grad.item(), tuple(each.numpy() for each in made)
-        run_tickets(_pull, ctx.points, *ctx.given, rows, grads)
-        return None, None, None, *made
+        run_tickets(_pull, ctx.points, ctx.given, rows, grads)
+        return None, None, *made

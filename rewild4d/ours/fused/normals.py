@@ -17,10 +17,13 @@ from rewild4d.ours.fused.quaternions import unit_grad, unit_row
 
 NORMALS = Kernel(
     "normals",
-    "817867c6a5af",
+    "545359fd8129",
     "rewild4d.ours.losses.regularizers:_normals",
     "rewild4d.ours.losses.regularizers:_disagreement",
 )
+
+LEAST_COVER = 1e-6
+"""Added to the weight of all pairs, so that an empty image has no loss (the paper's epsilon)."""
 
 
 @kernel
@@ -112,36 +115,36 @@ def _read(
 
 
 @inlined
-def _beside(field: np.ndarray, cover: np.ndarray, index: int, other: int) -> tuple:
+def _beside(field: np.ndarray, cover: np.ndarray, index: int, other: int, scale: np.float32) -> tuple:
     """Return weight, cosine and the gradient by the first direction for sixteen pairs of pixels."""
     a, b, c = load(field[0], other), load(field[1], other), load(field[2], other)
     agree = fma(load(field[0], index), a, fma(load(field[1], index), b, load(field[2], index) * c))
-    both, zero = load(cover, index) * load(cover, other), splat(np.float32(0))
+    both, zero = load(cover, index) * load(cover, other) * splat(scale), splat(np.float32(0))
     share = select_gt(agree, zero, both, select_gt(zero, agree, zero - both, zero))
     return both, agree, share * a, share * b, share * c
 
 
 @kernel
-def _agreement(image: np.ndarray, matte: np.ndarray, grad: np.ndarray) -> tuple:
-    """Return the loss times the pairs' weight, and that weight; set the former's gradient by the image [3, h, w]."""
+def _lacking(image: np.ndarray, matte: np.ndarray, right: float, down: float, grad: np.ndarray) -> float:
+    """Return the loss, whose pairs along a row weigh ``right`` and along a column ``down``; set its gradient by the
+    image [3, h, w]."""
     height, width = matte.shape
     stride = (width + LANES - 1) // LANES * LANES + LANES
     room = (height + 2) * stride + LANES
     field, cover, over = np.empty((3, room), np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
     _read(image, matte, stride, field, cover, over)
-    one = splat(np.float32(1))
-    sums, total, mass = np.empty(2 * LANES, np.float32), 0.0, 0.0
+    one, along_row, along_column = splat(np.float32(1)), np.float32(right), np.float32(down)
+    sums, total = np.empty(LANES, np.float32), 0.0
     for y in range(height):
-        lacking, weight = splat(np.float32(0)), splat(np.float32(0))
+        lacking = splat(np.float32(0))
         for x in range(0, width, LANES):
             index = (y + 1) * stride + LANES + x
-            right, r_cos, a, b, c = _beside(field, cover, index, index + 1)
-            below, b_cos, d, e, f = _beside(field, cover, index, index + stride)
-            lacking = lacking + (right * (one - absolute(r_cos)) + below * (one - absolute(b_cos)))
-            weight = weight + (right + below)
+            beside, r_cos, a, b, c = _beside(field, cover, index, index + 1, along_row)
+            below, b_cos, d, e, f = _beside(field, cover, index, index + stride, along_column)
+            lacking = lacking + (beside * (one - absolute(r_cos)) + below * (one - absolute(b_cos)))
             a, b, c = a + d, b + e, c + f
-            for other in (index - 1, index - stride):
-                _, _, d, e, f = _beside(field, cover, index, other)
+            for other, scale in ((index - 1, along_row), (index - stride, along_column)):
+                _, _, d, e, f = _beside(field, cover, index, other, scale)
                 a, b, c = a + d, b + e, c + f
             p, q, r = load(field[0], index), load(field[1], index), load(field[2], index)
             along, inverse = fma(a, p, fma(b, q, c * r)), load(over, index)
@@ -150,10 +153,8 @@ def _agreement(image: np.ndarray, matte: np.ndarray, grad: np.ndarray) -> tuple:
             store_first(grad[1], target, width - x, inverse * fma(along, q, splat(np.float32(0)) - b))
             store_first(grad[2], target, width - x, inverse * fma(along, r, splat(np.float32(0)) - c))
         store(sums, 0, lacking)
-        store(sums, LANES, weight)
-        total += sums[:LANES].sum()
-        mass += sums[LANES:].sum()
-    return total, mass
+        total += sums.sum()
+    return total
 
 
 def disagreement(image: Tensor, matte: Tensor) -> Tensor:
@@ -164,12 +165,13 @@ def disagreement(image: Tensor, matte: Tensor) -> Tensor:
 class _Disagreement(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, matte: Tensor) -> Tensor:
-        ctx.grad = torch.empty(image.shape)
-        total, mass = _agreement(array(image), array(matte), ctx.grad.numpy().reshape(3, -1))
-        ctx.mass = max(mass, 1.0)
-        return torch.tensor(total / ctx.mass, dtype=torch.float32)
+        ctx.grad, cover = torch.empty(image.shape), array(matte)
+        right, down = (float((a * b).sum()) for a, b in ((cover[:, 1:], cover[:, :-1]), (cover[1:], cover[:-1])))
+        weights = 1 / (right + LEAST_COVER), 1 / (down + LEAST_COVER)
+        total = _lacking(array(image), cover, *weights, ctx.grad.numpy().reshape(3, -1))
+        return torch.tensor(total, dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        return ctx.grad * (grad.item() / ctx.mass), None
+        return ctx.grad * grad.item(), None

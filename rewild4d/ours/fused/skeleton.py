@@ -16,7 +16,7 @@ from rewild4d.kernels.switch import Kernel
 from rewild4d.ours.fused.quaternions import dot, rotation, rotation_grad, side, unit, unit_grad
 
 POSTURE = Kernel(
-    "posture", "c6a13064e900", "rewild4d.ours.losses.skeleton:posture", "rewild4d.ours.losses.skeleton:skeleton_losses"
+    "posture", "2a29813aab22", "rewild4d.ours.losses.skeleton:posture", "rewild4d.ours.losses.skeleton:skeleton_losses"
 )
 
 
@@ -136,55 +136,61 @@ def _combined(p: float, a: tuple, q: float, b: tuple) -> tuple:
 
 @kernel
 def _second_differences(
-    quats: np.ndarray, shifts: np.ndarray, weight: float, unit: float, on_quats: np.ndarray, on_shifts: np.ndarray
-) -> float:
-    """Compute the mean squared second difference of rotations and shifts over triples; add gradients."""
+    quats: np.ndarray, shifts: np.ndarray, gaps: np.ndarray, weight: float, unit: float, on_quats: np.ndarray,
+    on_shifts: np.ndarray,
+) -> float:  # fmt: skip
+    """Compute the mean squared second difference, a frame squared, of rotations and shifts over triples; add
+    gradients."""
     joints, total = quats.shape[1], 0.0
     share = 3 * weight / (len(quats) * joints)
     by_length = share / (unit * unit)
     for item in range(1, len(quats), 3):
+        first, second = gaps[item // 3, 0], gaps[item // 3, 1]
+        a, b, c = 2 / (first * (first + second)), -2 / (first * second), 2 / (second * (first + second))
         for joint in range(joints):
             middle = _quat(quats, item, joint)
             before, after = _quat(quats, item - 1, joint), _quat(quats, item + 1, joint)
             one, other = side(before, middle), side(after, middle)
             for i in range(4):
-                bend = one * before[i] + other * after[i] - 2 * middle[i]
+                bend = a * one * before[i] + c * other * after[i] + b * middle[i]
                 total += share * bend * bend
-                on_quats[item - 1, joint, i] += 2 * share * one * bend
-                on_quats[item + 1, joint, i] += 2 * share * other * bend
-                on_quats[item, joint, i] -= 4 * share * bend
+                on_quats[item - 1, joint, i] += 2 * share * a * one * bend
+                on_quats[item + 1, joint, i] += 2 * share * c * other * bend
+                on_quats[item, joint, i] += 2 * share * b * bend
             for i in range(3):
-                swerve = np.float64(shifts[item - 1, joint, i]) + shifts[item + 1, joint, i]
-                swerve -= 2 * np.float64(shifts[item, joint, i])
+                swerve = a * shifts[item - 1, joint, i] + c * shifts[item + 1, joint, i] + b * shifts[item, joint, i]
                 total += by_length * swerve * swerve
-                on_shifts[item - 1, joint, i] += 2 * by_length * swerve
-                on_shifts[item + 1, joint, i] += 2 * by_length * swerve
-                on_shifts[item, joint, i] -= 4 * by_length * swerve
+                on_shifts[item - 1, joint, i] += 2 * by_length * a * swerve
+                on_shifts[item + 1, joint, i] += 2 * by_length * c * swerve
+                on_shifts[item, joint, i] += 2 * by_length * b * swerve
     return total
 
 
 @kernel
 def _steps(
-    quats: np.ndarray, shifts: np.ndarray, weight: float, step: float, unit: float, on_quats: np.ndarray,
-    on_shifts: np.ndarray,
+    quats: np.ndarray, shifts: np.ndarray, gaps: np.ndarray, weight: float, step: float, unit: float,
+    on_quats: np.ndarray, on_shifts: np.ndarray,
 ) -> float:  # fmt: skip
-    """Compute the mean of s v^2 / (v^2 + s^2) over steps v of rotations and of shifts in triples; add gradients."""
+    """Compute the mean of s v^2 / (v^2 + s^2) over steps v, a frame, of rotations and of shifts in triples; add
+    gradients."""
     joints, square, total = quats.shape[1], step * step, 0.0
     share = 3 * weight * step / (2 * len(quats) * joints)
     for item in range(len(quats)):
         if item % 3 == 2:
             continue
+        gap = gaps[item // 3, item % 3]
+        length = unit * gap
         for joint in range(joints):
             one, other = _quat(quats, item, joint), _quat(quats, item + 1, joint)
             same = side(one, other)
             rotated, moved = 0.0, 0.0
             for i in range(4):
-                rotated += (other[i] - same * one[i]) ** 2
+                rotated += ((other[i] - same * one[i]) / gap) ** 2
             for i in range(3):
-                moved += ((np.float64(shifts[item + 1, joint, i]) - shifts[item, joint, i]) / unit) ** 2
+                moved += ((np.float64(shifts[item + 1, joint, i]) - shifts[item, joint, i]) / length) ** 2
             total += share * (rotated / (rotated + square) + moved / (moved + square))
-            by_rotation = 2 * share * square / (rotated + square) ** 2
-            by_shift = 2 * share * square / ((moved + square) * unit) ** 2
+            by_rotation = 2 * share * square / ((rotated + square) * gap) ** 2
+            by_shift = 2 * share * square / ((moved + square) * length) ** 2
             for i in range(4):
                 grad = by_rotation * (other[i] - same * one[i])
                 on_quats[item + 1, joint, i] += grad
@@ -199,7 +205,7 @@ def _steps(
 @kernel
 def _regularise(
     quats: np.ndarray, shifts: np.ndarray, pivots: np.ndarray, parents: np.ndarray, mirror: np.ndarray,
-    weights: Weights, on_quats: np.ndarray, on_shifts: np.ndarray,
+    weights: Weights, gaps: np.ndarray, on_quats: np.ndarray, on_shifts: np.ndarray,
 ) -> float:  # fmt: skip
     """Return the weighted sum of all regularizers; add their gradients."""
     total = 0.0
@@ -210,9 +216,9 @@ def _regularise(
     if weights.limb_plane or weights.body_plane:
         total += _out_of_plane(quats, parents, mirror, weights, on_quats)
     if weights.temporal:
-        total += _second_differences(quats, shifts, weights.temporal, weights.unit, on_quats, on_shifts)
+        total += _second_differences(quats, shifts, gaps, weights.temporal, weights.unit, on_quats, on_shifts)
     if weights.still:
-        total += _steps(quats, shifts, weights.still, weights.step, weights.unit, on_quats, on_shifts)
+        total += _steps(quats, shifts, gaps, weights.still, weights.step, weights.unit, on_quats, on_shifts)
     return total
 
 
@@ -266,16 +272,18 @@ def posture_and_losses(
     parents: Tensor,
     mirror: Tensor,
     weights: Weights,
+    gaps: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Select rows of poses with their transforms [k, J, 4, 4], and sum the regularizers of all; float32 on the CPU."""
-    return _Posture.apply(quats, shifts, features, rows, pivots, parents, mirror, weights)
+    between = np.ones((0, 2)) if gaps is None else gaps.numpy()
+    return _Posture.apply(quats, shifts, features, rows, pivots, parents, mirror, weights, between)
 
 
 class _Posture(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, quats: Tensor, shifts: Tensor, features: Tensor, rows: list[int], pivots: Tensor, parents: Tensor,
-        mirror: Tensor, weights: Weights,
+        mirror: Tensor, weights: Weights, gaps: np.ndarray,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         joints, chosen = len(pivots), np.array(rows, np.int64)
         all_quats, all_shifts, centers = array(quats), array(shifts), pivots.numpy()
@@ -283,7 +291,7 @@ class _Posture(torch.autograd.Function):
         made = tuple(np.empty((len(rows), joints, *size), np.float32) for size in sizes)
         _select(all_quats, all_shifts, array(features), chosen, centers, *made)
         grads = np.zeros(all_quats.shape), np.zeros(all_shifts.shape)
-        total = _regularise(all_quats, all_shifts, centers, parents.numpy(), mirror.numpy(), weights, *grads)
+        total = _regularise(all_quats, all_shifts, centers, parents.numpy(), mirror.numpy(), weights, gaps, *grads)
         ctx.given, ctx.grads, ctx.size = (all_quats, chosen, centers), grads, features.shape
         return tuple(map(torch.from_numpy, (*made, np.array(total, np.float32))))
 
@@ -294,4 +302,4 @@ class _Posture(torch.autograd.Function):
         on_quats, on_shifts = (grad * scale for grad in ctx.grads)
         _select_back(*ctx.given, *map(array, grads[:4]), on_quats, on_shifts, on_features)
         made = (on_quats.astype(np.float32), on_shifts.astype(np.float32), on_features)
-        return *map(torch.from_numpy, made), *[None] * 5
+        return *map(torch.from_numpy, made), *[None] * 6

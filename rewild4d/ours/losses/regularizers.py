@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from rewild4d.ours.deform import Posed
-from rewild4d.ours.fused.compactness import COMPACTNESS, compactness
-from rewild4d.ours.fused.normals import NORMALS, disagreement, smallest_axes
+from rewild4d.ours.fused.compactness import COMPACTNESS, LEAST_MASS, compactness
+from rewild4d.ours.fused.normals import LEAST_COVER, NORMALS, disagreement, smallest_axes
 from rewild4d.ours.pose import Pose, aligned
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import look_at, quat_multiply, quat_to_matrix
@@ -19,7 +19,8 @@ from rewild4d.types import OBJECT_DIAGONAL
 
 
 def tv_loss(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
-    """Compute L_tv of a field [R^3, J]: the mean over the axes of the mean Huber function of forward differences.
+    """Compute L_tv (paper, "Geometric Regularization") of a field [R^3, J]: the mean over the axes of the mean Huber
+    function of forward differences.
 
     The Huber function is x^2 / 2 inside delta, delta (|x| - delta / 2) outside.
     """
@@ -31,19 +32,24 @@ def tv_loss(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
     return torch.stack(terms).mean()
 
 
-def compact_loss(clouds: Sequence[Tensor], weights: Tensor, opacities: Tensor, power: float) -> Tensor:
-    """Compute L_compact: the mean over clouds [n, 3] and parts of the two smaller eigenvalues of a part's covariance.
+def compact_loss(clouds: Sequence[Tensor], weights: Tensor, alpha: float) -> Tensor:
+    """Compute L_compact (paper, "Geometric Regularization"), the mean over clouds of the mean over parts of gamma_j
+    times the two smaller eigenvalues of the part's covariance.
 
-    They are tr C - v^T C v with v the top eigenvector of the detached C: exactly the eigenvalues' gradient, and defined
-    where the two coincide. Masses are opacity times weight to a ``power``, without gradients; parts of mass below 1 are
-    skipped.
+    gamma_j = exp(-alpha Omega_j / max Omega) of the masses Omega_j = sum_i w_ij. The eigenvalues are
+    tr C - v^T C v with v the top eigenvector of the detached C: exactly their gradient, and defined where the two
+    coincide. The weights get no gradient: it would move them away from a part instead of drawing the part together.
+
+    Args:
+        clouds: centres, canonical and posed, [n, 3] each.
+        weights: skinning weights w, [n, J].
+        alpha: how much a large part, such as the torso, counts less.
     """
     if COMPACTNESS.takes(*clouds):
-        return compactness(clouds, weights, opacities, power)
-    mass = weights.detach() ** power * opacities.detach()[:, None]
-    total = mass.sum(0)
-    counted = (total >= 1).to(total)  # a mask would wait for a GPU
-    share = mass / torch.where(total >= 1, total, 1.0)
+        return compactness(clouds, weights, alpha)
+    mass = weights.detach().sum(0).clamp_min(LEAST_MASS)
+    gamma = (-alpha * mass / mass.max()).exp()
+    share = weights.detach() / mass
     losses = []
     for points in clouds:
         center = share.T @ points
@@ -51,13 +57,13 @@ def compact_loss(clouds: Sequence[Tensor], weights: Tensor, opacities: Tensor, p
         covariance = (share.T @ outer).view(-1, 3, 3) - center[:, :, None] * center[:, None, :]
         top = torch.linalg.eigh(covariance.detach().cpu())[1][..., -1].to(covariance)  # a GPU takes longer for so few
         trace = covariance.diagonal(dim1=1, dim2=2).sum(-1)
-        rest = trace - torch.einsum("ja,jab,jb->j", top, covariance, top)
-        losses.append((rest * counted).sum() / counted.sum().clamp_min(1))
+        losses.append((gamma * (trace - torch.einsum("ja,jab,jb->j", top, covariance, top))).mean())
     return torch.stack(losses).mean()
 
 
 def smooth_loss(posed: Posed, opacities: Tensor, size: int, generator: torch.Generator) -> Tensor:
-    """Compute L_smooth: agreement of neighbouring pixels of a rendered normal map, ``size`` pixels wide.
+    """Compute L_smooth (paper, "Geometric Regularization"): how far neighbouring pixels of a rendered normal map,
+    ``size`` pixels wide, disagree, summed over the two axes.
 
     The viewpoint is random: azimuth in [0, 360), elevation in [-10, 60) degrees. A Gaussian's normal is the axis of its
     smallest scale, pointing to the camera. Only the normals get gradients.
@@ -89,18 +95,18 @@ def _normals(quats: Tensor, log_scales: Tensor, means: Tensor, eye: Tensor) -> T
 
 
 def _disagreement(image: Tensor, matte: Tensor) -> Tensor:
-    """Compute the mean of 1 - |cos| between neighbouring pixels' vectors [3, h, w], weighted by both mattes [h, w]."""
+    """Sum over both axes the mean of 1 - |cos| between neighbouring pixels' vectors [3, h, w], weighted by both mattes
+    [h, w]."""
     if NORMALS.takes(image):
         return disagreement(image, matte)
     # torch's own norm over the channels takes longer than the rest of this function.
     field = image / (image.square().sum(0) + 1e-24).sqrt()
-    total, mass = image.new_zeros(()), image.new_zeros(())
-    for axis in (0, 1):
-        length = matte.shape[axis] - 1
+    lacking = image.new_zeros(())
+    for axis, length in ((0, matte.shape[0] - 1), (1, matte.shape[1] - 1)):
         agree = (field.narrow(axis + 1, 1, length) * field.narrow(axis + 1, 0, length)).sum(0).abs()
         both = matte.narrow(axis, 1, length) * matte.narrow(axis, 0, length)
-        total, mass = total + (both * (1 - agree)).sum(), mass + both.sum()
-    return total / mass.clamp_min(1.0)
+        lacking = lacking + (both * (1 - agree)).sum() / (both.sum() + LEAST_COVER)
+    return lacking
 
 
 def limit_loss(pose: Pose, parents: Tensor, degrees: float) -> Tensor:
@@ -149,24 +155,29 @@ def sagittal_losses(
     return (out @ of_limbs).mean(), (out @ others).mean(), (sideways @ of_limbs).mean()
 
 
-def temporal_loss(pose: Pose) -> Tensor:
-    """Compute the mean squared second difference of rotations and shifts over triples of frames, B = 3 k."""
+def temporal_loss(pose: Pose, gaps: Tensor) -> Tensor:
+    """Compute the mean squared second difference, a frame squared, of rotations and shifts over triples of frames,
+    B = 3 k, ``gaps`` [k, 2] frames apart."""
     quats, shifts = pose.quats.unflatten(0, (-1, 3)), pose.shifts.unflatten(0, (-1, 3))
+    first, second = gaps.to(quats).unbind(-1)
+    a, b, c = 2 / (first * (first + second)), -2 / (first * second), 2 / (second * (first + second))
+    a, b, c = (each[:, None, None] for each in (a, b, c))
     middle = quats[:, 1]
-    bend = aligned(quats[:, 0], middle) + aligned(quats[:, 2], middle) - 2 * middle
-    swerve = (shifts[:, 0] + shifts[:, 2] - 2 * shifts[:, 1]) / OBJECT_DIAGONAL
+    bend = a * aligned(quats[:, 0], middle) + b * middle + c * aligned(quats[:, 2], middle)
+    swerve = (a * shifts[:, 0] + b * shifts[:, 1] + c * shifts[:, 2]) / OBJECT_DIAGONAL
     return bend.square().sum(-1).mean() + swerve.square().sum(-1).mean()
 
 
-def still_loss(pose: Pose, step: float) -> Tensor:
-    """Compute the mean of s v^2 / (v^2 + s^2) over steps v of rotations within triples of frames, B = 3 k, plus that of
-    shifts.
+def still_loss(pose: Pose, step: float, gaps: Tensor) -> Tensor:
+    """Compute the mean of s v^2 / (v^2 + s^2) over steps v, a frame, of rotations within triples of frames, B = 3 k,
+    ``gaps`` [k, 2] frames apart, plus that of shifts.
 
     Steps much longer than s cost s and get no gradient; slow drift is held still (Geman and McClure's function).
     """
     quats, shifts = pose.quats.unflatten(0, (-1, 3)), pose.shifts.unflatten(0, (-1, 3))
-    rotated = quats[:, 1:] - aligned(quats[:, :-1], quats[:, 1:])
-    moved = (shifts[:, 1:] - shifts[:, :-1]) / OBJECT_DIAGONAL
+    apart = gaps.to(quats)[..., None, None]
+    rotated = (quats[:, 1:] - aligned(quats[:, :-1], quats[:, 1:])) / apart
+    moved = (shifts[:, 1:] - shifts[:, :-1]) / (OBJECT_DIAGONAL * apart)
     squares = torch.stack([each.square().sum(-1) for each in (rotated, moved)])
     return 2 * step * (squares / (squares + step**2)).mean()
 

@@ -1,6 +1,7 @@
 """The skeleton's regularizers of a batch of poses, and the neighbouring frames that one of them needs."""
 
 import math
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -13,42 +14,64 @@ from rewild4d.ours.symmetry import Key
 from rewild4d.types import OBJECT_DIAGONAL
 
 
-def neighbour_keys(keys: list[Key], frames: int, config: Geometry) -> tuple[list[Key], list[int]]:
-    """Return each view with the frames before and after it, in triples, and the rows of the views themselves.
+class Neighbours(NamedTuple):
+    """Views with those of the frames beside them.
 
-    At an end of the clip the triple is moved inwards. No neighbours where the clip has two frames or no term needs
-    them.
+    Attributes:
+        keys: the views, or triples of them.
+        rows: of the views themselves among `keys`.
+        gaps: frames from the first to the second and from the second to the third view of each triple, float64, [k, 2];
+            None where `keys` are no triples.
     """
-    if (not config.temporal and not config.still) or frames < 3:
-        return keys, list(range(len(keys)))
+
+    keys: list[Key]
+    rows: list[int]
+    gaps: Tensor | None
+
+
+def neighbour_keys(keys: list[Key], positions: Tensor, config: Geometry) -> Neighbours:
+    """Find the frames before and after each view's; at an end of the clip the triple is moved inwards.
+
+    There are no neighbours where the clip has two frames or no term needs them.
+
+    Args:
+        keys: the views.
+        positions: of the clip's frames (`symmetry.frame_positions`), [T].
+        config: weights of the terms.
+    """
+    if (not config.temporal and not config.still) or len(positions) < 3:
+        return Neighbours(keys, list(range(len(keys))), None)
     triples, own = [], []
     for row, key in enumerate(keys):
-        middle = min(max(key.frame, 1), frames - 2)
+        middle = min(max(key.frame, 1), len(positions) - 2)
         triples += [key._replace(frame=middle + offset) for offset in (-1, 0, 1)]
         own.append(3 * row + key.frame - middle + 1)
-    return triples, own
+    frames = positions[[key.frame for key in triples]].view(-1, 3)
+    return Neighbours(triples, own, frames.diff(dim=1))
 
 
-def posture(model: Model, poses: Pose, rows: list[int], config: Geometry) -> tuple[Pose, Tensor, Tensor]:
-    """Select poses of a batch, with their transforms, and sum the weighted regularizers of the whole batch.
+def posture(
+    model: Model, poses: Pose, rows: list[int], config: Geometry, gaps: Tensor | None
+) -> tuple[Pose, Tensor, Tensor]:
+    """Select ``rows`` of a batch of poses, with their transforms, and sum the weighted regularizers of the whole batch.
 
-    Where B = 3 k, the poses are triples of neighbouring frames from `neighbour_keys`, ``rows`` the k selected ones.
+    ``gaps`` are those of `neighbour_keys`, None where the poses are no triples.
     """
-    triples = len(poses.quats) == 3 * len(rows)
     skeleton = model.pivots, model.parents, model.mirror
     if POSTURE.takes(poses.quats):
-        *own, transforms, total = posture_and_losses(*poses, rows, *skeleton, _weights(config, triples))
+        *own, transforms, total = posture_and_losses(*poses, rows, *skeleton, _weights(config, gaps), gaps)
         return Pose(*own), transforms, total
     transforms = model.transforms(poses)
-    total = skeleton_losses(model, poses, transforms, config, triples)
+    total = skeleton_losses(model, poses, transforms, config, gaps)
     return Pose(*(tensor[rows] for tensor in poses)), transforms[rows], total
 
 
-def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geometry, triples: bool) -> Tensor:
+def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geometry, gaps: Tensor | None) -> Tensor:
     """Sum the weighted regularizers of poses [B, J, ...] with transforms [B, J, 4, 4]: joint limits, attachment, planes
-    and, if the poses are triples of neighbouring frames, smoothness and stillness."""
+    and, of triples of neighbouring frames (``gaps`` is not None), smoothness and stillness."""
     if POSTURE.takes(pose.quats):
-        return posture_and_losses(*pose, [], model.pivots, model.parents, model.mirror, _weights(config, triples))[-1]
+        weights = _weights(config, gaps)
+        return posture_and_losses(*pose, [], model.pivots, model.parents, model.mirror, weights, gaps)[-1]
     total = pose.shifts.sum() * 0.0
     if config.limit:
         total = total + config.limit * limit_loss(pose, model.parents, config.limit_degrees)
@@ -57,15 +80,15 @@ def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geomet
     planes = sagittal_losses(pose, transforms, model.pivots, model.parents, model.mirror)
     for weight, loss in zip((config.limb_plane, config.body_plane, config.sideways), planes, strict=True):
         total = total + weight * loss
-    if config.temporal and triples:
-        total = total + config.temporal * temporal_loss(pose)
-    if config.still and triples:
-        total = total + config.still * still_loss(pose, config.still_step)
+    if config.temporal and gaps is not None:
+        total = total + config.temporal * temporal_loss(pose, gaps)
+    if config.still and gaps is not None:
+        total = total + config.still * still_loss(pose, config.still_step, gaps)
     return total
 
 
-def _weights(config: Geometry, triples: bool) -> Weights:
+def _weights(config: Geometry, gaps: Tensor | None) -> Weights:
     planes = (config.limb_plane, config.body_plane, config.sideways)
     cosine = math.cos(math.radians(config.limit_degrees) / 2)
-    steps = (config.temporal, config.still) if triples else (0.0, 0.0)
+    steps = (0.0, 0.0) if gaps is None else (config.temporal, config.still)
     return Weights(config.limit, *planes, cosine, config.attach, *steps, config.still_step, OBJECT_DIAGONAL)
