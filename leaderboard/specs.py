@@ -56,6 +56,7 @@ class Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         scores: names of the scores, a column each under every condition.
         conditions: groups of columns.
         rows: labels, methods and settings.
+        rows_of: name of a table whose rows stand before its own, "" for none.
         preset: where the command line names none.
         seeds: where the command line names none.
         paper: name of the file of reported numbers, "" for none.
@@ -65,7 +66,8 @@ class Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     dataset: str
     scores: tuple[str, ...]
     conditions: tuple[Condition, ...]
-    rows: tuple[Line, ...]
+    rows: tuple[Line, ...] = ()
+    rows_of: str = ""
     description: str = ""
     preset: str = "standard"
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -109,7 +111,14 @@ class Reported(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 def load_specs() -> dict[str, Spec]:
     """Read all tables that ship with the package, by name."""
-    return {name: _decode(f"tables/{name}.toml", data, Spec) for name, data in _files("tables", ".toml").items()}
+    found = {name: _decode(f"tables/{name}.toml", data, Spec) for name, data in _files("tables", ".toml").items()}
+    return {name: msgspec.structs.replace(spec, rows=_rows(spec, found), rows_of="") for name, spec in found.items()}
+
+
+def _rows(spec: Spec, found: Mapping[str, Spec]) -> tuple[Line, ...]:
+    if spec.rows_of and spec.rows_of not in found:
+        raise unknown_name("table", spec.rows_of, found)
+    return (*(found[spec.rows_of].rows if spec.rows_of else ()), *spec.rows)
 
 
 def find_spec(name: str) -> Spec:

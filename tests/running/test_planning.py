@@ -40,9 +40,10 @@ def test_every_table_that_ships_can_be_planned() -> None:
     specs = load_specs()
     assert set(specs) == {
         "ablation", "artemis", "input-view", "novel-view", "prior-mismatch", "protocols", "sweep-random",
+        "reproduction", "reproduction-films", "reproduction-fixed", "reproduction-prior",
     }  # fmt: skip
     for name, found in specs.items():
-        for preset in ("quick", "standard", "paper"):
+        for preset in ("quick", "standard", "paper", "paper-short"):
             full = planning.with_choice(name, found, planning.Choice(preset=preset))
             for row in full.rows:
                 planning.row_entry(name, row, full, (0,))
