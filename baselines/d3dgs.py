@@ -37,7 +37,7 @@ from rewild4d.ours.checkpoint import fit_digest, load_fitted, save_fitted
 from rewild4d.ours.config import Canonical
 from rewild4d.ours.motion import Root
 from rewild4d.ours.schedule import exponential, fade, for_clip
-from rewild4d.ours.symmetry import Key, Supervision, Target, match_times
+from rewild4d.ours.symmetry import Supervision, Target, match_times
 from rewild4d.rasterizer import RasterInfo
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Prior, Splats
 
@@ -87,11 +87,9 @@ class D3dgsTraining(SplatTraining):
 
     def drawn_losses(self, index: int) -> tuple[dict[str, Tensor], RasterInfo, Target]:
         progress, motion = index / self.config.iterations, self.config.motion
-        frame = int(torch.randint(self.supervision.frames, (), generator=self.generator))
-        view = -1 if self.mirrored and float(torch.rand((), generator=self.generator)) < self.mirrored else 1
+        key = self.draw(self.mirrored)
         noise = float(torch.randn((), generator=self.generator)) * motion.noise * fade(progress, motion.noise_until)
-        key = Key(1, view, frame)
-        target, time = self.supervision.target(key), view * self.supervision.code_times([key], noise)[0]
+        target, time = self.supervision.target(key), key.view * self.supervision.code_times([key], noise)[0]
         shape = self.model.canonical() if progress < motion.warm_up else self.model.deformed(time)
         rgb, alpha, info = self.render(shape, target, progress)
         return self.image_losses(rgb, alpha, target), info, target

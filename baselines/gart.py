@@ -14,6 +14,9 @@ original does there, and never a held-out view. Where frames of a video are held
 evaluation then fits their poses to them (`GartStarReconstruction.refined`), and every table says that the row has seen
 the test images.
 
+As in the paper of `ours`, the frames' mirror images are seen too, at time -t: each has a pose of its own, which starts
+from the prior's pose of the flipped frame. The results have the poses of the frames alone.
+
 Differences from the original: positions get no gradient through the skinning grid; a Gaussian rotates by the blended
 quaternion of its joints, not by the blended matrix, which would shrink it; the grid is a cube; neighbours are searched
 when the set of Gaussians changes, not in every step; colours start from the frames; scales are logarithms with a cap;
@@ -49,11 +52,13 @@ from rewild4d.types import OBJECT_DIAGONAL, Clip, Prior
 
 
 class GartModel(nn.Module):
-    """Canonical Gaussians, skinning field and poses."""
+    """Canonical Gaussians, skinning field, poses of the frames, and of their mirror images where these are seen."""
 
-    def __init__(self, gaussians: Gaussians, field: ResidualField, poses: PoseTable) -> None:
+    def __init__(
+        self, gaussians: Gaussians, field: ResidualField, poses: PoseTable, flipped: PoseTable | None = None
+    ) -> None:
         super().__init__()
-        self.gaussians, self.field, self.poses = gaussians, field, poses
+        self.gaussians, self.field, self.poses, self.flipped = gaussians, field, poses, flipped
 
 
 class GartTraining(SplatTraining):
@@ -65,7 +70,12 @@ class GartTraining(SplatTraining):
     def __init__(
         self, model: GartModel, config: GartConfig, supervision: Supervision, generator: torch.Generator
     ) -> None:
-        groups = {"turns": [model.poses.turns], "shifts": [model.poses.shifts], "skinning": [model.field.residual]}
+        tables = [table for table in (model.poses, model.flipped) if table is not None]
+        groups = {
+            "turns": [table.turns for table in tables],
+            "shifts": [table.shifts for table in tables],
+            "skinning": [model.field.residual],
+        }
         super().__init__(model, groups, config, supervision, generator)
         self.weights: Tensor | None = None
 
@@ -88,15 +98,16 @@ class GartTraining(SplatTraining):
     def drawn_losses(self, index: int) -> tuple[dict[str, Tensor], RasterInfo, Target]:
         config, model = self.config, self.model
         progress = index / config.iterations
-        frame = int(torch.randint(self.supervision.frames, (), generator=self.generator))
-        target = self.supervision.target(Key(1, 1, frame))
+        key = self.draw(config.mirrored)
+        target, table = self.supervision.target(key), model.poses if key.view > 0 else model.flipped
+        assert table is not None, "mirror images are drawn, so they have poses"
         learns = config.skinning.learn and progress >= config.poses.skinning_start
         regularised = learns and index % config.regularisers.every == 0
         if learns:
             weights, variation = model.field(model.gaussians.means.detach(), regularised)
         else:
             weights, variation = model.field.still(model.gaussians.means), None
-        shape = posed(model.gaussians, weights, *model.poses(frame))
+        shape = posed(model.gaussians, weights, *table(key.frame))
         rgb, alpha, info = self.render(shape, target, progress)
         losses = self.image_losses(rgb, alpha, target) | self._alike()
         if regularised and variation is not None:
@@ -167,8 +178,10 @@ class Gart:
         template = template_prior(Path(config.template), prior) if config.template else prior
         values = surface_gaussians(template, clip, None, config.canonical, generator)
         gaussians = Gaussians(values, config.canonical.max_scale)
-        poses = prior_poses(template, match_times(clip, prior))
-        model = GartModel(gaussians, ResidualField(template, config.skinning), poses).to(device)
+        rows = match_times(clip, prior)
+        poses, flipped = (prior_poses(template, rows, mirrored=side) for side in (False, True))
+        field = ResidualField(template, config.skinning)
+        model = GartModel(gaussians, field, poses, flipped if config.mirrored else None).to(device)
         training = GartTraining(model, config, supervision, generator)
         with torch_on_one():
             run_training(training, f"{self.name} {fit_digest(config, clip, template, seed)}", log, workdir)

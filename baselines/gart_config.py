@@ -129,6 +129,8 @@ class GartConfig(SplatConfig, frozen=True, forbid_unknown_fields=True, kw_only=T
 
     iterations: Whole = 10_000
     """Steps (the original's)."""
+    mirrored: Share = 0.0
+    """Share of the steps that see a mirror image, at time -t with a pose of its own (paper of `ours`: open)."""
     template: str = ""
     """Path of a D-SMAL file; empty for the prior's surface and its 20 bones."""
     canonical: GartCanonical = GartCanonical()

@@ -103,9 +103,10 @@ def pose_table(transforms: Tensor, pivots: Tensor, parents: Tensor) -> PoseTable
     return PoseTable(quats, (moved - centers).float(), pivots.float(), parents.tolist())
 
 
-def prior_poses(prior: Prior, rows: list[int]) -> PoseTable:
-    """Return the table of the prior's poses at some of its frames."""
-    return pose_table(prior.transforms[rows], prior.bones[:, 0], prior.parents)
+def prior_poses(prior: Prior, rows: list[int], mirrored: bool = False) -> PoseTable:
+    """Return the table of the prior's poses at some of its frames, or at their mirror images."""
+    transforms = prior.transforms_flip if mirrored else prior.transforms
+    return pose_table(transforms[rows], prior.bones[:, 0], prior.parents)
 
 
 def exponential_quats(rotations: Tensor) -> Tensor:

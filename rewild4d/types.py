@@ -255,6 +255,8 @@ class Prior:
         quality: named figures of the fit (mask_iou, ...), copied into the record.
         digest: SHA-256 of all of the above.
         notes: what was done to it for a clip and what speaks against it, a sentence each; not in its file.
+        steady: whether a frame may be trained from the plain and from the flipped sequence, bool, [2, T]; None for all;
+            not in its file.
     """
 
     name: str
@@ -274,6 +276,7 @@ class Prior:
     quality: dict[str, float]
     digest: str
     notes: tuple[str, ...] = ()
+    steady: Tensor | None = None
 
 
 @dataclass(frozen=True)

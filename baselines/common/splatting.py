@@ -19,7 +19,7 @@ from rewild4d.ours.canonical import Gaussians, attributes, start_surface
 from rewild4d.ours.checkpoint import load_checkpoint
 from rewild4d.ours.config import Canonical
 from rewild4d.ours.losses.images import WINDOW, colour_losses, silhouette_loss, union_window
-from rewild4d.ours.symmetry import Target
+from rewild4d.ours.symmetry import Key, Target
 from rewild4d.ours.training import GaussianTraining, run_steps
 from rewild4d.priors.motion import colors_from_frames, pose_gaussians, quats_from_normals
 from rewild4d.rasterizer import RasterInfo, rasterize
@@ -99,6 +99,13 @@ class SplatTraining(GaussianTraining):
         canonical = self.config.canonical
         degree = min(canonical.sh_degree, int(progress / canonical.sh_every))
         return render(self.gaussians, shape, target.camera, degree)
+
+    def draw(self, mirrored: float) -> Key:
+        """Draw one of the frames of the plain sequence, or in a share of the draws its mirror image, at time -t."""
+        frames = self.supervision.frames_of(1) or list(range(self.supervision.frames))
+        frame = frames[int(torch.randint(len(frames), (), generator=self.generator))]
+        flip = mirrored and float(torch.rand((), generator=self.generator)) < mirrored
+        return Key(1, -1 if flip else 1, frame)
 
     def image_losses(self, rgb: Tensor, alpha: Tensor, target: Target) -> dict[str, Tensor]:
         """Compute `image_losses` over the background that the settings ask for."""

@@ -54,6 +54,7 @@ class Supervision:
 
     Attributes:
         frames: number of frames T.
+        usable: frames that may be trained from the plain and from the flipped sequence (`Prior.steady`).
         positions: of the frames in the video, held-out ones counted (`frame_positions`), float64, [T].
         reduction: side of a training pixel in pixels of the clip.
         prior_quats: rotation of each joint, for v = +1 and v = -1, [2, T, J, 4].
@@ -65,6 +66,8 @@ class Supervision:
     ) -> None:
         rows = match_times(clip, prior)
         self.frames = len(clip.frames)
+        steady = torch.ones(2, self.frames) if prior.steady is None else prior.steady[:, rows]
+        self.usable = tuple(torch.nonzero(marks)[:, 0].tolist() for marks in steady)
         self.positions = frame_positions(torch.tensor(clip.times, dtype=torch.float64))
         longest = max(clip.frames[0].mask.shape[-2:])
         self.reduction = max(1.0, longest / size)
@@ -122,13 +125,22 @@ class Supervision:
         return self.pixel() * math.sqrt(EPS2D * (1 - 1 / self.reduction**2))
 
     def draw(self, generator: torch.Generator, mirrored: float = 0.5, cameras: str = "both") -> Key:
-        """Draw a view: group and frame uniformly, then the frame's image or, in a share of the draws, its mirror image.
+        """Draw a view: a group, one of its usable frames, and its image or, in a share of the draws, its mirror image.
 
         With "own" cameras the image decides the group: m = v.
         """
-        group, frame = (int(torch.randint(count, (), generator=generator)) for count in (2, self.frames))
+        half, frame = (int(torch.randint(count, (), generator=generator)) for count in (2, self.frames))
         view = -1 if float(torch.rand((), generator=generator)) < mirrored else 1
-        return Key(view if cameras == "own" else 1 - 2 * group, view, frame)
+        group = view if cameras == "own" else 1 - 2 * half
+        group = group if self.frames_of(group) else -group
+        frames = self.frames_of(group)
+        if len(frames) < self.frames:
+            frame = frames[int(torch.randint(len(frames), (), generator=generator))]
+        return Key(group, view, frame)
+
+    def frames_of(self, group: int) -> list[int]:
+        """Return the frames that group m = 1 or -1 is trained from."""
+        return self.usable[0 if group > 0 else 1]
 
 
 def frame_positions(times: Tensor) -> Tensor:

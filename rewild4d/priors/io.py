@@ -77,7 +77,8 @@ def seal(prior: Prior) -> Prior:
         prior.vertices, prior.faces, prior.weights, prior.bones, prior.parents, prior.mirror, prior.times,
         prior.object_to_world, prior.transforms, prior.transforms_flip,
     )  # fmt: skip
-    return replace(prior, digest=digest(prior.name, prior.provenance, quality, *arrays, *cameras))
+    marks = () if prior.steady is None else (prior.steady,)
+    return replace(prior, digest=digest(prior.name, prior.provenance, quality, *arrays, *cameras, *marks))
 
 
 def save_prior(prior: Prior, path: Path) -> None:

@@ -1,7 +1,8 @@
 """Filter frames whose camera is far from the others', as where the heading is reversed for a while.
 
 DBSCAN (Ester et al. 1996) clusters the direction of the camera's centre and its translation; the largest cluster stays
-(METHOD, section 2). The clip and its mirror image are filtered on their own.
+(METHOD, section 2). The clip and its mirror image are filtered on their own, and a frame that is steady in one of them
+is trained from that one (paper, "Robustness to Unstable Camera Estimation").
 """
 
 from collections.abc import Sequence
@@ -27,7 +28,7 @@ class Filtered:
     """A prior without the frames whose camera was filtered out.
 
     Attributes:
-        prior: with the kept rows; a mirrored camera that was filtered out is the mirror image of the plain one.
+        prior: with the kept rows; `Prior.steady` marks those that one sequence alone can be trained from.
         kept: rows of the original prior.
         notes: what was changed, a sentence each.
     """
@@ -74,9 +75,11 @@ def _between(features: Tensor, times: Tensor) -> Tensor:
 
 
 def without_hops(prior: Prior) -> Filtered:
-    """Remove frames whose camera is not steady; replace such mirrored ones by the mirror image of the plain one.
+    """Remove frames whose camera is steady in neither sequence, and mark those that are steady in one alone.
 
-    A sequence in which less than half of the cameras agree is not filtered, and a note says so.
+    The other sequence's camera and pose of a marked frame become mirror images of the steady one's, so that every row
+    can be rendered and interpolated; a fit is not trained from them. A sequence in which less than half of the cameras
+    agree is not filtered, and a note says so.
     """
     plain, flipped = steady(prior.cameras, prior.times), steady(prior.cameras_flip, prior.times)
     count, undecided = len(plain), []
@@ -85,27 +88,30 @@ def without_hops(prior: Prior) -> Filtered:
             share = f"{int(each.sum())} of {count}"
             undecided.append(f"no {what}camera left out: the largest group that agrees is {share} frames")
             each[:] = True
-    kept = tuple(torch.nonzero(plain)[:, 0].tolist())
-    mended = [row for row in kept if not flipped[row]]
-    cameras_flip, transforms_flip = list(prior.cameras_flip), prior.transforms_flip.clone()
-    for row in mended:
-        cameras_flip[row] = mirror_camera(prior.cameras[row])
-        transforms_flip[row] = mirror_matrix(prior.transforms[row, prior.mirror])
+    kept, both = plain | flipped, plain & flipped
+    rows = tuple(torch.nonzero(kept)[:, 0].tolist())
+    sides = [(list(prior.cameras), prior.transforms.clone()), (list(prior.cameras_flip), prior.transforms_flip.clone())]
+    for own, other, good in ((sides[0], sides[1], plain), (sides[1], sides[0], flipped)):
+        for row in torch.nonzero(kept & ~good)[:, 0].tolist():
+            own[0][row] = mirror_camera(other[0][row])
+            own[1][row] = mirror_matrix(other[1][row, prior.mirror])
     smaller = replace(
         prior,
-        times=prior.times[plain],
-        object_to_world=prior.object_to_world[plain],
-        cameras=tuple(prior.cameras[row] for row in kept),
-        transforms=prior.transforms[plain],
-        cameras_flip=tuple(cameras_flip[row] for row in kept),
-        transforms_flip=transforms_flip[plain],
+        times=prior.times[kept],
+        object_to_world=prior.object_to_world[kept],
+        cameras=tuple(sides[0][0][row] for row in rows),
+        transforms=sides[0][1][kept],
+        cameras_flip=tuple(sides[1][0][row] for row in rows),
+        transforms_flip=sides[1][1][kept],
+        steady=None if bool(both.all()) else torch.stack((plain, flipped))[:, kept],
     )
     changes = (
-        (torch.nonzero(~plain)[:, 0].tolist(), "left out: the camera is far from those of the other frames"),
-        (mended, "mirrored from the plain frame: the camera of the mirrored one is far off"),
+        (~kept, "left out: the camera is far from those of the other frames, and so is that of the mirror image"),
+        (kept & ~plain, "trained from the mirrored sequence alone: the camera is far from those of the other frames"),
+        (kept & ~flipped, "trained from the plain sequence alone: the camera of the mirrored one is far off"),
     )
-    notes = [_told(rows, count, what) for rows, what in changes if rows]
-    return Filtered(seal(smaller), kept, (*notes, *undecided))
+    notes = [_told(torch.nonzero(which)[:, 0].tolist(), count, what) for which, what in changes if bool(which.any())]
+    return Filtered(seal(smaller), rows, (*notes, *undecided))
 
 
 def _told(rows: list[int], count: int, what: str) -> str:

@@ -17,8 +17,9 @@ from rewild4d.commands import prior as command
 from rewild4d.datasets.video.travel import TravelMeter
 from rewild4d.errors import UserError
 from rewild4d.priors.config import FOOTAGE
-from rewild4d.priors.io import load_prior, save_prior
+from rewild4d.priors.io import load_prior, save_prior, seal
 from rewild4d.priors.steady import EPS, clusters, steady, without_hops
+from rewild4d.transforms import mirror_matrix
 
 
 def test_clusters_are_those_of_the_definition() -> None:
@@ -37,20 +38,30 @@ def test_clusters_are_those_of_the_definition() -> None:
     assert len({int(x) for x in labels[dense]}) >= 3 and labels[-1] == -1
 
 
-def test_a_camera_that_hops_is_left_out_and_a_hop_of_the_mirrored_one_is_mended() -> None:
+def test_a_frame_is_left_out_where_both_cameras_hop_and_else_mended_from_the_steady_one() -> None:
     angles = [0.1 * t for t in range(12)]
-    hopping = [a + math.pi * (t == 4) for t, a in enumerate(angles)]
-    mirrored = [-a + math.pi * (t == 7) for t, a in enumerate(angles)]
+    hopping = [a + math.pi * (t in (4, 9)) for t, a in enumerate(angles)]
+    mirrored = [-a + math.pi * (t in (7, 9)) for t, a in enumerate(angles)]
     times = torch.arange(12).double() / 24
-    assert steady(ring(angles), times).all() and steady(ring(hopping), times).tolist() == [t != 4 for t in range(12)]
-    filtered = without_hops(a_prior(hopping, mirrored))
-    assert filtered.kept == tuple(t for t in range(12) if t != 4) and len(filtered.prior.cameras) == 11
-    # row 7 is the sixth of those kept; its mirrored camera is now the mirror image of the plain one
-    assert torch.allclose(filtered.prior.cameras_flip[6].world_to_camera, ring([-0.7])[0].world_to_camera, atol=1e-6)
-    assert filtered.notes[0].startswith("1 of 12 frames left out") and filtered.notes[0].endswith(": 4")
-    assert filtered.notes[1].startswith("1 of 12 frames mirrored") and filtered.notes[1].endswith(": 7")
+    assert steady(ring(angles), times).all() and steady(ring(hopping), times).tolist() == [
+        t not in (4, 9) for t in range(12)
+    ]
+    given = a_prior(hopping, mirrored)
+    filtered = without_hops(given)
+    made, kept = filtered.prior, [t for t in range(12) if t != 9]
+    assert filtered.kept == tuple(kept) and len(made.cameras) == len(made.cameras_flip) == len(made.times) == 11
+    # Rows before 9 keep their numbers. The unsteady camera is now the mirror image of the steady one.
+    for found, angle in ((made.cameras[4], 0.4), (made.cameras_flip[7], -0.7)):
+        assert torch.allclose(found.world_to_camera, ring([angle])[0].world_to_camera, atol=1e-6)
+    assert torch.allclose(made.transforms[4], mirror_matrix(given.transforms_flip[4, given.mirror]))
+    assert made.steady is not None and made.digest != seal(replace(made, steady=None)).digest
+    assert made.steady.tolist() == [[t != 4 for t in kept], [t != 7 for t in kept]]
+    left_out, plain, flipped = filtered.notes
+    assert left_out.startswith("1 of 12 frames left out") and left_out.endswith(": 9")
+    assert plain.startswith("1 of 12 frames trained from the mirrored sequence alone") and plain.endswith(": 4")
+    assert flipped.startswith("1 of 12 frames trained from the plain sequence alone") and flipped.endswith(": 7")
     nothing = without_hops(a_prior(angles, [-a for a in angles]))
-    assert nothing.notes == () and len(nothing.kept) == 12
+    assert nothing.notes == () and len(nothing.kept) == 12 and nothing.prior.steady is None
 
 
 def test_a_frame_that_is_held_out_parts_no_smooth_way_but_a_hop_stays_one() -> None:

@@ -213,9 +213,7 @@ def test_a_file_for_another_clip_is_one_sentence(clip: Clip, sentence: str) -> N
 
 def test_frames_whose_camera_hops_are_left_out_of_the_fit_and_told(tmp_path: Path) -> None:
     clip = crops()
-    save_prior(
-        a_prior([0.1 * t + math.pi * (t == 4) for t in range(10)], [-0.1 * t for t in range(10)]), tmp_path / "p"
-    )
+    save_prior(a_prior(*([sign * 0.1 * t + math.pi * (t == 4) for t in range(10)] for sign in (1, -1))), tmp_path / "p")
     choice, truth = PriorChoice(str(tmp_path / "p"), STANDARD), Truth((), None, "")
     prior = make_prior(choice, clip, truth, tmp_path / "no", silent)
     assert len(prior.times) == 9 and prior.quality["hops"] == 1
