@@ -24,7 +24,7 @@ ARROWS = {"higher": "↑", "lower": "↓", "": ""}
 TEX_SIGNS = str.maketrans({
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
-    "−": "$-$", "·": r"$\cdot$", "⊕": r"$\oplus$", "<": "$<$", ">": "$>$",
+    "−": "$-$", "—": "---", "·": r"$\cdot$", "⊕": r"$\oplus$", "<": "$<$", ">": "$>$",
 })  # fmt: skip
 
 
@@ -49,7 +49,9 @@ def latex(table: Table) -> str:
         rf"\begin{{tabular}}{{{'l' * len(table.stubs)}{'r' * len(table.columns)}}}",
         r"\toprule", *_latex_groups(table), " & ".join(map(_tex, heads)) + r" \\",
     ]  # fmt: skip
-    for _, rows in groupby(_LATEX.rows(table), key=lambda found: found[0].kind):
+    # Rules stand between cases, and in a table without cases between kinds of rows.
+    cases = len(table.stubs) > 1
+    for _, rows in groupby(_LATEX.rows(table), key=lambda found: found[0].stubs[0] if cases else found[0].kind):
         lines += [r"\midrule", *(" & ".join([*stubs, *cells]) + r" \\" for _, stubs, cells in rows)]
     notes = [rf"\par\smallskip\raggedright\footnotesize {line}" for line in _LATEX.notes(table)]
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", *notes, r"\end{table}"])

@@ -5,7 +5,7 @@ from functools import cached_property
 from itertools import groupby
 
 Kind = str
-"""Of a row: "method", "floor", "unranked" (it had what the others had not) or "reported" (by a paper)."""
+"""Of a row: "method", "unranked" (it had what the others had not), "floor" (lower bound) or "reported" (by a paper)."""
 
 
 @dataclass(frozen=True)

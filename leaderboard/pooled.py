@@ -40,7 +40,7 @@ def pooled_tables(found: Sequence[Found]) -> list[Table]:
         if not any(name in NAMES for name in protocol["scores"]):
             continue
         kept, remarks = latest(group)
-        caption = f"`{protocol['name']}`"
+        caption = f"Protocol `{protocol['name']}`."
         frame = Frame(protocol["name"], protocol["title"], caption, ("",), tuple(protocol["scores"]), tuple(remarks))
         entrants = [Entrant(variant.label, (variant.records,)) for variant in variants(kept)]
         tables.append(pooled_table(frame, entrants, found))

@@ -20,12 +20,14 @@ class Condition(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         protocol: its name; without a version the newest one.
         prior: what `run --prior` says.
         cases: patterns of cases, all where it is left out.
+        dataset: name of a data set, the table's where it is left out.
     """
 
     protocol: str
     title: str = ""
     prior: str = "template"
     cases: tuple[str, ...] = ()
+    dataset: str = ""
 
 
 class Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -52,7 +54,7 @@ class Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     Attributes:
         title: as printed.
         description: how to read it.
-        dataset: name of a data set.
+        dataset: name of the data set that `run --table` runs; conditions on others are printed.
         scores: names of the scores, a column each under every condition.
         conditions: groups of columns.
         rows: labels, methods and settings.
@@ -74,34 +76,25 @@ class Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     paper: str = ""
 
 
-class ReportedCell(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A number that the paper printed, or of which only the difference to its own method is known.
+class ReportedRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One row of a paper's table.
 
     Attributes:
-        value: as printed; None where it is not known.
-        difference: the row's value less that of the paper's method; None where `value` is known.
-        origin: where it was read.
+        label: as printed.
+        cells: numbers as printed, None where a dash stands, by the name of the score; in a table of several conditions
+            by "title/name".
     """
 
-    origin: str
-    value: float | None = None
-    difference: float | None = None
-
-
-class ReportedRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One row of the paper's table: cells by the name of the score."""
-
     label: str
-    cells: dict[str, ReportedCell]
-    note: str = ""
+    cells: dict[str, float | None]
 
 
 class Reported(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One table of the paper, as far as its numbers are known.
+    """One table of a paper.
 
     Attributes:
         source: the paper and its table.
-        note: what is not known, and why a comparison is loose.
+        note: why a comparison is loose.
     """
 
     source: str

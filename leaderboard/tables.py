@@ -10,14 +10,13 @@ from rewild4d.leaderboard.formats import markdown as to_markdown
 from rewild4d.leaderboard.layout import Cell, Column, Row, Table
 from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.remarks import cases_said, seeds_said
-from rewild4d.leaderboard.specs import Reported, ReportedCell
+from rewild4d.leaderboard.specs import Reported
 from rewild4d.leaderboard.statistics import Estimate, estimate, ranks
 from rewild4d.leaderboard.titles import TITLES, better_of, digits_of
 from rewild4d.leaderboard.variants import (
     Variant,
     by_protocol,
     coverage_text,
-    is_floor,
     latest,
     marks,
     row_kind,
@@ -85,7 +84,9 @@ def protocol_tables(records: Sequence[RunRecord]) -> list[Table]:
         frame = _frame(kept, remarks)
         columns = (*columns_of(kept, frame.scores), Column("seeds"), Column("fit, s"))
         over = [[case] for case in cases] + [cases] * (len(cases) > 1)
-        rows = [row for some in over for variant in named if (row := _timed_row(variant, some, frame.scores))]
+        rows = []
+        for some in over:
+            rows += _apart([row for variant in named if (row := _timed_row(variant, some, frame.scores))])
         sets = len(cases) > 1 and any(name in scores for scores in KINDS.values() for name in frame.scores)
         remarks = [*frame.remarks, *([POOLED] if sets else [])]
         stubs = ("case", "method")
@@ -107,8 +108,8 @@ def named_table(frame: Frame, entrants: Sequence[Entrant], reported: Reported | 
     """Make a table whose rows are entrants, columns scores under conditions, cells means over the cases of a condition.
 
     The best of a column is bold and the second underlined, as `rewild4d.leaderboard.statistics.ranks` tells them apart
-    by the spread over seeds. Reported rows and those that had what the others had not are never ranked. Remarks say
-    over which cases the means are, and where nothing is known of the spread.
+    by the spread over seeds. Lower bounds, reported rows and those that had what the others had not are never ranked.
+    Remarks say over which cases the means are, and where nothing is known of the spread.
 
     Args:
         frame: titles, conditions and scores.
@@ -135,7 +136,7 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
     """Subtract a reference row from every row: mean of the cases' differences, 95 % bootstrap interval in brackets.
 
     A row that is better than the reference, by an interval without 0, is bold; one that is worse by such an interval is
-    not marked. Rows that had what the others had not are never marked.
+    not marked. Lower bounds and rows that had what the others had not are never marked.
 
     Raises:
         UserError: no row of that name.
@@ -150,7 +151,7 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
             pairs = zip(entrant.records, reference.records, strict=True)
             cells = [difference(*pair, name, entrant.absent) for pair in pairs for name in frame.scores]
             row = row_of(entrant, cells)
-            rows.append(row if row.flags else _leading(row, columns))
+            rows.append(_leading(row, columns) if row.kind == "method" else row)
     title = f"{frame.title}: difference to {reference.label}"
     caption = _difference_caption(reference.label, entrants)
     remarks = tuple(filter(None, [_over(frame, entrants), *frame.remarks]))
@@ -189,7 +190,7 @@ def _difference_caption(reference: str, entrants: Sequence[Entrant]) -> str:
     return (
         f"The row less {reference}: behind it is a minus where ↑ stands and a plus where ↓ stands. Mean of the cases' "
         f"differences; in brackets the 95 % interval of a bootstrap over {drawn}. Bold: ahead of {reference} by an "
-        "interval without 0"
+        "interval without 0."
     )
 
 
@@ -219,7 +220,7 @@ def columns_of(
 
 def _frame(records: Sequence[RunRecord], remarks: Sequence[str]) -> Frame:
     protocol = records[0].protocol
-    caption = f"`{protocol['name']}`; {coverage_text(records)}"
+    caption = f"Protocol `{protocol['name']}`. {sentence(coverage_text(records))}"
     scores = tuple(protocol["scores"])
     return Frame(protocol["name"], protocol["title"], caption, ("",), scores, (*remarks, *_floors(records, scores)))
 
@@ -260,8 +261,8 @@ def _timed_row(variant: Variant, cases: list[str], scores: Sequence[str]) -> Row
     seconds = f"{statistics.fmean(run.timing.fit_seconds for run in good):.0f}" if whole else "-"
     cells = (*(cell(runs, cases, name) for name in scores), Cell(seeds), Cell(seconds))
     said = marks(variant.records)
-    kind = "floor" if is_floor(variant.records[0]) else "method"
-    return Row(("mean" if mean else cases[0], variant.label), cells, kind, said, said, summary=mean)
+    stubs = "mean" if mean else cases[0], variant.label
+    return Row(stubs, cells, row_kind(variant.records), said, said, summary=mean)
 
 
 def kind_of(entrant: Entrant) -> str:
@@ -270,19 +271,17 @@ def kind_of(entrant: Entrant) -> str:
 
 
 def _apart(rows: list[Row]) -> list[Row]:
-    """Sort: methods, then those that are not ranked, then floors."""
+    """Sort: methods, then those that are not ranked, then lower bounds; otherwise as they come."""
     order = {"method": 0, "unranked": 1, "floor": 2}
     return sorted(rows, key=lambda row: order[row.kind])
 
 
 def ranked(rows: Sequence[Row], columns: Sequence[Column]) -> list[Row]:
-    """Put methods before those that are not ranked before floors, and mark best and second of each column.
-
-    Floors compete too; what prints alike is alike.
-    """
+    """Put methods before those that are not ranked before lower bounds, and mark the best and second method of each
+    column; what prints alike is alike."""
     found = []
     for place, column in enumerate(columns):
-        cells = [row.cells[place] if row.kind != "unranked" else Cell("") for row in rows]
+        cells = [row.cells[place] if row.kind == "method" else Cell("") for row in rows]
         known = [None if c.value is None else Estimate(c.value, c.deviation, 0) for c in cells]
         digits = max((len(c.text.partition(" ")[0].partition(".")[2]) for c in cells), default=0)
         found.append(ranks(known, column.better, digits))
@@ -293,18 +292,19 @@ def ranked(rows: Sequence[Row], columns: Sequence[Column]) -> list[Row]:
 
 
 def _reported_rows(reported: Reported, columns: Sequence[Column]) -> list[Row]:
+    """Make a row for each of a paper's; a dash stands where the paper has one, nothing where it has no such column."""
     rows = []
     for line in reported.rows:
-        cells = tuple(_reported_cell(line.cells.get(column.score), column.score) for column in columns)
-        rows.append(Row((f"{line.label} (reported)",), cells, "reported", (line.note,) if line.note else ()))
+        cells = []
+        for column in columns:
+            name = f"{column.group}/{column.score}" if column.group else column.score
+            value, digits = line.cells.get(name), max(3, digits_of(column.score, "1"))
+            dash = "—" if name in line.cells else ""
+            cells.append(Cell(dash) if value is None else Cell(f"{value:.{digits}f}", value=value))
+        rows.append(Row((f"{line.label} (reported)",), tuple(cells), "reported"))
     return rows
 
 
-def _reported_cell(found: ReportedCell | None, name: str) -> Cell:
-    if found is None:
-        return Cell("")
-    if found.value is not None:
-        digits = digits_of(name, "dB" if name.startswith("psnr") else "1")
-        return Cell(f"{found.value:.{digits}f}", value=found.value)
-    sign = "+" if (found.difference or 0) > 0 else "−"
-    return Cell(f"ours {sign} {abs(found.difference or 0)}")
+def sentence(text: str) -> str:
+    """Start with a capital and end with a full stop."""
+    return text[:1].upper() + text[1:].rstrip(".") + "." if text else ""

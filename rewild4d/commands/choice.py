@@ -21,12 +21,19 @@ def chosen(name: str, spec: Spec, choice: planning.Choice) -> Spec:
     presets = {preset for row in spec.rows if not row.preset for preset in preset_names(row.method)}
     if choice.preset and presets and choice.preset not in presets:
         raise unknown_name("preset", choice.preset, presets)
-    if choice.protocol and len(spec.conditions) == 1:
-        known = load_protocols().get(planning.newest_protocol(choice.protocol))
-        if known is not None and known.dataset != spec.dataset:
-            condition = msgspec.structs.replace(spec.conditions[0], cases=())
-            spec = msgspec.structs.replace(spec, conditions=(condition,), dataset=known.dataset)
-    return planning.with_choice(name, spec, choice)
+    known = load_protocols().get(planning.newest_protocol(choice.protocol)) if choice.protocol else None
+    return planning.with_choice(name, spec if known is None else _on(spec, known.dataset), choice)
+
+
+def _on(spec: Spec, dataset: str) -> Spec:
+    """Leave of a table the condition on a data set, or its first one with all cases of that data set; a table whose
+    conditions share a data set stays as it is."""
+    own = [one for one in spec.conditions if (one.dataset or spec.dataset) == dataset]
+    if len({one.dataset or spec.dataset for one in spec.conditions}) < len(spec.conditions):
+        return spec
+    condition = own[0] if own else msgspec.structs.replace(spec.conditions[0], cases=())
+    condition = msgspec.structs.replace(condition, dataset=dataset)
+    return msgspec.structs.replace(spec, conditions=(condition,), dataset=dataset)
 
 
 def cases_of(name: str, known: Sequence[str], patterns: Sequence[str]) -> tuple[tuple[str, ...], str]:

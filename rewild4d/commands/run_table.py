@@ -70,6 +70,9 @@ def main(arguments: list[str]) -> int:
 
     spec = chosen(options.table, found, planning.Choice(options.preset, options.protocol))
     plans = make_plans(options, spec)
+    for other in [one for one in spec.conditions if one not in planning.own_conditions(spec)]:
+        command = f"rewild4d-bench run --table {options.table} --protocol {other.protocol}"
+        print(f"not run here: {other.title}, on data of its own: `{command}`", file=sys.stderr)
     if options.plan:
         labels = {_key(planning.row_entry(options.table, row, spec, ())): row.label for row in reversed(spec.rows)}
         for plan in plans:
@@ -95,7 +98,7 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
     from rewild4d.running import planning
     from rewild4d.running.runner import Plan
 
-    protocols = {one.protocol: find_protocol(spec.dataset, one.protocol) for one in spec.conditions}
+    protocols = {one.protocol: find_protocol(spec.dataset, one.protocol) for one in planning.own_conditions(spec)}
     entries = planning.entries(options.table, spec, tuple(dict.fromkeys(options.seeds or spec.seeds)))
     chosen = plan_fields(options)
     root, reader = open_dataset(spec.dataset, options.data, options)

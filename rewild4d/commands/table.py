@@ -90,7 +90,7 @@ def _named(options: Options) -> list[Table]:
     spec = chosen(name, find_spec(name), choice)
     found = _found(options)
     entrants, notes = planning.entrants(name, spec, [record for _, record in found])
-    gaps = [entrant.label for entrant in entrants if not entrant.absent and not all(entrant.records)]
+    gaps = [each.label for each in entrants if not each.absent and not planning.is_complete(each, spec)]
     if gaps:
         other = f" --protocol {options.protocol}" if options.protocol else ""
         command = f"rewild4d-bench run --table {name} --preset {spec.preset}{other}"

@@ -11,7 +11,7 @@ from rewild4d.config import load_preset, merged, preset_names
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.evaluation.protocol import load_protocols, newest_version
 from rewild4d.leaderboard.records import RunRecord
-from rewild4d.leaderboard.specs import Condition, Line, Spec, load_reported
+from rewild4d.leaderboard.specs import Condition, Line, Reported, Spec, load_reported
 from rewild4d.leaderboard.tables import Entrant, Frame
 from rewild4d.leaderboard.variants import is_floor, latest
 from rewild4d.priors.choose import PriorChoice
@@ -94,13 +94,25 @@ def entries(name: str, spec: Spec, seeds: tuple[int, ...]) -> tuple[Entry, ...]:
 
 
 def cases_of_conditions(spec: Spec) -> dict[tuple[str, str], tuple[str, ...]]:
-    """Return (protocol, prior) of the conditions, each once, with the patterns of their cases, () for all."""
+    """Return (protocol, prior) of the conditions on the table's own data set, each once, with the patterns of their
+    cases, () for all."""
     found: dict[tuple[str, str], tuple[str, ...]] = {}
-    for one in spec.conditions:
+    for one in own_conditions(spec):
         key = one.protocol, one.prior
         whole = not one.cases or (key in found and not found[key])
         found[key] = () if whole else (*found.get(key, ()), *one.cases)
     return found
+
+
+def own_conditions(spec: Spec) -> tuple[Condition, ...]:
+    """Return the conditions on the table's own data set, which `run --table` runs."""
+    return tuple(one for one in spec.conditions if one.dataset in ("", spec.dataset))
+
+
+def is_complete(entrant: Entrant, spec: Spec) -> bool:
+    """Tell whether a row has records under each condition on the table's own data set."""
+    own = own_conditions(spec)
+    return all(found for found, one in zip(entrant.records, spec.conditions, strict=True) if one in own)
 
 
 def frame(name: str, spec: Spec, notes: Sequence[str] = ()) -> Frame:
@@ -114,8 +126,6 @@ def frame(name: str, spec: Spec, notes: Sequence[str] = ()) -> Frame:
 
 def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[Entrant], list[str]]:
     """Return the rows of a table with their records, then its lower-bound rows, and notes on records left out."""
-    points = getattr(load_dataset(spec.dataset), "keypoint_use", "none")
-    records = [record for record in records if record.prior.get("keypoints", "none") == points]
     kept, left_out = latest([r for r in records if any(_is_under(r, condition, spec) for condition in spec.conditions)])
     kept = [_beside_equals(record) for record in kept]
     under = [tuple(r for r in kept if _is_under(r, condition, spec)) for condition in spec.conditions]
@@ -144,20 +154,30 @@ def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[
     return rows, [*left_out, *_missing(spec, cases)]
 
 
-def reported(spec: Spec) -> Any:
-    """Load the paper's own numbers for this table, or None."""
-    return load_reported(spec.paper) if spec.paper else None
+def reported(spec: Spec) -> Reported | None:
+    """Load the paper's own numbers for this table, or None; of a single condition those under its title."""
+    if not spec.paper:
+        return None
+    found, single = load_reported(spec.paper), len(spec.conditions) == 1
+    start = f"{spec.conditions[0].title}/" if single else ""
+    rows = tuple(
+        msgspec.structs.replace(row, cells={name.removeprefix(start): value for name, value in row.cells.items()})
+        for row in found.rows
+    )
+    return msgspec.structs.replace(found, rows=rows)
 
 
 def _is_under(record: RunRecord, condition: Condition, spec: Spec) -> bool:
     choice = record.prior.get("choice", record.prior.get("name"))
-    wanted = spec.dataset, condition.protocol, condition.prior
+    dataset = condition.dataset or spec.dataset
+    wanted = dataset, condition.protocol, condition.prior, getattr(load_dataset(dataset), "keypoint_use", "none")
     fits = not condition.cases or any(fnmatchcase(record.case, pattern) for pattern in condition.cases)
     effort = record.prior.get("config")  # records from before it was written have none
     known_cameras = record.protocol.get("selection", {}).get("cameras") != "unknown"
     asked = PriorChoice(condition.prior, PRIOR_PRESETS.get(spec.preset, STANDARD)).settings_under(known_cameras)
     same_effort = effort is None or _equals(effort, asked)
-    return (record.dataset, record.protocol["name"], choice) == wanted and fits and same_effort
+    found = record.dataset, record.protocol["name"], choice, record.prior.get("keypoints", "none")
+    return found == wanted and fits and same_effort
 
 
 def _missing(spec: Spec, cases: Sequence[Collection[str]]) -> list[str]:

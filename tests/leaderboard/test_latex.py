@@ -10,7 +10,7 @@ import pytest
 from records_for_tests import psnr, record
 
 from rewild4d.leaderboard.formats import latex
-from rewild4d.leaderboard.specs import Reported, ReportedCell, ReportedRow
+from rewild4d.leaderboard.specs import Reported, ReportedRow
 from rewild4d.leaderboard.tables import Entrant, Frame, difference_table, named_table
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -25,9 +25,8 @@ def test_every_sign_compiles(tmp_path: Path) -> None:
     runs = [(record(case=case, scores=psnr(value)),) for case, value in (("a", 20.0), ("b", 21.0))]
     marked = (record(case="a", scores=psnr(9.0), marks=[odd]),)
     rows = [Entrant(odd, (runs[0], runs[1])), Entrant("Ours", (runs[0], ())), Entrant("seen", (marked, ()), "", (odd,))]
-    reported = Reported(source=odd, note=odd, rows=(
-        ReportedRow(label=odd, cells={"psnr": ReportedCell(difference=-1.0, origin="o")}, note=odd),
-    ))  # fmt: skip
+    cells = {"one & all/psnr": -1.0, "two_2/psnr": None}
+    reported = Reported(source=odd, note=odd, rows=(ReportedRow(label=odd, cells=cells),))
     source = latex(named_table(frame, rows, reported)) + "\n\n" + latex(difference_table(frame, rows, "ours"))
     (tmp_path / "t.tex").write_text(DOCUMENT % source)
     done = subprocess.run(

@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 
+import msgspec
 import numpy as np
 import pytest
 from records_for_tests import PROTOCOL, lower, psnr, record, runs, texts
@@ -15,9 +16,9 @@ from rewild4d.errors import UserError
 from rewild4d.leaderboard.formats import FORMATS, html, latex, markdown, tidy_csv
 from rewild4d.leaderboard.layout import Table
 from rewild4d.leaderboard.records import RunRecord
-from rewild4d.leaderboard.specs import Reported, ReportedCell, ReportedRow
+from rewild4d.leaderboard.specs import Reported, ReportedRow
 from rewild4d.leaderboard.statistics import Estimate, estimate, paired, ranks
-from rewild4d.leaderboard.tables import Entrant, Frame, difference_table, named_table
+from rewild4d.leaderboard.tables import Entrant, Frame, difference_table, named_table, protocol_tables
 
 FRAME = Frame("t", "Title", "How to read it", ("",), ("psnr",))
 
@@ -141,13 +142,6 @@ def test_a_failed_seed_is_told_and_does_not_count() -> None:
     assert made.notes == ("1 of 3 runs failed: it diverged",)
 
 
-def test_floors_compete_and_come_last() -> None:
-    made = table(empty=runs({"a": [30.0]}, method="empty"), ours=runs({"a": [20.0]}))
-    assert [(row.stubs[0], row.kind, row.cells[0].mark) for row in made.rows] == [
-        ("ours", "method", "second"), ("empty", "floor", "best"),
-    ]  # fmt: skip
-
-
 def test_rows_with_an_advantage_are_marked_and_not_ranked() -> None:
     mark = "upper bound: rotated to the best input-view PSNR"
     made = table(ours=runs({"a": [20.0]}), rotated=runs({"a": [30.0]}, marks=[mark]), gart=runs({"a": [10.0]}))
@@ -161,18 +155,50 @@ def test_rows_with_an_advantage_are_marked_and_not_ranked() -> None:
 
 
 def test_reported_rows_are_marked_and_never_ranked() -> None:
-    cells = {"psnr": ReportedCell(value=99.0, origin="o")}, {"psnr": ReportedCell(difference=-4.0, origin="o")}
     reported = Reported(source="Paper, its table", note="Loose.", rows=(
-        ReportedRow(label="Ours", cells=cells[0]), ReportedRow(label="GART", cells=cells[1]),
+        ReportedRow(label="Ours", cells={"psnr": 99.0}), ReportedRow(label="GART", cells={"psnr": None}),
         ReportedRow(label="None", cells={}),
     ))  # fmt: skip
     made = named_table(FRAME, [Entrant("ours", (runs({"a": [20.0]}),)), Entrant("g", (runs({"a": [10.0]}),))], reported)
     assert texts(made) == {
-        "ours": ("20.00", "", "best"), "g": ("10.00", "", "second"), "Ours (reported)": ("99.00", "", ""),
-        "GART (reported)": ("ours − 4.0", "", ""), "None (reported)": ("", "", ""),
+        "ours": ("20.00", "", "best"), "g": ("10.00", "", "second"), "Ours (reported)": ("99.000", "", ""),
+        "GART (reported)": ("—", "", ""), "None (reported)": ("", "", ""),
     }  # fmt: skip
     assert made.remarks[-1] == "Reported: Paper, its table. Loose."
     assert latex(made).count(r"\midrule") == 2, "a rule before the methods, one before what was reported"
+
+
+def test_lower_bounds_are_never_ranked_and_stand_apart() -> None:
+    """Nor are those that are better than every method."""
+    floor = tuple(msgspec.structs.replace(run, method="prior-only") for run in runs({"a": [30.0]}))
+    floor = tuple(msgspec.structs.replace(run, protocol=run.protocol | {"floors": ["prior-only"]}) for run in floor)
+    marked = tuple(msgspec.structs.replace(run, marks=["saw more"]) for run in runs({"a": [25.0]}))
+    rows = [
+        Entrant("prior-only", (floor,)), Entrant("seen", (marked,)), Entrant("ours", (runs({"a": [20.0]}),)),
+        Entrant("gart", (runs({"a": [10.0]}),)),
+    ]  # fmt: skip
+    reported = Reported(source="Paper", note="", rows=(ReportedRow(label="Ours", cells={"psnr": 50.0}),))
+    made = named_table(FRAME, rows, reported)
+    order = [("ours", "best"), ("gart", "second"), ("seen", ""), ("prior-only", ""), ("Ours (reported)", "")]
+    assert [(row.stubs[0], row.cells[0].mark) for row in made.rows] == order
+    assert latex(made).count(r"\midrule") == 4, "before each of the four kinds"
+    assert "**30.00**" not in markdown(made) and "<b>30.00</b>" not in html(made)
+    found = difference_table(FRAME, rows, "ours")
+    assert {row.stubs[0]: row.cells[0].mark for row in found.rows} == {"gart": "", "seen": "", "prior-only": ""}
+
+
+def test_case_by_case_rules_stand_between_cases_and_rows_have_one_order() -> None:
+    both = {"a": [20.0], "b": [21.0]}
+    floor = [
+        msgspec.structs.replace(run, method="prior-only", protocol=run.protocol | {"floors": ["prior-only"]})
+        for run in runs(both)
+    ]
+    (made,) = protocol_tables([*floor, *runs(both)])
+    assert [row.stubs for row in made.rows] == [
+        (case, method) for case in ("a", "b", "mean") for method in ("ours", "prior-only")
+    ]
+    assert latex(made).count(r"\midrule") == 3
+    assert made.caption.startswith("Protocol `") and made.caption.endswith(".")
 
 
 def test_differences_to_a_row() -> None:

@@ -57,7 +57,7 @@ def run_of(protocol: str, case: str, prior: PriorConfig, preset: str = "standard
 
 @pytest.mark.parametrize("name", NAMES)
 def test_both_tables_take_the_eight_animals_of_davis(name: str) -> None:
-    (condition,) = load_specs()[name].conditions
+    condition = load_specs()[name].conditions[0]
     eight = tuple(sequence for sequence, facts in known_sequences().items() if facts.get("eight"))
     assert condition.cases == eight and len(eight) == 8
 
@@ -78,7 +78,12 @@ def test_only_the_cases_that_the_data_has_are_planned(tmp_path: Path, capsys: py
     words = ("--table", "input-view", "--data", str(root), "--out", str(tmp_path / "runs"), "--seeds", "0", "--plan")
     assert call("run", *words) == 0
     out, err = capsys.readouterr()
-    assert err.strip() == "table 'input-view': the data has no bear, dog, dog-agility, elephant, goat, rhino"
+    missing, *elsewhere = err.splitlines()
+    assert missing == "table 'input-view': the data has no bear, dog, dog-agility, elephant, goat, rhino"
+    assert elsewhere == [
+        f"not run here: {title}, on data of its own: `rewild4d-bench run --table input-view --protocol {name}-512-v2`"
+        for title, name in (("Online", "online"), ("APTv2", "aptv2"))
+    ]
     lines = out.splitlines()
     assert {Path(line.split()[-1]).parent.relative_to(tmp_path / "runs").as_posix() for line in lines} == {
         "davis-512-v2/camel", "davis-512-v2/cows",
@@ -151,7 +156,7 @@ def test_distances_that_were_not_computed_say_why(tmp_path: Path, capsys: pytest
         assert call("table", name, "--runs", str(tmp_path / "runs")) == 0
         shown[name] = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| Ours"))
     assert shown["input-view"].startswith("| Ours | 21.00 |")
-    assert shown["novel-view"] == "| Ours | 0.1250 | n/a [2] | n/a [3] |"
+    assert shown["novel-view"].startswith("| Ours | 0.1250 | n/a [2] | n/a [3] |")
 
 
 @pytest.mark.parametrize(
@@ -176,19 +181,18 @@ def test_a_row_takes_only_runs_whose_prior_was_fitted_as_the_tables_is(
 
 
 def test_the_committed_records_fill_both_tables(capsys: pytest.CaptureFixture[str]) -> None:
-    """Every row has a figure: the mean of what the two records say of camel and of cows."""
+    """A row has the mean of what the two records say of camel and of cows; `ours` had other settings then."""
     scores = {(made.method, made.case): made.scores for _, made in find_records(COMMITTED)}
     for name in NAMES:
         spec = load_specs()[name]
         assert call("table", name, "--runs", str(COMMITTED), "--format", "csv") == 0
         lines = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
-        found = {(line["method"], line["score"]): line["value"] for line in lines}
-        for row in spec.rows:
+        found = {(line["method"], line["score"]): line["value"] for line in lines if line["condition"] == "DAVIS"}
+        for row in spec.rows[:-1]:
             for score in spec.scores:
                 camel, cows = (scores[row.method, case][score].value or 0.0 for case in ("camel", "cows"))
                 assert float(found[row.label, score]) == pytest.approx((camel + cows) / 2)
-        if name == "input-view":
-            assert f"{float(found['Ours', 'psnr']):.2f}" == "25.63", "26.41 and 24.85, as the notes on them say"
+        assert found[spec.rows[-1].label, spec.scores[0]] == ""
 
 
 def test_pooling_without_features_says_so(capsys: pytest.CaptureFixture[str]) -> None:
@@ -216,7 +220,7 @@ def test_the_page_has_both_tables(tmp_path: Path) -> None:
     assert call("leaderboard", "build", "--runs", str(COMMITTED), "--out", str(page)) == 0
     text = (page / "index.html").read_text()
     for name in NAMES:
-        assert f'<table id="{name}">' in text and f'<table id="{name}-difference">' in text
+        assert f'<table id="{name}">' in text
 
 
 def test_a_table_whose_rows_are_all_one_run_is_not_on_the_page(tmp_path: Path) -> None:
