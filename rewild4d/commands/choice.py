@@ -1,13 +1,14 @@
 """Apply the command line to a named table: another protocol with its data set, the cases that the data has."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 
 import msgspec
 
 from rewild4d.config import preset_names
 from rewild4d.errors import UserError, unknown_name
-from rewild4d.evaluation.protocol import load_protocols
+from rewild4d.evaluation.protocol import load_protocols, versions
+from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.specs import Spec
 from rewild4d.running import planning
 
@@ -23,6 +24,24 @@ def chosen(name: str, spec: Spec, choice: planning.Choice) -> Spec:
         raise unknown_name("preset", choice.preset, presets)
     known = load_protocols().get(planning.newest_protocol(choice.protocol)) if choice.protocol else None
     return planning.with_choice(name, spec if known is None else _on(spec, known.dataset), choice)
+
+
+def printed(spec: Spec, protocol: str, records: Iterable[RunRecord]) -> tuple[Spec, list[str]]:
+    """Fit a table that is printed, after `chosen`, to records that may be of older protocols.
+
+    A condition whose newest protocol no record has takes the newest one that a record has, and a note says so; the
+    version that the command line names (``protocol``) stays.
+    """
+    recorded = {record.protocol["name"] for record in records}
+    conditions, notes = [], {}
+    for one in spec.conditions:
+        family = one.protocol.rpartition("-v")[0]
+        older = versions(family, recorded)
+        if one.protocol != protocol and older and one.protocol not in recorded:
+            notes[one.protocol] = f"By protocol {older[0]}, as there is no record of {one.protocol} here."
+            one = msgspec.structs.replace(one, protocol=older[0])
+        conditions.append(one)
+    return msgspec.structs.replace(spec, conditions=tuple(conditions)), list(notes.values())
 
 
 def _on(spec: Spec, dataset: str) -> Spec:

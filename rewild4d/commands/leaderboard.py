@@ -116,14 +116,15 @@ def _require_records(folders: tuple[Path, ...], found: Sequence[object]) -> None
 def _named(records: list[RunRecord], preset: str) -> list[tuple[Table, ...]]:
     """Make the named tables in which two rows other than lower bounds have different records under every condition on
     the table's own data set, each with the differences to `REFERENCE`."""
-    from rewild4d.commands.choice import chosen
+    from rewild4d.commands.choice import chosen, printed
     from rewild4d.leaderboard.tables import difference_table, named_table
     from rewild4d.running import planning
 
     tables: list[tuple[Table, ...]] = []
     for name, spec in load_specs().items():
-        full = chosen(name, spec, planning.Choice(preset=preset))
+        full, older = printed(chosen(name, spec, planning.Choice(preset=preset)), "", records)
         rows, notes = planning.entrants(name, full, records)
+        notes = [*older, *notes]
         whole = [row for row in rows[: len(full.rows)] if planning.is_complete(row, full)]
         if len({frozenset(record.run_id for under in row.records for record in under) for row in whole}) < 2:
             continue

@@ -80,16 +80,18 @@ def _by_protocol(options: Options) -> list[Table]:
 
 
 def _named(options: Options) -> list[Table]:
-    from rewild4d.commands.choice import chosen
+    from rewild4d.commands.choice import chosen, printed
     from rewild4d.leaderboard.pooled import pooled_table
     from rewild4d.leaderboard.tables import difference_table, named_table
     from rewild4d.running import planning
 
     name = options.name[0]
     choice = planning.Choice(options.preset, options.protocol)
-    spec = chosen(name, find_spec(name), choice)
-    found = _found(options)
-    entrants, notes = planning.entrants(name, spec, [record for _, record in found])
+    spec, found = chosen(name, find_spec(name), choice), _found(options)
+    records = [record for _, record in found]
+    spec, older = printed(spec, options.protocol, records)
+    entrants, notes = planning.entrants(name, spec, records)
+    notes = [*older, *notes]
     gaps = [each.label for each in entrants if not each.absent and not planning.is_complete(each, spec)]
     if gaps:
         other = f" --protocol {options.protocol}" if options.protocol else ""

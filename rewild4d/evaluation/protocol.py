@@ -129,8 +129,14 @@ def default_name(dataset: str, protocols: Mapping[str, Protocol]) -> str | None:
 
 def newest_version(name: str, known: Iterable[str]) -> str:
     """Return the full name of a protocol: of a family ("artemis-sweep-256") the highest version; others unchanged."""
-    family = [other for other in known if other.rpartition("-v")[0] == name]
-    return max(family, key=lambda other: int(other.rpartition("-v")[2])) if family else name
+    return next(iter(versions(name, known)), name)
+
+
+def versions(family: str, known: Iterable[str]) -> list[str]:
+    """List the full names of a family's protocols, the newest first."""
+    parts = {name: name.rpartition("-v") for name in known}
+    found = [name for name, (stem, _, number) in parts.items() if stem == family and number.isdecimal()]
+    return sorted(found, key=lambda name: int(parts[name][2]), reverse=True)
 
 
 def find_protocol(dataset: str, name: str | None) -> Protocol:

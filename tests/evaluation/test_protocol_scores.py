@@ -62,7 +62,7 @@ def quiet(*_: object) -> None:
 
 
 def asking(*scores: str) -> Protocol:
-    base = find_protocol("artemis", "artemis-sweep-128-v2")
+    base = find_protocol("artemis", "artemis-sweep-128-v3")
     return msgspec.structs.replace(base, scores=scores, points=700, novel=NovelViews(frames=2, clip=16, stride=8))
 
 
@@ -76,7 +76,7 @@ def test_a_protocol_is_never_changed_once_it_was_used() -> None:
 
 
 def test_the_default_is_the_newest_of_the_defaults() -> None:
-    assert find_protocol("artemis", None).name == "artemis-sweep-256-v2"
+    assert find_protocol("artemis", None).name == "artemis-sweep-256-v3"
 
 
 @pytest.mark.parametrize(

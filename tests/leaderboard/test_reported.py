@@ -4,11 +4,14 @@ import json
 from pathlib import Path
 
 import pytest
+from calling import call
 
 from rewild4d.commands.choice import chosen
 from rewild4d.leaderboard.specs import load_reported, load_specs
 from rewild4d.leaderboard.tables import columns_of
 from rewild4d.running import planning
+
+RESULTS = Path(__file__).parents[2] / "results"
 
 
 def test_every_cell_of_the_papers_tables_is_there() -> None:
@@ -53,3 +56,13 @@ def test_the_protocol_chooses_the_condition_of_its_data_set() -> None:
     whole = chosen("input-view", load_specs()["input-view"], planning.Choice())
     assert [one.title for one in whole.conditions] == ["DAVIS", "Online", "APTv2"]
     assert [one.title for one in planning.own_conditions(whole)] == ["DAVIS"]
+
+
+def test_records_of_an_older_protocol_are_printed_by_it_and_that_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("table", "artemis", "--runs", str(RESULTS / "2026-11-23-artemis-standard"))
+    assert call(*words) == 0
+    out = capsys.readouterr().out
+    assert "By protocol artemis-sweep-256-v2, as there is no record of artemis-sweep-256-v3 here." in out
+    assert "`artemis-sweep-256-v2`" in out and "| D-3DGS | 21.91 ± " in out
+    assert call(*words, "--protocol", "artemis-sweep-256-v3") == 0
+    assert "21.91" not in capsys.readouterr().out, "a version that is named stays"
