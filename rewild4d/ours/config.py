@@ -302,10 +302,10 @@ class Footage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """Instead of `geometry.temporal`."""
     rigid: Weight = 0.2
     """Instead of `geometry.rigid`."""
-    blend: bool = False
-    """Instead of `prior.blend`."""
-    pull: Weight = 0.3
-    """Instead of `prior.pull`."""
+    blend: bool | None = None
+    """Instead of `prior.blend`; None leaves it."""
+    pull: Weight | None = None
+    """Instead of `prior.pull`; None leaves it."""
     pull_until: Weight = 0.35
     """Instead of `prior.pull_until`."""
     pose: Rate = (7e-4, 1e-5)

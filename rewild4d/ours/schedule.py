@@ -31,12 +31,13 @@ def for_clip_of_ours(config: Config, frames: int, *, filmed: bool = False) -> Co
 
 
 def _for_footage(config: Config) -> Config:
-    own, replace = config.footage, msgspec.structs.replace
+    own, prior, replace = config.footage, config.prior, msgspec.structs.replace
+    blend, pull = prior.blend if own.blend is None else own.blend, prior.pull if own.pull is None else own.pull
     return replace(
         config,
         steps_per_frame=own.steps_per_frame,
         geometry=replace(config.geometry, temporal=own.temporal, rigid=own.rigid),
-        prior=replace(config.prior, blend=own.blend, pull=own.pull, pull_until=own.pull_until),
+        prior=replace(prior, blend=blend, pull=pull, pull_until=own.pull_until),
         rates=replace(config.rates, pose=own.pose, deform=own.deform),
         cameras=own.cameras,
         footage=replace(own, use=False),

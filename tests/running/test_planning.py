@@ -313,3 +313,28 @@ def test_bad_input_is_one_sentence(
     assert (stop.value.code, out) == (2, "") and len(err.strip().splitlines()) == 1
     assert sentence in err
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_runs_from_before_the_losses_were_mended_stand_for_their_row_until_there_are_later_ones() -> None:
+    found = spec(
+        [Line(label="Ours", method="ours"), Line(label="bare", method="ours", settings={"pose": {"anchors": False}})]
+    )
+    now = msgspec.to_builtins(planning.row_entry("t", found.rows[0], found, ()).config)
+    then = now | {
+        "deform": now["deform"] | {"anchors": True}, "geometry": now["geometry"] | {"compact_power": 2.0},
+        "pose": {name: value for name, value in now["pose"].items() if name != "anchors"},
+    }  # fmt: skip
+    without = then | {"deform": then["deform"] | {"anchors": False}}
+    protocol = PROTOCOL | {"name": "artemis-sweep-128", "scores": ["psnr"]}
+
+    def run(config: dict[str, Any], value: float) -> RunRecord:
+        prior = {"choice": "template", "config": msgspec.to_builtins(QUICK)}
+        return record(
+            config=config, preset="quick", protocol=protocol, prior=prior, scores=psnr(value), run_id=str(value)
+        )
+
+    (ours, other), _ = planning.entrants("t", found, [run(then, 1.0), run(without, 2.0)])
+    assert [r.run_id for r in ours.records[0]] == ["1.0"] and planning.OLDER in ours.notes
+    assert other.records == ((),), "the older ablation kept anchors in the pose network"
+    (ours, _), _ = planning.entrants("t", found, [run(then, 1.0), run(now, 3.0)])
+    assert [r.run_id for r in ours.records[0]] == ["3.0"] and not ours.notes
