@@ -117,7 +117,7 @@ def training(size: int, gaussians: int, preset: str, device: torch.device | None
     model = build_model(config, prior, generator)
     for layer in (model.network.head, model.deform.out):  # they start at zero, where gradients vanish
         torch.nn.init.normal_(layer.weight, std=0.01, generator=generator)
-    supervision = Supervision(clip, prior, size, device)
+    supervision = Supervision(clip, prior, size, device, config.loss.mean_over)
     return Training(model.to(device), supervision, config, generator), round(PROGRESS * config.iterations)
 
 

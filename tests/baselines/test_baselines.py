@@ -96,7 +96,7 @@ def test_a_state_that_does_not_fit_is_one_sentence(name: str, case: Case, tmp_pa
 @pytest.mark.parametrize("name", TINY)
 def test_every_preset_keeps_what_it_does_not_name(name: str) -> None:
     method = load_method(name)
-    assert preset_names(name) == ["quick", "standard", "paper"]
+    assert preset_names(name) == ["quick", "standard", "paper", "paper-short"]
     defaults = method.Config()
     for preset in preset_names(name):
         config = load_preset(name, method.Config, preset)

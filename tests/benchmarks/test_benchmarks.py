@@ -224,14 +224,14 @@ def test_a_step_has_every_loss() -> None:
     assert (config.image_size, config.canonical.samples, config.iterations) == (32, 150, 20_000)
     figures = trainer.step(index)
     assert figures["gaussians"] == 150
-    expected = {"pose_silhouette", "l1", "ssim", "silhouette", "prior", "skeleton", "tv", "compact", "smooth"}
+    expected = {"pose_silhouette", "l1", "ssim", "silhouette", "skeleton", "tv", "compact", "smooth"}
     assert expected <= set(figures)
     every = config.density.every * config.iterations
     for late in (index + 1, round((index // every + 1) * every) - 1):
         trainer.step(late)
     assert len(trainer.model.gaussians) == 150, "no densification"
-    # The three act in every 4th step under `quick`; under `paper` smooth in every 2nd and the others in every step.
-    assert [loss_period(step_config(32, 150, preset)) for preset in ("quick", "paper")] == [4, 2]
+    # The three act in every 4th step under `quick` and in every step under `paper`.
+    assert [loss_period(step_config(32, 150, preset)) for preset in ("quick", "paper")] == [4, 1]
 
 
 def test_a_regulariser_that_acts_in_every_fourth_step_weighs_four_times_as_much() -> None:
