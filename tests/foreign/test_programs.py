@@ -17,9 +17,9 @@ from rewild4d.foreign.programs import BoundedLog, last_words, run_foreign
 
 posix = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc here: processes cannot be looked up")
 PARENT = """
-import sys
-from pathlib import Path
+import signal
 from rewild4d.foreign.programs import run_foreign
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background ignores it
 run_foreign(["sh", "-c", "sleep 60 & echo $! $$ > {0}.part; mv {0}.part {0}; wait"], timeout=60)
 """
 

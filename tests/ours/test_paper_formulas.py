@@ -125,7 +125,7 @@ def test_weights_and_terms_of_a_step() -> None:
         own = Training(build_model(config, case.prior, generator), supervision, config, generator)
         key = Key(1, 1, 0)
         losses, _ = own.losses(key, supervision.target(key), 10_000 if last else 3_999)
-        values = {name for name, value in losses.items() if float(value) != 0}
+        values = {name for name, value in losses.items() if float(value.detach()) != 0}
         wanted = {"pose_silhouette", "l1", "ssim", "silhouette"}
         wanted |= set() if last else {"tv", "compact", "smooth"}
         assert values == wanted | ({"prior"} if film and not last else set())
