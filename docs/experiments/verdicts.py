@@ -66,7 +66,7 @@ def line(entrant: Entrant, own: Entrant, condition: int, score: str, digits: int
 
 def lines(name: str, records: Sequence[RunRecord]) -> list[str]:
     """Make the tables of one named table, one a condition; none where the paper's method has no record."""
-    full, _ = printed(chosen(name, load_specs()[name], planning.Choice()), "", records)
+    full, _ = printed(name, chosen(name, load_specs()[name], planning.Choice()), "", records)
     entrants, _ = planning.entrants(name, full, records)
     entrants = entrants[: len(full.rows)]
     own = next(entrant for entrant in entrants if entrant.label == REFERENCE)

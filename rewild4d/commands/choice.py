@@ -1,6 +1,6 @@
 """Apply the command line to a named table: another protocol with its data set, the cases that the data has."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from fnmatch import fnmatchcase
 
 import msgspec
@@ -9,7 +9,7 @@ from rewild4d.config import preset_names
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.evaluation.protocol import load_protocols, versions
 from rewild4d.leaderboard.records import RunRecord
-from rewild4d.leaderboard.specs import Spec
+from rewild4d.leaderboard.specs import Condition, Spec
 from rewild4d.running import planning
 
 
@@ -26,22 +26,29 @@ def chosen(name: str, spec: Spec, choice: planning.Choice) -> Spec:
     return planning.with_choice(name, spec if known is None else _on(spec, known.dataset), choice)
 
 
-def printed(spec: Spec, protocol: str, records: Iterable[RunRecord]) -> tuple[Spec, list[str]]:
+def printed(name: str, spec: Spec, protocol: str, records: Sequence[RunRecord]) -> tuple[Spec, list[str]]:
     """Fit a table that is printed, after `chosen`, to records that may be of older protocols.
 
-    A condition whose newest protocol no record has takes the newest one that a record has, and a note says so; the
-    version that the command line names (``protocol``) stays.
+    A condition under whose newest protocol no row has a record takes the newest one under which a row has, and a note
+    says so; the version that the command line names (``protocol``) stays.
     """
     recorded = {record.protocol["name"] for record in records}
     conditions, notes = [], {}
     for one in spec.conditions:
         family = one.protocol.rpartition("-v")[0]
-        older = versions(family, recorded)
-        if one.protocol != protocol and older and one.protocol not in recorded:
-            notes[one.protocol] = f"By protocol {older[0]}, as there is no record of {one.protocol} here."
-            one = msgspec.structs.replace(one, protocol=older[0])
-        conditions.append(one)
+        tried = [one.protocol] if one.protocol == protocol else [one.protocol, *versions(family, recorded)]
+        each = [msgspec.structs.replace(one, protocol=version) for version in tried]
+        found = next((condition for condition in each if _has_rows(name, spec, condition, records)), one)
+        if found != one:
+            notes[one.protocol] = f"By protocol {found.protocol}, as no row has a record of {one.protocol} here."
+        conditions.append(found)
     return msgspec.structs.replace(spec, conditions=tuple(conditions)), list(notes.values())
+
+
+def _has_rows(name: str, spec: Spec, condition: Condition, records: Sequence[RunRecord]) -> bool:
+    """Tell whether a row of the table, no lower bound, has a record under a condition."""
+    rows, _ = planning.entrants(name, msgspec.structs.replace(spec, conditions=(condition,)), records)
+    return any(any(row.records) for row in rows[: len(spec.rows)])
 
 
 def _on(spec: Spec, dataset: str) -> Spec:

@@ -122,7 +122,7 @@ def _named(records: list[RunRecord], preset: str) -> list[tuple[Table, ...]]:
 
     tables: list[tuple[Table, ...]] = []
     for name, spec in load_specs().items():
-        full, older = printed(chosen(name, spec, planning.Choice(preset=preset)), "", records)
+        full, older = printed(name, chosen(name, spec, planning.Choice(preset=preset)), "", records)
         rows, notes = planning.entrants(name, full, records)
         notes = [*older, *notes]
         whole = [row for row in rows[: len(full.rows)] if planning.is_complete(row, full)]

@@ -89,7 +89,7 @@ def _named(options: Options) -> list[Table]:
     choice = planning.Choice(options.preset, options.protocol)
     spec, found = chosen(name, find_spec(name), choice), _found(options)
     records = [record for _, record in found]
-    spec, older = printed(spec, options.protocol, records)
+    spec, older = printed(name, spec, options.protocol, records)
     entrants, notes = planning.entrants(name, spec, records)
     notes = [*older, *notes]
     gaps = [each.label for each in entrants if not each.absent and not planning.is_complete(each, spec)]
