@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.priors.io import seal
+from rewild4d.priors.motion import pose_at
 from rewild4d.transforms import mirror_camera, mirror_matrix
 from rewild4d.types import Camera, Prior
 
@@ -78,8 +79,9 @@ def without_hops(prior: Prior) -> Filtered:
     """Remove frames whose camera is steady in neither sequence, and mark those that are steady in one alone.
 
     The other sequence's camera and pose of a marked frame become mirror images of the steady one's, so that every row
-    can be rendered and interpolated; a fit is not trained from them. A sequence in which less than half of the cameras
-    agree is not filtered, and a note says so.
+    can be rendered and interpolated; a fit is not trained from them. `object_to_world`, which belongs to the plain
+    camera, is interpolated where that camera is not steady. A sequence in which less than half of the cameras agree is
+    not filtered, and a note says so.
     """
     plain, flipped = steady(prior.cameras, prior.times), steady(prior.cameras_flip, prior.times)
     count, undecided = len(plain), []
@@ -98,7 +100,7 @@ def without_hops(prior: Prior) -> Filtered:
     smaller = replace(
         prior,
         times=prior.times[kept],
-        object_to_world=prior.object_to_world[kept],
+        object_to_world=_roots(prior, plain)[kept],
         cameras=tuple(sides[0][0][row] for row in rows),
         transforms=sides[0][1][kept],
         cameras_flip=tuple(sides[1][0][row] for row in rows),
@@ -112,6 +114,17 @@ def without_hops(prior: Prior) -> Filtered:
     )
     notes = [_told(torch.nonzero(which)[:, 0].tolist(), count, what) for which, what in changes if bool(which.any())]
     return Filtered(seal(smaller), rows, (*notes, *undecided))
+
+
+def _roots(prior: Prior, good: Tensor) -> Tensor:
+    """Interpolate object_to_world from the good rows to all, [T] -> [T, 4, 4]."""
+    known = replace(
+        prior,
+        times=prior.times[good],
+        object_to_world=prior.object_to_world[good],
+        transforms=prior.transforms[good],
+    )
+    return torch.stack([pose_at(known, time)[0] for time in prior.times.tolist()])
 
 
 def _told(rows: list[int], count: int, what: str) -> str:
