@@ -20,7 +20,7 @@ def initial_colors(model: Model, supervision: Supervision) -> Tensor:
     own = model.gaussians
     weights = model.field.sample(model.field.probabilities(), own.means)
     total, count = torch.zeros_like(own.means), torch.zeros_like(own.means[:, :1])
-    for frame in range(supervision.frames):
+    for frame in supervision.frames_of(1):  # of the others the pose under this key is not trained
         key = Key(1, 1, frame)
         pose = model.pose(supervision.code_times([key]), [key])
         posed = model.skin(weights, pose.quats[0], model.transforms(pose)[0])[1]
