@@ -36,6 +36,19 @@ ROTATION = (
 """Each element of the matrix, row by row, of a unit quaternion times itself."""
 
 
+def constant(values: tuple[float, ...], like: Tensor) -> Tensor:
+    """Return numbers as a vector of the type and on the device of another tensor; do not write to it.
+
+    It is made once, so that a step on a GPU copies no number there.
+    """
+    return _constant(values, like.device, like.dtype)
+
+
+@cache
+def _constant(values: tuple[float, ...], device: torch.device, dtype: torch.dtype) -> Tensor:
+    return torch.tensor(values, device=device, dtype=dtype)
+
+
 @cache
 def _table(sums: tuple[str, ...], device: torch.device, dtype: torch.dtype) -> Tensor:
     """Return signs of the products in each sum, [16, sums]."""
@@ -81,7 +94,7 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
 def rigid(rotation: Tensor, translation: Tensor) -> Tensor:
     """Return 4x4 matrices from a linear part and a translation, [..., 3, 3] and [..., 3] -> [..., 4, 4]."""
     top = torch.cat((rotation, translation[..., None]), dim=-1)
-    bottom = top.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(*top.shape[:-2], 1, 4)
+    bottom = constant((0.0, 0.0, 0.0, 1.0), top).expand(*top.shape[:-2], 1, 4)
     return torch.cat((top, bottom), dim=-2)
 
 
@@ -117,12 +130,12 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
 
 def mirror_points(points: Tensor) -> Tensor:
     """Return S x: points in the object frame reflected in x = 0, [..., 3]."""
-    return points * points.new_tensor((-1.0, 1.0, 1.0))
+    return points * constant((-1.0, 1.0, 1.0), points)
 
 
 def mirror_quats(quats: Tensor) -> Tensor:
     """Return the orientation of a reflected Gaussian: S R S, (w, x, y, z) -> (w, x, -y, -z), [..., 4]."""
-    return quats * quats.new_tensor((1.0, 1.0, -1.0, -1.0))
+    return quats * constant((1.0, 1.0, -1.0, -1.0), quats)
 
 
 def mirror_matrix(matrix: Tensor) -> Tensor:

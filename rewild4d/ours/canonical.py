@@ -11,7 +11,7 @@ from rewild4d.harmonics import C0, basis, rotated
 from rewild4d.ours.config import Canonical
 from rewild4d.ours.fused.harmonics import COLORS, seen_rgb
 from rewild4d.priors.motion import SurfaceSample, quats_from_normals, sample_surface, surface_vertices
-from rewild4d.transforms import quat_multiply, quat_to_matrix
+from rewild4d.transforms import constant, quat_multiply, quat_to_matrix
 from rewild4d.types import OBJECT_DIAGONAL, Prior, Splats
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "colors")
@@ -95,7 +95,7 @@ class Gaussians(nn.Module):
     def rotations_to(self, quats: Tensor) -> Tensor:
         """Return each Gaussian's rotation from rest to an orientation, [n, 4] -> [n, 3, 3]."""
         rest = normalize(self.quats.detach(), dim=-1)
-        return quat_to_matrix(quat_multiply(quats, rest * rest.new_tensor((1.0, -1.0, -1.0, -1.0))))
+        return quat_to_matrix(quat_multiply(quats, rest * constant((1.0, -1.0, -1.0, -1.0), rest)))
 
     def splat_colors(self, quats: Tensor) -> Tensor:
         """Return RGB or coefficients in the frame of unit ``quats`` [n, 4] for `Splats`, [n, (degree + 1)^2, 3]."""

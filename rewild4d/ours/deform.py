@@ -10,6 +10,7 @@ from rewild4d.ours.config import Deform as DeformConfig
 from rewild4d.ours.fused.deformation import DEFORMATION, deform
 from rewild4d.ours.fused.folding import Layers, fold
 from rewild4d.ours.fused.queries import Scales
+from rewild4d.ours.inputs import Scalar
 from rewild4d.ours.pose import seed_linears
 from rewild4d.transforms import quat_multiply
 from rewild4d.types import OBJECT_DIAGONAL
@@ -48,7 +49,7 @@ class DeformNetwork(nn.Module):
         weights: Tensor,
         anchors: Tensor | None,
         posed: Posed,
-        strength: float,
+        strength: Scalar,
         offset: float = 0.0,
     ) -> Posed:
         """Deform skinned Gaussians.
@@ -105,7 +106,7 @@ class DeformNetwork(nn.Module):
         return asked * size**-0.5, bias * size**-0.5, mixed
 
     def _fused(
-        self, features: Tensor, weights: Tensor, anchors: Tensor | None, posed: Posed, strength: float, offset: float
+        self, features: Tensor, weights: Tensor, anchors: Tensor | None, posed: Posed, strength: Scalar, offset: float
     ) -> tuple[Tensor, Tensor, Tensor]:
         config = self.config
         layers = (self.query, self.skip, self.key, self.value, self.project, self.up, self.down, self.out)

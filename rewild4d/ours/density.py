@@ -42,7 +42,7 @@ class DensityControl:
         grad_norms = info.means2d.grad[0].norm(dim=-1) * (side / 2)
         self.gradient += torch.where(drawn, grad_norms, 0.0)
         self.seen += drawn
-        self.radius = torch.maximum(self.radius, radii / longest)
+        torch.maximum(self.radius, radii / longest, out=self.radius)
 
     def round_if_due(
         self, index: int, total: int, gaussians: Gaussians, optimizer: Optimizer, generator: torch.Generator

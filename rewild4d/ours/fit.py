@@ -13,9 +13,11 @@ from rewild4d.ours.checkpoint import fit_digest, load_checkpoint
 from rewild4d.ours.coloring import initial_colors
 from rewild4d.ours.config import Config
 from rewild4d.ours.deform import Posed
-from rewild4d.ours.gradients import all_finite, clip_gradients, require_finite
+from rewild4d.ours.gradients import all_finite, clip_gradients, norm_of, require_finite, scale_gradients
+from rewild4d.ours.graphs import CudaRecorder, StepGraphs, can_record
+from rewild4d.ours.inputs import StepInput
 from rewild4d.ours.losses.images import WINDOW, colour_losses, silhouette_loss, union_window
-from rewild4d.ours.losses.regularizers import compact_loss, neighbours, rigid_loss, smooth_loss
+from rewild4d.ours.losses.regularizers import compact_loss, neighbours, random_direction, rigid_loss, smooth_loss
 from rewild4d.ours.losses.skeleton import neighbour_keys, posture
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.pose import blend_poses, pose_distance
@@ -25,6 +27,9 @@ from rewild4d.ours.training import GaussianTraining, run_steps
 from rewild4d.ours.warmup import WarmUp
 from rewild4d.rasterizer import RasterInfo, rasterize
 from rewild4d.types import Clip, Prior
+
+CLIPPED = ("pose", "deform")
+"""Groups whose gradients are clipped."""
 
 
 class Training(GaussianTraining):
@@ -42,6 +47,11 @@ class Training(GaussianTraining):
         }
         model.field.logits.requires_grad_(config.skinning.learn)
         super().__init__(model, groups, config, supervision, generator)
+        self.graphs = StepGraphs(self, CudaRecorder(model.pivots.device)) if can_record(model.pivots.device) else None
+
+    def step(self, index: int) -> dict[str, float]:
+        """Take one step, from graphs where the model is on a GPU that records them."""
+        return super().step(index) if self.graphs is None else self.graphs.step(index)
 
     def rate(self, name: str, progress: float) -> float:
         rates = self.config.rates
@@ -49,23 +59,57 @@ class Training(GaussianTraining):
         return exponential(first, last, progress) * ramp(progress, 0.0, rates.rise)
 
     def drawn_losses(self, index: int) -> tuple[dict[str, Tensor], RasterInfo | None, Target]:
+        self.prepare()
+        given = self.drawn_input(index)
+        return *self.losses_of(given), given.target
+
+    def drawn_input(self, index: int) -> StepInput:
+        """Draw a view and all else that a step takes."""
         key = self.supervision.draw(self.generator, self.config.mirrored, self.config.cameras)
-        target = self.supervision.target(key)
-        return *self.losses(key, target, index), target
+        return self.input(key, self.supervision.target(key), index)
 
     def losses(self, key: Key, target: Target, index: int) -> tuple[dict[str, Tensor], RasterInfo | None]:
         """Compute all weighted losses of a view at an iteration, and the render info of the deformed branch."""
-        config, model = self.config, self.model
-        progress = index / config.iterations
-        keys, own, gaps = neighbour_keys([key], self.supervision.positions, config.geometry)
-        poses = model.pose(self._times(keys, progress), keys)
-        network_pose = poses
-        if config.prior.blend:
-            prior_pose = self.supervision.prior_pose(keys)
-            poses = blend_poses(poses, *prior_pose, fade(progress, config.prior.blend_until))
-        pose, transforms, skeleton = posture(model, poses, own, config.geometry, gaps)
+        self.prepare()
+        return self.losses_of(self.input(key, target, index))
+
+    def input(self, key: Key, target: Target, index: int) -> StepInput:
+        """Draw and schedule what a step with a view takes; all but the target's images are on the CPU."""
+        config, supervision = self.config, self.supervision
+        progress, geometry = index / config.iterations, config.geometry
+        keys, own, gaps = neighbour_keys([key], supervision.positions, geometry)
+        codes, flipped = self.model.codes(self._times(keys, progress), keys)
+        blend = fade(progress, config.prior.blend_until) if config.prior.blend else 0.0
+        pull = config.prior.pull * fade(progress, config.prior.pull_until)
+        deform, background = config.deform, torch.ones(3)
+        offset = float(torch.rand((), generator=self.generator)) if deform.sampled else 0.0
+        if config.loss.random_background:
+            background = torch.rand(3, generator=self.generator)
+        acts = index < geometry.until * config.iterations
+        smooths = acts and geometry.smooth > 0 and index % geometry.smooth_every == 0
+        return StepInput(
+            target, target.eye, codes, flipped, torch.tensor(own), gaps,
+            prior_pose=supervision.prior_pose(keys),
+            blend=blend or None,
+            pull=pull or None,
+            ramp=(deform.enabled and ramp(progress, deform.ramp_start, deform.ramp_end)) or None,
+            offset=offset,
+            background=background,
+            direction=random_direction(self.generator) if smooths else None,
+            degree=min(config.canonical.sh_degree, int(progress / config.canonical.sh_every)),
+            varies=acts and config.skinning.learn and geometry.tv > 0 and index % geometry.tv_every == 0,
+            compacts=acts and geometry.compact > 0 and index % geometry.compact_every == 0,
+        )  # fmt: skip
+
+    def losses_of(self, given: StepInput) -> tuple[dict[str, Tensor], RasterInfo | None]:
+        """Compute all weighted losses of an input, and the render info of the deformed branch; draw nothing."""
+        config, model, target = self.config, self.model, given.target
+        poses = network_pose = model.pose_of(given.codes, given.flipped)
+        if given.blend is not None:
+            poses = blend_poses(poses, *given.prior_pose, given.blend)
+        pose, transforms, skeleton = posture(model, poses, given.row, config.geometry, given.gaps)
         probabilities = model.field.probabilities()
-        delta = config.geometry.tv_delta if self._varies(index) else None
+        delta = config.geometry.tv_delta if given.varies else None
         weights, variation = model.field.sample_and_vary(probabilities, model.gaussians.means, delta)
         opacities = model.gaussians.opacities()
 
@@ -73,22 +117,17 @@ class Training(GaussianTraining):
         _, pose_alpha, _ = self._render(
             live, opacities.detach(), opacities.new_zeros(len(opacities), 1), target, detach_scales=True
         )
-        strength = ramp(progress, config.deform.ramp_start, config.deform.ramp_end)
-        offset = float(torch.rand((), generator=self.generator)) if config.deform.sampled else 0.0
-        deformed = model.deformed(pose, weights, posed, strength, offset)
-        degree = min(config.canonical.sh_degree, int(progress / config.canonical.sh_every))
-        colors = model.gaussians.seen_rgb(deformed.means, deformed.quats, target.eye, degree)
+        deformed = model.deformed(pose, weights, posed, given.ramp, given.offset)
+        colors = model.gaussians.seen_rgb(deformed.means, deformed.quats, given.eye, given.degree)
         rgb, alpha, info = self._render(deformed, opacities, colors, target)
 
-        losses = self._image_losses(pose_alpha, rgb, alpha, target)
-        if config.prior.pull and progress < config.prior.pull_until:
-            apart = pose_distance(network_pose, *self.supervision.prior_pose(keys))
-            losses["prior"] = config.prior.pull * fade(progress, config.prior.pull_until) * apart
+        losses = self._image_losses(pose_alpha, rgb, alpha, target, given.background)
+        if given.pull is not None:
+            losses["prior"] = given.pull * pose_distance(network_pose, *given.prior_pose)
         losses["skeleton"] = skeleton
         if delta is not None:
             losses["tv"] = config.geometry.tv * config.geometry.tv_every * variation
-        losses |= self._geometry_losses(index, weights, opacities, posed, deformed)
-        return losses, info
+        return losses | self._geometry_losses(given, weights, opacities, posed, deformed), info
 
     def _times(self, keys: list[Key], progress: float) -> Tensor:
         """Return times for the code, jittered early on by a share of a frame that neighbours share."""
@@ -107,12 +146,13 @@ class Training(GaussianTraining):
         )  # fmt: skip
         return image[0], alpha[0], info
 
-    def _image_losses(self, pose_alpha: Tensor, rgb: Tensor, alpha: Tensor, target: Target) -> dict[str, Tensor]:
+    def _image_losses(
+        self, pose_alpha: Tensor, rgb: Tensor, alpha: Tensor, target: Target, background: Tensor
+    ) -> dict[str, Tensor]:
         """Compute L_pose and L_deform of one view."""
         weights = self.config.loss
         window = union_window([pose_alpha, alpha, target.mask], WINDOW - 1)
-        background = torch.rand(3, generator=self.generator).to(rgb) if weights.random_background else rgb.new_ones(3)
-        l1, dissimilarity = colour_losses(rgb, alpha, target, background, window)
+        l1, dissimilarity = colour_losses(rgb, alpha, target, background.to(rgb), window)
         return {
             "pose_silhouette": weights.pose_silhouette * silhouette_loss(pose_alpha, target, window),
             "l1": weights.l1 * l1,
@@ -120,37 +160,51 @@ class Training(GaussianTraining):
             "silhouette": weights.silhouette * silhouette_loss(alpha, target, window),
         }
 
-    def _varies(self, index: int) -> bool:
-        """Tell whether the total variation of the skinning field counts in this step."""
-        config = self.config.geometry
-        lasts = index < config.until * self.config.iterations and self.config.skinning.learn
-        return lasts and config.tv > 0 and index % config.tv_every == 0
-
     def _geometry_losses(
-        self, index: int, weights: Tensor, opacities: Tensor, posed: Posed, deformed: Posed
+        self, given: StepInput, weights: Tensor, opacities: Tensor, posed: Posed, deformed: Posed
     ) -> dict[str, Tensor]:
-        """Compute compactness and smoothness while they last, and neighbour rigidity."""
+        """Compute compactness and smoothness where they act, and neighbour rigidity."""
         config, own = self.config.geometry, self.model.gaussians
         losses: dict[str, Tensor] = {}
-        if index < config.until * self.config.iterations:
-            if config.compact and index % config.compact_every == 0:
-                both = compact_loss((own.means, posed.means), weights, config.compact_alpha)
-                losses["compact"] = config.compact * config.compact_every * both
-            if config.smooth and index % config.smooth_every == 0:
-                smooth = smooth_loss(deformed, opacities, config.smooth_size, self.generator)
-                losses["smooth"] = config.smooth * config.smooth_every * smooth
+        if given.compacts:
+            both = compact_loss((own.means, posed.means), weights, config.compact_alpha)
+            losses["compact"] = config.compact * config.compact_every * both
+        if given.direction is not None:
+            smooth = smooth_loss(deformed, opacities, config.smooth_size, given.direction)
+            losses["smooth"] = config.smooth * config.smooth_every * smooth
         if config.rigid and len(own) > 1:
-            if self.near is None:
-                self.near = neighbours(own.means, config.rigid_neighbours)
+            assert self.near is not None, "`prepare` comes first"
             losses["rigid"] = config.rigid * rigid_loss(own.means, deformed.means, self.near)
         if config.steady:
             losses["steady"] = config.steady * (deformed.log_scales - posed.log_scales).square().mean()
         return losses
 
+    def change_density(self, index: int) -> bool:
+        changed = super().change_density(index)
+        if changed and self.graphs is not None:
+            self.graphs.forget()
+        return changed
+
+    def prepare(self) -> None:
+        """Search each Gaussian's neighbours, where a loss needs them and the set of Gaussians changed."""
+        if self.config.geometry.rigid and len(self.model.gaussians) > 1 and self.near is None:
+            self.near = neighbours(self.model.gaussians.means, self.config.geometry.rigid_neighbours)
+
+    def limited(self) -> Tensor:
+        """Clip the networks' gradients as `check_gradients` does, without a look at a number; return whether all
+        gradients are finite, a number, scalar."""
+        limit, norms = self.config.rates.clip or math.inf, []
+        for parameters in (*self.groups.values(), list(self.model.gaussians.parameters())):
+            norms.append(norm_of(parameters))
+        for name, norm in zip(self.groups, norms, strict=False):
+            if name in CLIPPED and math.isfinite(limit):
+                scale_gradients(self.groups[name], (limit / (norm + 1e-6)).clamp(max=1.0))
+        return torch.stack(norms).isfinite().all().to(norms[0])
+
     def check_gradients(self, index: int) -> None:
         """Clip the networks' gradients; raise a FloatingPointError where a gradient is not finite."""
         limit = self.config.rates.clip or math.inf
-        norms = [clip_gradients(self.groups[name], limit) for name in ("pose", "deform")]
+        norms = [clip_gradients(self.groups[name], limit) for name in CLIPPED]
         if not all(map(math.isfinite, norms)) or not all_finite(list(self.model.gaussians.parameters())):
             require_finite(self.model, index)
 

@@ -24,6 +24,19 @@ def clip_gradients(parameters: list[nn.Parameter], limit: float) -> float:
     return norm
 
 
+def norm_of(parameters: list[nn.Parameter]) -> Tensor:
+    """Return the norm of all gradients together, scalar; not finite where one is not; no look at a number."""
+    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    norms = torch._foreach_norm(gradients) if gradients else [parameters[0].new_zeros(())]
+    return torch.stack(list(norms)).norm()
+
+
+def scale_gradients(parameters: list[nn.Parameter], factor: Tensor) -> None:
+    """Multiply all gradients by a scalar."""
+    if gradients := [parameter.grad for parameter in parameters if parameter.grad is not None]:
+        torch._foreach_mul_(gradients, factor)
+
+
 def all_finite(parameters: list[nn.Parameter]) -> bool:
     """Tell whether all gradients are finite."""
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
@@ -45,4 +58,4 @@ def _norm(gradients: list[Tensor]) -> float:
 
 
 def _flat(gradients: list[Tensor]) -> Tensor:
-    return torch.cat([gradient.flatten() for gradient in gradients])
+    return torch.cat([gradient.flatten() for gradient in gradients]) if gradients else torch.zeros(1)

@@ -7,6 +7,7 @@ from rewild4d.ours.canonical import Gaussians, initial_gaussians
 from rewild4d.ours.config import Config
 from rewild4d.ours.deform import DeformNetwork, Posed
 from rewild4d.ours.fused.skinning import SKINNING, skin_both
+from rewild4d.ours.inputs import Scalar
 from rewild4d.ours.pose import Pose, PoseNetwork, joint_transforms, time_code
 from rewild4d.ours.skinning import SkinningField, build_field
 from rewild4d.ours.symmetry import Key
@@ -49,15 +50,22 @@ class Model(nn.Module):
 
     def pose(self, times: Tensor, keys: list[Key]) -> Pose:
         """Compute poses of views at (jittered) times (i + 1) / T, [B]; where tied, mirror images share a pose."""
+        codes, flipped = self.codes(times, keys)
+        return self.pose_of(codes.to(self.pivots), flipped.to(self.pivots.device))
+
+    def codes(self, times: Tensor, keys: list[Key]) -> tuple[Tensor, Tensor]:
+        """Return time codes [B, E] of views at times [B], and which of them are mirror images, boolean, [B]."""
         config = self.config.pose
-        if config.tied:
-            ones = torch.ones(len(keys))
-            code = time_code(times, ones, ones, config.frequencies, config.explicit_group).to(self.pivots)
-            return self.network(code, [key.view < 0 for key in keys], self.mirror)
         view = torch.tensor([float(key.view) for key in keys])
         group = torch.tensor([float(key.group) for key in keys])
         sign = group if config.encoding == "group" else view
-        return self.network(time_code(times, sign, view, config.frequencies, config.explicit_group).to(self.pivots))
+        if config.tied:
+            sign = view = torch.ones(len(keys))
+        return time_code(times, sign, view, config.frequencies, config.explicit_group), view < 0
+
+    def pose_of(self, codes: Tensor, flipped: Tensor) -> Pose:
+        """Compute poses of time codes [B, E]; where tied, those of mirror images are mirrored by ``flipped`` [B]."""
+        return self.network(codes, flipped, self.mirror) if self.config.pose.tied else self.network(codes)
 
     def transforms(self, pose: Pose) -> Tensor:
         """Return rest -> posed transforms of a batch of poses, [B, J, 4, 4]."""
@@ -80,9 +88,12 @@ class Model(nn.Module):
         )
         return live, still if self.config.loss.isolated else live
 
-    def deformed(self, pose: Pose, weights: Tensor, posed: Posed, strength: float, offset: float = 0.0) -> Posed:
-        """Apply the deformation network to skinned Gaussians at a pose of one code; see `DeformNetwork.forward`."""
-        if strength == 0 or not self.config.deform.enabled:
+    def deformed(
+        self, pose: Pose, weights: Tensor, posed: Posed, strength: Scalar | None, offset: float = 0.0
+    ) -> Posed:
+        """Apply the deformation network to skinned Gaussians at a pose of one code, with a ``strength`` above zero, or
+        None for none; see `DeformNetwork.forward`."""
+        if strength is None or not self.config.deform.enabled:
             return posed
         features = pose.features[0].detach() if self.config.deform.detach_features else pose.features[0]
         return self.deform(features, weights, self.network.anchors, posed, strength, offset)
@@ -90,7 +101,7 @@ class Model(nn.Module):
     def moved(self, pose: Pose, weights: Tensor, strength: float) -> tuple[Posed, Posed]:
         """Return skinned Gaussians of the appearance branch at a pose of one code, and the same deformed."""
         posed = self.skin(weights, pose.quats[0], self.transforms(pose)[0])[1]
-        return posed, self.deformed(pose, weights, posed, strength)
+        return posed, self.deformed(pose, weights, posed, strength or None)
 
 
 def build_model(config: Config, prior: Prior, generator: torch.Generator) -> Model:

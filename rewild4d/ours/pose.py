@@ -1,6 +1,5 @@
 """Part anchors, the symmetry-aware time code and the pose network."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +9,7 @@ from torch import Tensor, nn
 from rewild4d.ours.config import Pose as PoseConfig
 from rewild4d.ours.fused.pose_layers import fits_sizes, sizes_of
 from rewild4d.ours.fused.posing import POSE_NETWORK, codes, poses
-from rewild4d.transforms import mirror_points, mirror_quats, quat_to_matrix, rigid
+from rewild4d.transforms import constant, mirror_points, mirror_quats, quat_to_matrix, rigid
 from rewild4d.types import OBJECT_DIAGONAL
 
 
@@ -86,7 +85,7 @@ class PoseNetwork(nn.Module):
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
 
-    def forward(self, code: Tensor, flipped: Sequence[bool] | None = None, mirror: Tensor | None = None) -> Pose:
+    def forward(self, code: Tensor, flipped: Tensor | None = None, mirror: Tensor | None = None) -> Pose:
         """Compute poses of codes [B, E], with left and right exchanged by ``mirror`` [J] where ``flipped`` [B]."""
         if (
             self.anchors is not None
@@ -98,10 +97,10 @@ class PoseNetwork(nn.Module):
         pose = self._plain(code)
         if flipped is None or mirror is None:
             return pose
-        pick = torch.tensor(flipped, device=code.device)[:, None, None]
+        pick = flipped[:, None, None]
         return Pose(*(torch.where(pick, other, own) for own, other in zip(pose, pose.mirrored(mirror), strict=True)))
 
-    def _fused(self, anchors: Tensor, code: Tensor, flipped: Sequence[bool] | None, mirror: Tensor | None) -> Pose:
+    def _fused(self, anchors: Tensor, code: Tensor, flipped: Tensor | None, mirror: Tensor | None) -> Pose:
         config, (joints, anchor) = self.config, anchors.shape
         # The modules' own generator of parameters takes longer than a layer.
         layers = (each for layer in self._layers for each in layer._parameters.values() if each is not None)
@@ -110,7 +109,7 @@ class PoseNetwork(nn.Module):
         sizes = sizes_of(joints, anchor, anchor + code.shape[1], *network, len(code))
         if flipped is None or mirror is None:
             return Pose(*poses(sizes, parameters, code, np.zeros(len(code), np.bool_), np.arange(joints)))
-        return Pose(*poses(sizes, parameters, code, np.array(flipped), mirror.numpy()))
+        return Pose(*poses(sizes, parameters, code, flipped.numpy(), mirror.numpy()))
 
     def _plain(self, code: Tensor) -> Pose:
         hidden = self._tokens(code)
@@ -118,7 +117,7 @@ class PoseNetwork(nn.Module):
             hidden = block(hidden)
         features = self.norm(hidden)
         out = self.head(features)
-        identity = out.new_tensor((1.0, 0.0, 0.0, 0.0))
+        identity = constant((1.0, 0.0, 0.0, 0.0), out)
         quats = nn.functional.normalize(identity + out[..., :4], dim=-1)
         return Pose(quats, out[..., 4:] * (self.config.reach * OBJECT_DIAGONAL), features)
 
@@ -173,10 +172,8 @@ def joint_transforms(quats: Tensor, shifts: Tensor, pivots: Tensor) -> Tensor:
     return rigid(rotation, pivots + shifts - (rotation @ pivots[..., None])[..., 0])
 
 
-def blend_poses(pose: Pose, quats: Tensor, shifts: Tensor, weight: float) -> Pose:
+def blend_poses(pose: Pose, quats: Tensor, shifts: Tensor, weight: float | Tensor) -> Pose:
     """Blend (1 - weight) of a pose with weight of quats [B, J, 4] and shifts [B, J, 3], never as matrices."""
-    if weight == 0:
-        return pose
     mixed = (1 - weight) * pose.quats + weight * aligned(quats, pose.quats)
     return Pose(nn.functional.normalize(mixed, dim=-1), (1 - weight) * pose.shifts + weight * shifts, pose.features)
 

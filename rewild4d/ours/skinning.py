@@ -63,10 +63,11 @@ class SkinningField(nn.Module):
         part = position - base
         x, y, z = (torch.stack((1 - part[:, axis], part[:, axis]), dim=-1) for axis in range(3))
         factors = torch.einsum("na,nb,nc->nabc", x, y, z).flatten(1)
-        step = torch.tensor((self.resolution**2, self.resolution, 1), device=points.device)
         corners = torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3)
-        rows = ((base.long()[:, None] + corners) * step).sum(-1)
-        return nn.functional.embedding_bag(rows, probabilities, per_sample_weights=factors, mode="sum")
+        x, y, z = (base.long()[:, None] + corners).unbind(-1)
+        rows = (x * self.resolution + y) * self.resolution + z
+        chosen = probabilities.index_select(0, rows.flatten()).unflatten(0, rows.shape)
+        return torch.einsum("nk,nkj->nj", factors, chosen)
 
 
 def build_field(vertices: Tensor, weights: Tensor, mirror: Tensor, config: Skinning) -> SkinningField:

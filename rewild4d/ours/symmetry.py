@@ -50,7 +50,7 @@ class Target:
 
 
 class Supervision:
-    """All mirrored views of a clip with the prior's poses, on one device.
+    """All mirrored views of a clip, images on one device, with the prior's poses, on the CPU.
 
     Attributes:
         frames: number of frames T.
@@ -91,9 +91,9 @@ class Supervision:
                 self._targets[Key(group, view, index)] = Target(colour.contiguous(), matte.contiguous(), camera, side)
         chosen = torch.stack((prior.transforms[rows], prior.transforms_flip[rows])).float()
         pivots = prior.bones[:, 0].float()
-        self.prior_quats = matrix_to_quat(chosen[..., :3, :3]).to(device)
+        self.prior_quats = matrix_to_quat(chosen[..., :3, :3])
         moved = (chosen[..., :3, :3] @ pivots[..., None])[..., 0] + chosen[..., :3, 3]
-        self.prior_shifts = (moved - pivots).to(device)
+        self.prior_shifts = moved - pivots
 
     def target(self, key: Key) -> Target:
         """Return image, matte and camera of one view."""

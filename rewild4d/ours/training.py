@@ -53,8 +53,9 @@ class GaussianTraining(ABC):
         # The rate of the means is set at every step.
         rates = {name: 0.0 if name == "means" else getattr(config.rates, name) for name in NAMES}
         fixed = [{"params": [getattr(own, name)], "lr": rates[name]} for name in NAMES]
-        self.optimizer = Adam(fixed, eps=1e-15, fused=True)
-        self.others = Adam([{"params": group} for group in groups.values()], eps=1e-8, fused=True)
+        on_gpu = own.means.is_cuda  # where graphs may hold the updates
+        self.optimizer = Adam(fixed, eps=1e-15, fused=True, capturable=on_gpu)
+        self.others = Adam([{"params": group} for group in groups.values()], eps=1e-8, fused=True, capturable=on_gpu)
         self.density = DensityControl(config.density, len(own), own.means.device)
         self.near: Tensor | None = None
 
@@ -75,28 +76,60 @@ class GaussianTraining(ABC):
 
     def step(self, index: int) -> dict[str, float]:
         """Take one step; return the figures for the log."""
-        config, progress = self.config, index / self.config.iterations
-        first, last = config.rates.means
-        self.optimizer.param_groups[NAMES.index("means")]["lr"] = exponential(first, last, progress)
-        for name, group in zip(self.groups, self.others.param_groups, strict=True):
-            group["lr"] = self.rate(name, progress)
+        for group, rate in zip(self.rated(), self.step_rates(index), strict=True):
+            group["lr"] = rate
         losses, info, target = self.drawn_losses(index)
         values = torch.stack(list(losses.values()))
-        figures = dict(zip(losses, values.tolist(), strict=True))
-        for name, value in figures.items():
+        figures = self.checked(index, dict(zip(losses, values.tolist(), strict=True)))
+        self.backward(values)
+        self.check_gradients(index)
+        self.update(info if self.observes(index) else None, target)
+        self.change_density(index)
+        return self.logged(figures)
+
+    def rated(self) -> list[dict[str, Any]]:
+        """Return the optimizers' groups whose learning rates follow a schedule, in the order of `step_rates`."""
+        return [self.optimizer.param_groups[NAMES.index("means")], *self.others.param_groups]
+
+    def step_rates(self, index: int) -> list[float]:
+        """Return the learning rates of a step: of the means, then of `groups`."""
+        progress = index / self.config.iterations
+        return [exponential(*self.config.rates.means, progress), *(self.rate(name, progress) for name in self.groups)]
+
+    def checked(self, index: int, losses: dict[str, float]) -> dict[str, float]:
+        """Return the losses; raise a FloatingPointError where one is not finite."""
+        for name, value in losses.items():
             if not math.isfinite(value):
                 raise FloatingPointError(f"iteration {index}: loss '{name}' is not finite")
+        return losses
+
+    def backward(self, losses: Tensor) -> None:
+        """Compute the gradients of the sum of losses [k]."""
         self.optimizer.zero_grad(set_to_none=True)
         self.others.zero_grad(set_to_none=True)
-        values.sum().backward()
-        self.check_gradients(index)
-        if info is not None and progress < config.density.end:
+        losses.sum().backward()
+
+    def observes(self, index: int) -> bool:
+        """Tell whether the density control looks at a step's gradients."""
+        return index / self.config.iterations < self.config.density.end
+
+    def update(self, info: RasterInfo | None, target: Target) -> None:
+        """Show a render's ``info``, if any, to the density control, and follow the gradients."""
+        if info is not None:
             self.density.observe(info, target.side, max(target.camera.width, target.camera.height))
         self.optimizer.step()
         self.others.step()
-        if self.density.round_if_due(index, config.iterations, self.gaussians, self.optimizer, self.generator):
-            self.near = None
-        return {"loss": sum(figures.values()), "gaussians": len(self.gaussians)} | figures
+
+    def change_density(self, index: int) -> bool:
+        """Densify and prune if that is due after a step; tell whether it was."""
+        total = self.config.iterations
+        due = self.density.round_if_due(index, total, self.gaussians, self.optimizer, self.generator)
+        self.near = None if due else self.near
+        return due
+
+    def logged(self, losses: Mapping[str, float]) -> dict[str, float]:
+        """Return the figures for the log from a step's losses."""
+        return {"loss": sum(losses.values()), "gaussians": len(self.gaussians)} | dict(losses)
 
     def check_gradients(self, index: int) -> None:
         """Raise a FloatingPointError where a gradient is not finite."""
@@ -105,7 +138,7 @@ class GaussianTraining(ABC):
 
     def state(self) -> dict[str, Any]:
         """Return what a resumed fit needs beside the generator."""
-        optimizers = zip(self.SAVED, (self.optimizer.state_dict(), self.others.state_dict()), strict=True)
+        optimizers = zip(self.SAVED, map(_saved, (self.optimizer, self.others)), strict=True)
         others = {"density": self.density.state(), "near": self.near}
         return {"model": self.model.state_dict(), **dict(optimizers), **others}
 
@@ -119,9 +152,19 @@ class GaussianTraining(ABC):
         self.model.load_state_dict(state["model"])
         for name, optimizer in zip(self.SAVED, (self.optimizer, self.others), strict=True):
             optimizer.load_state_dict(state[name])
+            for group in optimizer.param_groups:
+                group["capturable"] = own.means.is_cuda
         self.density.restore(state["density"])
         # A new search would find neighbours of the present positions, not of those at the last change.
         self.near = state.get("near")
+
+
+def _saved(optimizer: Adam) -> dict[str, Any]:
+    """Return an optimizer's state with learning rates as numbers."""
+    state = optimizer.state_dict()
+    for group in state["param_groups"]:
+        group["lr"] = float(group["lr"])
+    return state
 
 
 def run_steps(

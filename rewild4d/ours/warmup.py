@@ -55,7 +55,7 @@ class WarmUp:
         if not copied:
             keys, own, gaps = neighbour_keys(keys, self.supervision.positions, self.config.geometry)
         pose = self.model.pose(self.supervision.code_times(keys), keys)
-        distance = pose_distance(pose, *self.supervision.prior_pose(keys))
+        distance = pose_distance(pose, *(part.to(pose.quats) for part in self.supervision.prior_pose(keys)))
         if copied:
             loss, figures = distance, {}
         else:

@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 from rewild4d.rasterizer import triton_blend, triton_project, triton_tiles
 from rewild4d.rasterizer.checks import check_values
 from rewild4d.rasterizer.conventions import Options, RasterInfo, RasterInput, Rendered, camera_gradients
+from rewild4d.rasterizer.rooms import take_room
 
 TILE, MOMENTS = triton_blend.SIDE.value, triton_blend.MOMENTS.value
 BLOCK, RECORD, CAMERA = triton_project.BLOCK.value, triton_project.RECORD.value, triton_project.CAMERA.value
@@ -54,10 +55,12 @@ def rasterize(given: RasterInput) -> Rendered:
         means2d, rests, records, radii, keys, wides, tiles = _Project.apply(given.options, shades, *inputs)
         if means2d.requires_grad:
             means2d.retain_grad()
-        lists = _list_tiles(keys, wides, tiles, views, across, down)
-        if lists is None:
+        ends = tiles.flatten().cumsum(0)
+        room = take_room(ends)
+        if room >= UNUSABLE:
             check_values(named)
             raise ValueError(f"expected fewer than {UNUSABLE} pairs of a Gaussian and a tile that it touches.")
+        lists = _list_tiles(keys, wides, tiles, ends, room, views, across, down)
         image, alpha = _Blend.apply(means2d, rests, records, features, background, lists, (width, height))
     return image, alpha, RasterInfo(radii, means2d)
 
@@ -118,8 +121,8 @@ class _TileLists(NamedTuple):
     Attributes:
         tiles: tiles across and down.
         starts: first index in ``entries`` of the list of each tile of each view, and their end, [V * tiles + 1].
-        entries: rows, tile by tile, nearest first, [E].
-        slots: each entry's index in an order by rows, [E].
+        entries: rows, tile by tile, nearest first, [room].
+        slots: each entry's index in an order by rows, [room].
         counts: entries of each row, [V, N].
         ends: their running sum, [V * N].
     """
@@ -133,29 +136,29 @@ class _TileLists(NamedTuple):
 
 
 @torch.no_grad()
-def _list_tiles(keys: Tensor, wides: Tensor, counts: Tensor, views: int, across: int, down: int) -> _TileLists | None:
-    """Repeat each row over its rectangle of tiles, and sort by tile, then depth, then row; None if any is unusable.
+def _list_tiles(
+    keys: Tensor, wides: Tensor, counts: Tensor, ends: Tensor, room: int, views: int, across: int, down: int
+) -> _TileLists:
+    """Repeat each row over its rectangle of tiles, and sort by tile, then depth, then row.
 
     Args:
         keys: of the first tile of each row, see `triton_project.project`, [V, N].
         wides, counts: tiles across and of each rectangle, [V, N].
+        ends: running sum of the counts, [V * N].
+        room: pairs of a row and a tile that there is room for.
         views: V.
         across, down: tiles across and down an image.
     """
     rows, number = counts.numel(), views * across * down + 1
-    ends = counts.flatten().cumsum(0)
-    total = int(ends[-1]) if rows else 0
-    if total >= UNUSABLE:
-        return None
-    entry_keys, owners = keys.new_empty(total), counts.new_empty(total)
-    triton_tiles.list_entries[(triton.cdiv(total, ENTRIES),)](
-        ends, counts, wides, keys, entry_keys, owners, total, rows, rows.bit_length(), across,
+    entry_keys, owners = keys.new_empty(room), counts.new_empty(room)
+    triton_tiles.list_entries[(triton.cdiv(room, ENTRIES),)](
+        ends, counts, wides, keys, entry_keys, owners, room, rows, rows.bit_length(), across,
         **LAUNCHES["list_entries"],
     )  # fmt: skip
     entry_keys, slots = entry_keys.sort(stable=True)
     entries, starts = torch.empty_like(owners), keys.new_empty(number)
-    triton_tiles.start_tiles[(triton.cdiv(max(total, number), ENTRIES),)](
-        entry_keys, slots, owners, entries, starts, total, number, total.bit_length(), **LAUNCHES["start_tiles"]
+    triton_tiles.start_tiles[(triton.cdiv(max(room, number), ENTRIES),)](
+        entry_keys, slots, owners, entries, starts, room, number, room.bit_length(), **LAUNCHES["start_tiles"]
     )
     return _TileLists((across, down), starts, entries, slots, counts, ends)
 
@@ -195,7 +198,7 @@ class _Blend(torch.autograd.Function):
                 width, height, *lists.tiles, count, CHANNELS=channels, **LAUNCHES["blend_backward"],
             )  # fmt: skip
             triton_tiles.gather[(triton.cdiv(count, OWNERS), triton.cdiv(channels, part))](
-                lists.ends, lists.counts, sums, records, *gradients, views, count,
+                lists.ends, lists.counts, sums, records, *gradients, len(lists.slots), views, count,
                 CHANNELS=channels, PART=part, **LAUNCHES["gather"],
             )  # fmt: skip
         v_background = (g_image * (1 - alpha)).sum(dim=(2, 3)) if ctx.needs_input_grad[4] else None

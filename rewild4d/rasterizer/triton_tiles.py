@@ -17,21 +17,25 @@ ROWS = tl.constexpr(4)
 
 _LN2 = tl.constexpr(math.log(2.0))
 
-SIZES = ["total", "rows", "steps", "across", "views", "count", "number"]
+LAST = tl.constexpr((1 << 63) - 1)
+"""Key of room that no entry takes; it sorts behind all others."""
+
+SIZES = ["room", "rows", "steps", "across", "views", "count", "number"]
 
 
 @triton.jit(do_not_specialize=SIZES)
 def list_entries(
     ends: tl.tensor, tiles: tl.tensor, wides: tl.tensor, first_keys: tl.tensor, keys: tl.tensor, owners: tl.tensor,
-    total: tl.tensor, rows: tl.tensor, steps: tl.tensor, across: tl.tensor,
+    room: tl.tensor, rows: tl.tensor, steps: tl.tensor, across: tl.tensor,
 ) -> None:  # fmt: skip
-    """Fill keys and owners [E] with each row's rectangle of tiles, row after row; program (block).
+    """Fill keys and owners [room] with each row's rectangle of tiles, row after row, then `LAST`; program (block).
 
     A row is a view and a Gaussian, view * N + Gaussian. ``ends`` [rows] is the running sum of ``tiles``; each entry
-    finds its row by binary search in ``steps`` steps.
+    finds its row by binary search in ``steps`` steps. Entries beyond the room are left out.
     """
     entry = tl.program_id(0).to(tl.int64) * ENTRIES + tl.arange(0, ENTRIES)
-    real = entry < total
+    within = entry < room
+    real = within & (entry < tl.load(ends + rows - 1))
     low = tl.zeros((ENTRIES,), tl.int32)
     high = low + rows - 1
     for _ in range(steps):
@@ -41,24 +45,24 @@ def list_entries(
     rank = (entry - tl.load(ends + low, real, 0)).to(tl.int32) + tl.load(tiles + low, real, 1)
     wide = tl.load(wides + low, real, 1)
     step = (rank // wide * across + rank % wide).to(tl.int64)
-    tl.store(keys + entry, tl.load(first_keys + low, real, 0) + (step << DEPTH_BITS), real)
-    tl.store(owners + entry, low, real)
+    tl.store(keys + entry, tl.where(real, tl.load(first_keys + low, real, 0) + (step << DEPTH_BITS), LAST), within)
+    tl.store(owners + entry, tl.where(real, low, 0), within)
 
 
 @triton.jit(do_not_specialize=SIZES)
 def start_tiles(
-    keys: tl.tensor, slots: tl.tensor, owners: tl.tensor, entries: tl.tensor, starts: tl.tensor, total: tl.tensor,
+    keys: tl.tensor, slots: tl.tensor, owners: tl.tensor, entries: tl.tensor, starts: tl.tensor, room: tl.tensor,
     number: tl.tensor, steps: tl.tensor,
 ) -> None:  # fmt: skip
-    """Fill entries [E], the owners in the order of the sorted keys, and starts [tiles + 1]; program (block).
+    """Fill entries [room], the owners in the order of the sorted keys, and starts [tiles + 1]; program (block).
 
     Each of ``number`` starts is the index of the first key that is not before its tile, found by binary search.
     """
     index = tl.program_id(0).to(tl.int64) * ENTRIES + tl.arange(0, ENTRIES)
-    real = index < total
+    real = index < room
     tl.store(entries + index, tl.load(owners + tl.load(slots + index, real, 0), real, 0), real)
     low = tl.zeros((ENTRIES,), tl.int64)
-    high = low + total
+    high = low + room
     for _ in range(steps):
         middle = (low + high) // 2
         before = (low < high) & (tl.load(keys + middle, low < high, 0) < (index << DEPTH_BITS))
@@ -69,9 +73,9 @@ def start_tiles(
 @triton.jit(do_not_specialize=SIZES)
 def gather(
     ends: tl.tensor, tiles: tl.tensor, sums: tl.tensor, records: tl.tensor, v_means2d: tl.tensor, v_records: tl.tensor,
-    v_features: tl.tensor, views: tl.tensor, count: tl.tensor, CHANNELS: tl.constexpr, PART: tl.constexpr,
+    v_features: tl.tensor, room: tl.tensor, views: tl.tensor, count: tl.tensor, CHANNELS: tl.constexpr, PART: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Add a Gaussian's rows of the sums [E, 6 + C]; program (block, part of the channels).
+    """Add a Gaussian's rows of the sums [room, 6 + C]; program (block, part of the channels).
 
     Fills v_means2d [V, N, 2] and v_records [V, N, 4] (see triton_project.py) and v_features [N, C], over all views.
     """
@@ -82,7 +86,8 @@ def gather(
     for view in range(views):
         row = view * count + n
         end = tl.load(ends + row, real, 0)
-        place = end - tl.load(tiles + row, real, 0)
+        place = tl.maximum(end - tl.load(tiles + row, real, 0), 0)
+        end = tl.minimum(end, room)
         none = tl.zeros((OWNERS,), tl.float32)
         m, mt, mu, mtt, mtu, muu = none, none, none, none, none, none
         while tl.max(end - place, 0) > 0:

@@ -54,7 +54,7 @@ def model(dtype: torch.dtype = torch.float32, pose: PoseConfig = SMALL) -> Model
     ],
 )
 def test_poses(batch: int, joints: int, config: PoseConfig) -> None:
-    flipped = [i % 2 == 1 for i in range(batch)]
+    flipped = torch.arange(batch) % 2 == 1
     mirror = torch.arange(joints).flip(0)
 
     def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
@@ -142,7 +142,7 @@ def test_posture(batch: int, rows: list[int], only: str | None) -> None:
 
     def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
         given = batch_of_poses(dtype, batch)
-        pose, transforms, total = posture(model(dtype), Pose(**given), rows, config, triples(batch))
+        pose, transforms, total = posture(model(dtype), Pose(**given), torch.tensor(rows, dtype=torch.long), config, triples(batch))
         return [*pose, transforms, total[None]], given
 
     check_twins(make)
@@ -151,15 +151,15 @@ def test_posture(batch: int, rows: list[int], only: str | None) -> None:
 def test_the_sum_alone_is_that_of_the_posture() -> None:
     own, pose, config = model(), Pose(**batch_of_poses(torch.float32, 3)), Geometry()
     alone = skeleton_losses(own, pose, own.transforms(pose), config, triples(3))
-    assert float(alone.detach()) == float(posture(own, pose, [1], config, triples(3))[2].detach()) > 0
+    assert float(alone.detach()) == float(posture(own, pose, torch.tensor([1]), config, triples(3))[2].detach()) > 0
 
 
 def test_only_neighbouring_frames_have_a_bend() -> None:
     own, pose = model(), Pose(**batch_of_poses(torch.float32, 3))
     config = Geometry(limit=0.0, attach=0.0, temporal=10.0, still=1.0)
     assert float(skeleton_losses(own, pose, own.transforms(pose), config, None).detach()) == 0
-    assert float(posture(own, pose, [0, 1, 2], config, None)[2].detach()) == 0  # three views of a clip of two frames
-    assert float(posture(own, pose, [1], config, triples(3))[2].detach()) > 0
+    assert float(posture(own, pose, torch.tensor([0, 1, 2]), config, None)[2].detach()) == 0  # three views of a clip of two frames
+    assert float(posture(own, pose, torch.tensor([1]), config, triples(3))[2].detach()) > 0
 
 
 def test_a_missing_frame_between_two_doubles_their_distance() -> None:
@@ -171,11 +171,11 @@ def test_a_missing_frame_between_two_doubles_their_distance() -> None:
     bend, drift = (
         Geometry(limit=0.0, attach=0.0, **{"temporal": 0.0, **one}) for one in ({"temporal": 1.0}, {"still": 1.0})
     )
-    assert float(posture(own, pose, [1], bend, gaps)[2]) == pytest.approx(0, abs=1e-12)
-    even = float(posture(own, pose, [1], bend, torch.ones_like(gaps))[2])
+    assert float(posture(own, pose, torch.tensor([1]), bend, gaps)[2]) == pytest.approx(0, abs=1e-12)
+    even = float(posture(own, pose, torch.tensor([1]), bend, torch.ones_like(gaps))[2])
     assert even == pytest.approx((3 - 2 * 1 + 0) ** 2 / OBJECT_DIAGONAL**2)
     step, scale = 1 / OBJECT_DIAGONAL, drift.still_step
-    assert float(posture(own, pose, [1], drift, gaps)[2]) == pytest.approx(scale * step**2 / (step**2 + scale**2))
+    assert float(posture(own, pose, torch.tensor([1]), drift, gaps)[2]) == pytest.approx(scale * step**2 / (step**2 + scale**2))
 
 
 def test_a_skeleton_without_parents_has_no_joints_to_hold() -> None:
@@ -183,7 +183,7 @@ def test_a_skeleton_without_parents_has_no_joints_to_hold() -> None:
     for dtype, leaf in given.items():
         own = model(dtype)
         own.parents.fill_(-1)
-        total = posture(own, Pose(**leaf), [1], Geometry(temporal=0.0), triples(3))[2]
+        total = posture(own, Pose(**leaf), torch.tensor([1]), Geometry(temporal=0.0), triples(3))[2]
         assert float(total.detach()) == 0, dtype
 
 
@@ -195,7 +195,7 @@ def test_attachment_of_a_shifted_joint() -> None:
     config = Geometry(limit=0.0, temporal=0.0, attach=2.0)
     bones = sum(parent >= 0 for parent in PARENTS)
     expected = 2.0 * (0.5 / OBJECT_DIAGONAL) ** 2 / bones
-    assert float(posture(own, pose, [0], config, None)[2]) == pytest.approx(expected, rel=1e-5)
+    assert float(posture(own, pose, torch.tensor([0]), config, None)[2]) == pytest.approx(expected, rel=1e-5)
 
 
 def test_what_drifts_costs_and_what_moves_is_left_alone() -> None:
@@ -209,7 +209,7 @@ def test_what_drifts_costs_and_what_moves_is_left_alone() -> None:
         moved[1:, 7, 1] = way * OBJECT_DIAGONAL
         moved.requires_grad_(True)
         total = posture(
-            own, Pose(quats, moved, torch.zeros(3, 20, 4)), [1], config, torch.ones(1, 2, dtype=torch.float64)
+            own, Pose(quats, moved, torch.zeros(3, 20, 4)), torch.tensor([1]), config, torch.ones(1, 2, dtype=torch.float64)
         )[2]
         total.backward()
         return float(total.detach()), -float(moved.grad[0, 7, 1]) * OBJECT_DIAGONAL
@@ -230,7 +230,7 @@ def test_a_bone_beyond_its_limit() -> None:
     config = Geometry(limit=1.0, limit_degrees=60.0, attach=0.0, temporal=0.0)
     bones = sum(parent >= 0 for parent in PARENTS)
     expected = (math.cos(math.radians(30)) - math.cos(half)) ** 2 / bones
-    assert float(posture(own, pose, [0], config, None)[2]) == pytest.approx(expected, rel=1e-4)
+    assert float(posture(own, pose, torch.tensor([0]), config, None)[2]) == pytest.approx(expected, rel=1e-4)
 
 
 def test_what_leaves_the_planes_along_the_body() -> None:
@@ -244,7 +244,7 @@ def test_what_leaves_the_planes_along_the_body() -> None:
         quats, shifts = rest.repeat(1, 20, 1), torch.zeros(1, 20, 3)
         quats[0, joint, 0], quats[0, joint, 1 + axis], shifts[0, joint, axis] = math.cos(half), math.sin(half), 0.5
         pose = Pose(-quats, shifts, torch.zeros(1, 20, 4))  # the same rotations
-        return float(posture(own, pose, [0], msgspec.structs.replace(flat, **weights), None)[2])
+        return float(posture(own, pose, torch.tensor([0]), msgspec.structs.replace(flat, **weights), None)[2])
 
     out = math.sin(half) ** 2
     assert [cost(foot, axis, limb_plane=3.0) for axis in range(3)] == pytest.approx(
@@ -257,7 +257,7 @@ def test_what_leaves_the_planes_along_the_body() -> None:
     turned = torch.tensor((math.cos(half), 0, math.sin(half), 0)).repeat(1, 20, 1)
     pose = Pose(turned, torch.zeros(1, 20, 3), torch.zeros(1, 20, 4))
     held = msgspec.structs.replace(flat, limb_plane=3.0)
-    assert float(posture(own, pose, [0], held, None)[2]) == pytest.approx(0, abs=1e-12)
+    assert float(posture(own, pose, torch.tensor([0]), held, None)[2]) == pytest.approx(0, abs=1e-12)
 
 
 @pytest.mark.parametrize("weight", [0.3, 1.0])

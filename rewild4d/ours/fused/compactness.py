@@ -16,7 +16,7 @@ from rewild4d.kernels.simd import LANES, fma, load, splat, store, take_ticket
 from rewild4d.kernels.switch import Kernel
 from rewild4d.kernels.threads import run_tickets
 
-COMPACTNESS = Kernel("compactness", "98fbbed85ba8", "rewild4d.ours.losses.regularizers:compact_loss")
+COMPACTNESS = Kernel("compactness", "9bdac47df8b9", "rewild4d.ours.losses.regularizers:compact_loss")
 
 CHUNK = 16 * BLOCK
 """Gaussians of a unit of work; sums run over units, so they do not depend on the number of threads."""

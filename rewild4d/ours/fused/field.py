@@ -17,7 +17,7 @@ from rewild4d.kernels.threads import run_tickets
 
 FIELD = Kernel(
     "skinning field",
-    "22cb95aaf892",
+    "da5c18ef1605",
     "rewild4d.ours.skinning:SkinningField.sample",
     "rewild4d.ours.skinning:SkinningField.sample_and_vary",
     "rewild4d.ours.losses.regularizers:tv_loss",

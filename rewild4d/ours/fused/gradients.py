@@ -13,7 +13,7 @@ from rewild4d.kernels.threads import run_tickets
 
 GRADIENTS = Kernel(
     "norms of gradients",
-    "31dcb7f87689",
+    "8b8939834425",
     "rewild4d.ours.gradients:clip_gradients",
     "rewild4d.ours.gradients:all_finite",
     "rewild4d.ours.gradients:_norm",

@@ -18,7 +18,7 @@ from rewild4d.ours.fused.quaternions import dot, times_back
 
 COLORS = Kernel(
     "colours from harmonics",
-    "7fcc9a0fde99",
+    "48244663e4ab",
     "rewild4d.ours.canonical:Gaussians.seen_rgb",
     "rewild4d.ours.canonical:Gaussians.rotations_to",
 )

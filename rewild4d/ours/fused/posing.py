@@ -20,7 +20,7 @@ from rewild4d.ours.fused.quaternions import unit, unit_grad
 
 POSE_NETWORK = Kernel(
     "pose network",
-    "29a72d89d910",
+    "d507591a9f4b",
     "rewild4d.ours.pose:PoseNetwork.__init__",
     "rewild4d.ours.pose:PoseNetwork._plain",
     "rewild4d.ours.pose:PoseNetwork.forward",

@@ -16,7 +16,7 @@ from rewild4d.kernels.switch import Kernel
 from rewild4d.ours.fused.quaternions import dot, rotation, rotation_grad, side, unit, unit_grad
 
 POSTURE = Kernel(
-    "posture", "2a29813aab22", "rewild4d.ours.losses.skeleton:posture", "rewild4d.ours.losses.skeleton:skeleton_losses"
+    "posture", "193d46c018c5", "rewild4d.ours.losses.skeleton:posture", "rewild4d.ours.losses.skeleton:skeleton_losses"
 )
 
 

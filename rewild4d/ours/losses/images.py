@@ -23,7 +23,10 @@ Window = tuple[slice, slice]
 
 
 def union_window(alphas: list[Tensor], margin: int) -> Window:
-    """Return rows and columns of pixels where any matte [1, h, w] is above zero, with a margin inside the image."""
+    """Return rows and columns of pixels where any matte [1, h, w] is above zero, with a margin inside the image; all of
+    it on a GPU, where a look at the mattes would cost more."""
+    if not alphas[0].is_cpu:
+        return slice(0, alphas[0].shape[1]), slice(0, alphas[0].shape[2])
     slices = []
     for (first, last), length in zip(_extent(alphas), alphas[0].shape[1:], strict=True):
         slices.append(slice(max(0, first - margin), min(length, last + 1 + margin)))
@@ -37,7 +40,7 @@ def _extent(alphas: list[Tensor]) -> tuple[tuple[int, int], tuple[int, int]]:
     for marks in (union.any(dim=1), union.any(dim=0)):
         positions = torch.arange(len(marks), device=marks.device)
         ends += [torch.where(marks, positions, len(marks)).amin(), torch.where(marks, positions, -1).amax()]
-    top, bottom, left, right = torch.stack(ends).tolist()  # one look: each waits for a GPU
+    top, bottom, left, right = torch.stack(ends).tolist()
     return ((top, bottom), (left, right)) if top <= bottom else ((0, 0), (0, 0))
 
 

@@ -14,8 +14,11 @@ from rewild4d.ours.fused.compactness import COMPACTNESS, LEAST_MASS, compactness
 from rewild4d.ours.fused.normals import LEAST_COVER, NORMALS, disagreement, smallest_axes
 from rewild4d.ours.pose import Pose, aligned
 from rewild4d.rasterizer import rasterize
-from rewild4d.transforms import look_at, quat_multiply, quat_to_matrix
+from rewild4d.transforms import constant, look_at, quat_multiply, quat_to_matrix
 from rewild4d.types import OBJECT_DIAGONAL
+
+SQUARINGS = 14
+"""Of a covariance on a GPU: eigenvalues are raised to the power 2^14."""
 
 
 def tv_loss(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
@@ -55,28 +58,56 @@ def compact_loss(clouds: Sequence[Tensor], weights: Tensor, alpha: float) -> Ten
         center = share.T @ points
         outer = (points[:, :, None] * points[:, None, :]).flatten(1)
         covariance = (share.T @ outer).view(-1, 3, 3) - center[:, :, None] * center[:, None, :]
-        top = torch.linalg.eigh(covariance.detach().cpu())[1][..., -1].to(covariance)  # a GPU takes longer for so few
+        top = top_axes(covariance.detach())
         trace = covariance.diagonal(dim1=1, dim2=2).sum(-1)
         losses.append((gamma * (trace - torch.einsum("ja,jab,jb->j", top, covariance, top))).mean())
     return torch.stack(losses).mean()
 
 
-def smooth_loss(posed: Posed, opacities: Tensor, size: int, generator: torch.Generator) -> Tensor:
+def top_axes(matrices: Tensor) -> Tensor:
+    """Return the unit eigenvectors of the largest eigenvalues of positive matrices, without gradients, [J, 3, 3] -> [J,
+    3].
+
+    On a GPU by squaring them again and again, since `eigh` waits for it: where two eigenvalues are closer than one in
+    ten thousand, the direction is between theirs.
+    """
+    if matrices.is_cpu:
+        return torch.linalg.eigh(matrices)[1][..., -1]
+    power = matrices.double()
+    for _ in range(SQUARINGS):
+        power = power / power.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None].clamp_min(1e-300)
+        power = power @ power
+    best = power.diagonal(dim1=1, dim2=2).argmax(-1)[:, None, None].expand(-1, 3, 1)
+    return torch.nn.functional.normalize(power.gather(-1, best)[..., 0], dim=-1, eps=1e-300).to(matrices)
+
+
+def random_direction(generator: torch.Generator) -> Tensor:
+    """Draw the direction of L_smooth's viewpoint: azimuth in [0, 360), elevation in [-10, 60) degrees, [3]."""
+    azimuth, elevation = torch.rand(2, generator=generator).tolist()
+    azimuth, elevation = 2 * math.pi * azimuth, math.radians(-10 + 70 * elevation)
+    return torch.tensor(
+        (math.cos(elevation) * math.sin(azimuth), math.sin(elevation), math.cos(elevation) * math.cos(azimuth))
+    )
+
+
+def smooth_loss(posed: Posed, opacities: Tensor, size: int, direction: Tensor) -> Tensor:
     """Compute L_smooth (paper, "Geometric Regularization"): how far neighbouring pixels of a rendered normal map,
     ``size`` pixels wide, disagree, summed over the two axes.
 
-    The viewpoint is random: azimuth in [0, 360), elevation in [-10, 60) degrees. A Gaussian's normal is the axis of its
-    smallest scale, pointing to the camera. Only the normals get gradients.
+    A Gaussian's normal is the axis of its smallest scale, pointing to the camera. Only the normals get gradients.
+
+    Args:
+        posed: Gaussians.
+        opacities: [n].
+        size: side of the normal map in pixels.
+        direction: from the animal to the viewpoint, unit, [3].
     """
     means, log_scales = posed.means.detach(), posed.log_scales.detach()
-    azimuth, elevation = torch.rand(2, generator=generator).tolist()
-    azimuth, elevation = 2 * math.pi * azimuth, math.radians(-10 + 70 * elevation)
-    direction = (math.cos(elevation) * math.sin(azimuth), math.sin(elevation), math.cos(elevation) * math.cos(azimuth))
     center = means.mean(0)
     # Focal length 2 sides and a distance of 2.4 diagonals show the whole animal from every side.
-    eye = center + 2.4 * OBJECT_DIAGONAL * means.new_tensor(direction)
-    world_to_camera = look_at(eye, center, means.new_tensor((0.0, 1.0, 0.0)))
-    focal = means.new_tensor(((2.0 * size, 0, size / 2), (0, 2.0 * size, size / 2), (0, 0, 1)))
+    eye = center + 2.4 * OBJECT_DIAGONAL * direction.to(means)
+    world_to_camera = look_at(eye, center, constant((0.0, 1.0, 0.0), means))
+    focal = constant((2.0 * size, 0.0, size / 2, 0.0, 2.0 * size, size / 2, 0.0, 0.0, 1.0), means).view(3, 3)
     image, alpha, _ = rasterize(
         means, posed.quats.detach(), log_scales.exp(), opacities.detach(),
         _normals(posed.quats, log_scales, means, eye), world_to_camera[None], focal[None], size, size,
@@ -111,20 +142,20 @@ def _disagreement(image: Tensor, matte: Tensor) -> Tensor:
 
 def limit_loss(pose: Pose, parents: Tensor, degrees: float) -> Tensor:
     """Compute the mean squared excess of cos(half the angle of a bone to its parent) below that of ``degrees``."""
-    has_parent = parents >= 0
-    if not bool(has_parent.any()):
-        return pose.quats.sum() * 0.0
-    own, above = pose.quats[:, has_parent], pose.quats[:, parents[has_parent]]
-    relative = (own * above).sum(-1).abs()
-    return (math.cos(math.radians(degrees) / 2) - relative).clamp_min(0).square().mean()
+    relative = (pose.quats * pose.quats[:, parents.clamp_min(0)]).sum(-1).abs()
+    return _mean_below(parents, (math.cos(math.radians(degrees) / 2) - relative).clamp_min(0).square())
 
 
 def attach_loss(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
     """Compute the mean squared gap between a joint and its parent's copy of it, over the squared diagonal."""
-    has_parent = parents >= 0
-    if not bool(has_parent.any()):
-        return transforms.sum() * 0.0
-    return joint_gaps(transforms, pivots, parents)[:, has_parent].square().sum(-1).mean() / OBJECT_DIAGONAL**2
+    gaps = joint_gaps(transforms, pivots, parents).square().sum(-1)
+    return _mean_below(parents, gaps) / OBJECT_DIAGONAL**2
+
+
+def _mean_below(parents: Tensor, values: Tensor) -> Tensor:
+    """Return the mean of values [B, J] of joints that have a parent, 0 where none has; nothing looks at a number."""
+    below = (parents >= 0).to(values)
+    return (values @ below).mean() / below.sum().clamp_min(1)
 
 
 def joint_gaps(transforms: Tensor, pivots: Tensor, parents: Tensor) -> Tensor:
@@ -146,9 +177,9 @@ def sagittal_losses(
             (`joint_gaps`) over the squared diagonal.
     """
     limbs = (mirror != torch.arange(len(mirror), device=mirror.device)).to(pose.quats)
-    rest = pose.quats.new_tensor((1.0, 0, 0, 0))
+    rest = constant((1.0, 0.0, 0.0, 0.0), pose.quats)
     above = torch.where((parents >= 0)[:, None], pose.quats[:, parents.clamp_min(0)], rest)
-    local = quat_multiply(above * above.new_tensor((1.0, -1.0, -1.0, -1.0)), pose.quats)
+    local = quat_multiply(above * constant((1.0, -1.0, -1.0, -1.0), above), pose.quats)
     out = local[..., 2:].square().sum(-1)
     sideways = (joint_gaps(transforms, pivots, parents)[..., 0] / OBJECT_DIAGONAL).square()
     of_limbs, others = limbs / limbs.sum().clamp_min(1), (1 - limbs) / (1 - limbs).sum().clamp_min(1)
@@ -186,7 +217,7 @@ def neighbours(points: Tensor, count: int) -> Tensor:
     """Return indices of the nearest other points, [n, 3] -> [n, min(count, n - 1)]."""
     positions = points.detach().cpu().double().numpy()
     _, index = cKDTree(positions).query(positions, k=list(range(1, min(count, len(positions) - 1) + 2)))
-    return torch.from_numpy(np.ascontiguousarray(index[:, 1:]))
+    return torch.from_numpy(np.ascontiguousarray(index[:, 1:])).to(points.device)
 
 
 def rigid_loss(canonical: Tensor, deformed: Tensor, near: Tensor) -> Tensor:

@@ -51,7 +51,7 @@ def neighbour_keys(keys: list[Key], positions: Tensor, config: Geometry) -> Neig
 
 
 def posture(
-    model: Model, poses: Pose, rows: list[int], config: Geometry, gaps: Tensor | None
+    model: Model, poses: Pose, rows: Tensor, config: Geometry, gaps: Tensor | None
 ) -> tuple[Pose, Tensor, Tensor]:
     """Select ``rows`` of a batch of poses, with their transforms, and sum the weighted regularizers of the whole batch.
 
@@ -59,7 +59,7 @@ def posture(
     """
     skeleton = model.pivots, model.parents, model.mirror
     if POSTURE.takes(poses.quats):
-        *own, transforms, total = posture_and_losses(*poses, rows, *skeleton, _weights(config, gaps), gaps)
+        *own, transforms, total = posture_and_losses(*poses, rows.tolist(), *skeleton, _weights(config, gaps), gaps)
         return Pose(*own), transforms, total
     transforms = model.transforms(poses)
     total = skeleton_losses(model, poses, transforms, config, gaps)
