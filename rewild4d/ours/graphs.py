@@ -188,7 +188,8 @@ class StepGraphs:
         training.backward(values)
         short = values.new_zeros(())
         if step.room:
-            short = torch.stack([pairs > room for pairs, room in zip(found.pairs, step.room, strict=True)]).any()
+            lacking = [torch.as_tensor(pairs > room) for pairs, room in zip(found.pairs, step.room, strict=True)]
+            short = torch.stack(lacking).any()
         else:
             step.pairs = [int(pairs) for pairs in found.pairs]
         step.names, step.target = list(losses), given.target

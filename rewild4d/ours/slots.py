@@ -1,7 +1,7 @@
 """Tensors on a GPU that stay where they are, for the inputs of recorded training steps."""
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -35,9 +35,17 @@ class Kind(NamedTuple):
     @classmethod
     def of(cls, given: StepInput, observes: bool) -> "Kind":
         """Return the kind of a step."""
-        acting = (part is not None for part in (given.blend, given.pull, given.ramp, given.direction))
-        size = given.target.camera.width, given.target.camera.height
-        return cls(size, given.degree, *acting, given.varies, given.compacts, observes)
+        return cls(
+            (given.target.camera.width, given.target.camera.height),
+            given.degree,
+            blends=given.blend is not None,
+            pulls=given.pull is not None,
+            ramps=given.ramp is not None,
+            smooths=given.direction is not None,
+            varies=given.varies,
+            compacts=given.compacts,
+            observes=observes,
+        )
 
 
 class Slots:
@@ -101,7 +109,7 @@ class Slots:
             height=height,
         )
         return StepInput(
-            replace(self.given.target, rgb=rgb, mask=mask, camera=camera, side=side),
+            replace(self.given.target, rgb=rgb, mask=mask, camera=camera, side=cast(float, side)),
             eye,
             codes,
             flipped > 0,

@@ -94,7 +94,8 @@ class GaussianTraining(ABC):
     def step_rates(self, index: int) -> list[float]:
         """Return the learning rates of a step: of the means, then of `groups`."""
         progress = index / self.config.iterations
-        return [exponential(*self.config.rates.means, progress), *(self.rate(name, progress) for name in self.groups)]
+        first, last = self.config.rates.means
+        return [exponential(first, last, progress), *(self.rate(name, progress) for name in self.groups)]
 
     def checked(self, index: int, losses: dict[str, float]) -> dict[str, float]:
         """Return the losses; raise a FloatingPointError where one is not finite."""

@@ -73,7 +73,8 @@ def start_tiles(
 @triton.jit(do_not_specialize=SIZES)
 def gather(
     ends: tl.tensor, tiles: tl.tensor, sums: tl.tensor, records: tl.tensor, v_means2d: tl.tensor, v_records: tl.tensor,
-    v_features: tl.tensor, room: tl.tensor, views: tl.tensor, count: tl.tensor, CHANNELS: tl.constexpr, PART: tl.constexpr,
+    v_features: tl.tensor, room: tl.tensor, views: tl.tensor, count: tl.tensor, CHANNELS: tl.constexpr,
+    PART: tl.constexpr,
 ) -> None:  # fmt: skip
     """Add a Gaussian's rows of the sums [room, 6 + C]; program (block, part of the channels).
 

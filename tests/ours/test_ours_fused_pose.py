@@ -142,7 +142,9 @@ def test_posture(batch: int, rows: list[int], only: str | None) -> None:
 
     def make(dtype: torch.dtype) -> tuple[list[Tensor], dict[str, Tensor]]:
         given = batch_of_poses(dtype, batch)
-        pose, transforms, total = posture(model(dtype), Pose(**given), torch.tensor(rows, dtype=torch.long), config, triples(batch))
+        pose, transforms, total = posture(
+            model(dtype), Pose(**given), torch.tensor(rows, dtype=torch.long), config, triples(batch)
+        )
         return [*pose, transforms, total[None]], given
 
     check_twins(make)
@@ -158,7 +160,9 @@ def test_only_neighbouring_frames_have_a_bend() -> None:
     own, pose = model(), Pose(**batch_of_poses(torch.float32, 3))
     config = Geometry(limit=0.0, attach=0.0, temporal=10.0, still=1.0)
     assert float(skeleton_losses(own, pose, own.transforms(pose), config, None).detach()) == 0
-    assert float(posture(own, pose, torch.tensor([0, 1, 2]), config, None)[2].detach()) == 0  # three views of a clip of two frames
+    assert (
+        float(posture(own, pose, torch.tensor([0, 1, 2]), config, None)[2].detach()) == 0
+    )  # three views of a clip of two frames
     assert float(posture(own, pose, torch.tensor([1]), config, triples(3))[2].detach()) > 0
 
 
@@ -175,7 +179,9 @@ def test_a_missing_frame_between_two_doubles_their_distance() -> None:
     even = float(posture(own, pose, torch.tensor([1]), bend, torch.ones_like(gaps))[2])
     assert even == pytest.approx((3 - 2 * 1 + 0) ** 2 / OBJECT_DIAGONAL**2)
     step, scale = 1 / OBJECT_DIAGONAL, drift.still_step
-    assert float(posture(own, pose, torch.tensor([1]), drift, gaps)[2]) == pytest.approx(scale * step**2 / (step**2 + scale**2))
+    assert float(posture(own, pose, torch.tensor([1]), drift, gaps)[2]) == pytest.approx(
+        scale * step**2 / (step**2 + scale**2)
+    )
 
 
 def test_a_skeleton_without_parents_has_no_joints_to_hold() -> None:
@@ -209,7 +215,11 @@ def test_what_drifts_costs_and_what_moves_is_left_alone() -> None:
         moved[1:, 7, 1] = way * OBJECT_DIAGONAL
         moved.requires_grad_(True)
         total = posture(
-            own, Pose(quats, moved, torch.zeros(3, 20, 4)), torch.tensor([1]), config, torch.ones(1, 2, dtype=torch.float64)
+            own,
+            Pose(quats, moved, torch.zeros(3, 20, 4)),
+            torch.tensor([1]),
+            config,
+            torch.ones(1, 2, dtype=torch.float64),
         )[2]
         total.backward()
         return float(total.detach()), -float(moved.grad[0, 7, 1]) * OBJECT_DIAGONAL
