@@ -1,11 +1,11 @@
 """Hold each claim of the paper's tables on Artemis against records of the reproduction study (reproduction.md).
 
-python docs/experiments/verdicts.py results/2026-11-26-reproduction
+python docs/experiments/verdicts.py results/2026-11-26-reproduction [MORE FOLDERS]
 
-prints a Markdown table for each of the tables `reproduction*` that has records there: what the paper's method has less
-what a row has, in the paper and here with the 95 % interval of a bootstrap over cases and seeds, and a verdict. "Seen":
-the interval is on the paper's side of zero. "Opposite": it is on the other side. "Not seen": it holds zero. "Not run":
-there is no pair of records.
+prints a Markdown table for each condition of the tables `reproduction*` that has records there. A cell holds what the
+paper's method has less what a row has, the 95 % interval of a bootstrap over cases and seeds, and a verdict. "Seen":
+the interval is on the paper's side of zero. "Opposite": it is on the other side. "Not seen": it holds zero. With fewer
+than `FEW` pairs of fits there is no verdict: an interval over two cases is the two cases.
 """
 
 import sys
@@ -24,11 +24,11 @@ from rewild4d.running import planning
 REFERENCE = "Ours"
 SHAPE = {"w/o compact": -1, "w/o smooth": -1}
 """Rows that the paper shows in pictures alone, as worse: its sign in every score."""
+FEW = 4
 
 
 def claims(score: str) -> dict[str, float]:
-    """Return by row what the paper's method has less the row, in the paper; of a score that it did not print, +1 or -1
-    where it shows the row to be worse."""
+    """Return by row what the paper's method has less the row, in the paper, of a score that it printed."""
     found: dict[str, float] = {}
     for name in ("ablation", "artemis"):
         cells = {row.label: row.cells.get(score) for row in load_reported(name).rows}
@@ -46,22 +46,25 @@ def verdict(low: float, high: float, sign: float) -> str:
     return "seen" if (low > 0) == (sign > 0) else "opposite"
 
 
-def line(entrant: Entrant, own: Entrant, condition: int, score: str, digits: int) -> str:
-    """Compare one row under one condition with the paper's method."""
-    label = entrant.label.replace(" (20 bones)", "")
+def cell(entrant: Entrant, own: Entrant, condition: int, score: str) -> str:
+    """Compare one row under one condition with the paper's method, by one score."""
+    label, digits = entrant.label.replace(" (20 bones)", ""), digits_of(score, "dB" if score == "psnr" else "1")
     values = [values_of(each.records[condition], score) for each in (own, entrant)]
-    title, reported = TITLES[score], claims(score).get(label)
-    sign = 1 if better_of(score, {}) == "higher" else -1
-    said = "worse, in pictures" if reported is None else f"{reported:+.{max(3, digits)}f}"
-    said = "—" if reported is None and label not in SHAPE else said
     if not set(values[0]) & set(values[1]):
-        return f"| {entrant.label} | {title} | {said} | | not run |"
+        return "not run"
     found = paired(*values)
     low, high = found.interval or (found.mean, found.mean)
-    here = f"{found.mean:+.{digits}f} ({low:+.{digits}f} to {high:+.{digits}f}; {found.cases} cases)"
-    if found.interval is None:
-        return f"| {entrant.label} | {title} | {said} | {here} | one seed |"
-    return f"| {entrant.label} | {title} | {said} | {here} | {verdict(low, high, reported or sign)} |"
+    said = f"{found.mean:+.{digits}f} ({low:+.{digits}f} to {high:+.{digits}f})"
+    sign = 1 if better_of(score, {}) == "higher" else -1
+    if sum(min(len(values[0][case]), len(values[1][case])) for case in set(values[0]) & set(values[1])) < FEW:
+        return said
+    return f"{said} **{verdict(low, high, claims(score).get(label) or sign)}**"
+
+
+def reported(label: str) -> str:
+    """Return the paper's difference in PSNR of a row."""
+    value = claims("psnr").get(label.replace(" (20 bones)", ""))
+    return f"{value:+.2f}" if value is not None else "pictures: worse" if label in SHAPE else "n/a"
 
 
 def lines(name: str, records: Sequence[RunRecord]) -> list[str]:
@@ -72,22 +75,28 @@ def lines(name: str, records: Sequence[RunRecord]) -> list[str]:
     own = next(entrant for entrant in entrants if entrant.label == REFERENCE)
     made: list[str] = []
     for index, condition in enumerate(full.conditions):
-        if not own.records[index]:
+        cases = values_of(own.records[index], full.scores[0]) if own.records[index] else {}
+        if not cases:
             continue
-        made += [f"\n{' '.join(filter(None, (full.title, condition.title)))}, `{condition.protocol}`:\n"]
-        made += ["| row | score | paper | here (95 % interval) | verdict |", "|---|---|---:|---:|---|"]
+        fits, title = sum(map(len, cases.values())), " ".join(filter(None, (full.title, condition.title)))
+        made += [f"\n{title}, `{condition.protocol}`, {len(cases)} cases, {fits} fits a row:\n"]
+        made += [f"| `ours` less | paper, PSNR | {' | '.join(TITLES[score] for score in full.scores)} |"]
+        made += ["|---|---:|" + "---|" * len(full.scores)]
         for entrant in entrants:
-            for score in full.scores if entrant is not own else ():
-                made.append(line(entrant, own, index, score, digits_of(score, "dB" if score == "psnr" else "1")))
+            if entrant is not own:
+                found = " | ".join(cell(entrant, own, index, score) for score in full.scores)
+                made.append(f"| {entrant.label} | {reported(entrant.label)} | {found} |")
     return made
 
 
 def main(words: list[str]) -> int:
-    if len(words) != 1 or not Path(words[0]).is_dir():
+    if not words or not all(Path(word).is_dir() for word in words):
         print(__doc__, file=sys.stderr)
         return 2
-    records = [record for _, record in find_records(Path(words[0]))]
-    print("\n".join(text for name in load_specs() if name.startswith("reproduction") for text in lines(name, records)))
+    for word in words:
+        records = [record for _, record in find_records(Path(word))]
+        names = (name for name in load_specs() if name.startswith("reproduction"))
+        print("\n".join(text for name in names for text in lines(name, records)))
     return 0
 
 

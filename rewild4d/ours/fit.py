@@ -61,7 +61,7 @@ class Training(GaussianTraining):
     def drawn_losses(self, index: int) -> tuple[dict[str, Tensor], RasterInfo | None, Target]:
         self.prepare()
         given = self.drawn_input(index)
-        return *self.losses_of(given), given.target
+        return *self.losses_of(given.to(self.model.pivots.device)), given.target
 
     def drawn_input(self, index: int) -> StepInput:
         """Draw a view and all else that a step takes."""
@@ -71,7 +71,7 @@ class Training(GaussianTraining):
     def losses(self, key: Key, target: Target, index: int) -> tuple[dict[str, Tensor], RasterInfo | None]:
         """Compute all weighted losses of a view at an iteration, and the render info of the deformed branch."""
         self.prepare()
-        return self.losses_of(self.input(key, target, index))
+        return self.losses_of(self.input(key, target, index).to(self.model.pivots.device))
 
     def input(self, key: Key, target: Target, index: int) -> StepInput:
         """Draw and schedule what a step with a view takes; all but the target's images are on the CPU."""

@@ -1,7 +1,8 @@
 """All that one training step takes beside the model: the view, and what is drawn at random or follows a schedule."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from rewild4d.ours.symmetry import Target
@@ -49,3 +50,16 @@ class StepInput:
     degree: int
     varies: bool
     compacts: bool
+
+    def to(self, device: torch.device) -> "StepInput":
+        """Move all but the target, whose images are there already, to a device."""
+
+        def moved(part: Tensor | None) -> Tensor | None:
+            return None if part is None else part.to(device)
+
+        if device.type == "cpu":
+            return self
+        names = ("eye", "codes", "flipped", "row", "gaps", "background", "direction")
+        quats, shifts = self.prior_pose
+        pose = quats.to(device), shifts.to(device)
+        return replace(self, prior_pose=pose, **{name: moved(getattr(self, name)) for name in names})
