@@ -12,11 +12,14 @@ import torch
 from torch import Tensor
 
 from rewild4d.harmonics import products, rotated
+from rewild4d.kernels import gpu
 from rewild4d.types import Camera, Splats
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
     """Compute the Hamilton product a ⊗ b of wxyz quaternions, [..., 4]."""
+    if a.ndim == 2 and a.shape == b.shape and gpu.on_gpu(a, b):
+        return gpu.multiply(a, b)
     return products(a, b) @ _table(HAMILTON, a.device, a.dtype)
 
 

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from rewild4d.harmonics import C0, basis, rotated
+from rewild4d.kernels import gpu
 from rewild4d.ours.config import Canonical
 from rewild4d.ours.fused.harmonics import COLORS, seen_rgb
 from rewild4d.priors.motion import SurfaceSample, quats_from_normals, sample_surface, surface_vertices
@@ -86,6 +87,8 @@ class Gaussians(nn.Module):
             return self.rgb()
         if COLORS.takes(means, owner=self):
             return seen_rgb(self.colors, means, quats, self.quats, eye, degree, REST_GAIN)
+        if gpu.on_gpu(means):
+            return gpu.seen_rgb(self.colors, means, quats, self.quats, eye, degree, REST_GAIN)
         directions = normalize(means.detach() - eye.to(means), dim=-1)
         canonical = torch.einsum("na,nab->nb", directions, self.rotations_to(quats.detach()))
         values = basis(canonical, degree)[:, 1:] / REST_GAIN

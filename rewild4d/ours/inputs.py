@@ -53,13 +53,17 @@ class StepInput:
 
     def to(self, device: torch.device) -> "StepInput":
         """Move all but the target, whose images are there already, to a device."""
-
-        def moved(part: Tensor | None) -> Tensor | None:
-            return None if part is None else part.to(device)
-
         if device.type == "cpu":
             return self
-        names = ("eye", "codes", "flipped", "row", "gaps", "background", "direction")
         quats, shifts = self.prior_pose
-        pose = quats.to(device), shifts.to(device)
-        return replace(self, prior_pose=pose, **{name: moved(getattr(self, name)) for name in names})
+        return replace(
+            self,
+            eye=self.eye.to(device),
+            codes=self.codes.to(device),
+            flipped=self.flipped.to(device),
+            row=self.row.to(device),
+            gaps=None if self.gaps is None else self.gaps.to(device),
+            prior_pose=(quats.to(device), shifts.to(device)),
+            background=self.background.to(device),
+            direction=None if self.direction is None else self.direction.to(device),
+        )

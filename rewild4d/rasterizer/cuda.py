@@ -14,6 +14,7 @@ from rewild4d.rasterizer.rooms import take_room
 
 TILE, MOMENTS = triton_blend.SIDE.value, triton_blend.MOMENTS.value
 BLOCK, RECORD, CAMERA = triton_project.BLOCK.value, triton_project.RECORD.value, triton_project.CAMERA.value
+BUCKET, PIXELS = triton_blend.BUCKET.value, triton_blend.PIXELS.value
 OWNERS, ENTRIES = triton_tiles.OWNERS.value, triton_tiles.ENTRIES.value
 UNUSABLE = triton_project.UNUSABLE.value
 MOST_TILES = 1 << (63 - triton_project.DEPTH_BITS.value)
@@ -125,6 +126,8 @@ class _TileLists(NamedTuple):
         slots: each entry's index in an order by rows, [room].
         counts: entries of each row, [V, N].
         ends: their running sum, [V * N].
+        buckets: first bucket of each tile of each view, and their end, int32, [V * tiles + 1].
+        pages: buckets that there is room for.
     """
 
     tiles: tuple[int, int]
@@ -133,6 +136,8 @@ class _TileLists(NamedTuple):
     slots: Tensor
     counts: Tensor
     ends: Tensor
+    buckets: Tensor
+    pages: int
 
 
 @torch.no_grad()
@@ -160,7 +165,9 @@ def _list_tiles(
     triton_tiles.start_tiles[(triton.cdiv(max(room, number), ENTRIES),)](
         entry_keys, slots, owners, entries, starts, room, number, room.bit_length(), **LAUNCHES["start_tiles"]
     )
-    return _TileLists((across, down), starts, entries, slots, counts, ends)
+    lengths = (starts[1:] - starts[:-1] + (BUCKET - 1)) // BUCKET
+    buckets = torch.nn.functional.pad(lengths.cumsum(0, dtype=torch.int32), (1, 0))
+    return _TileLists((across, down), starts, entries, slots, counts, ends, buckets, room // BUCKET + number - 1)
 
 
 class _Blend(torch.autograd.Function):
@@ -174,27 +181,30 @@ class _Blend(torch.autograd.Function):
         views, (count, channels), (width, height) = len(records), features.shape, size
         image, alpha = features.new_empty(views, channels, height, width), features.new_empty(views, 1, height, width)
         part = min(MOST_CHANNELS, triton.next_power_of_2(channels))
+        kept = features.new_empty(lists.pages if any(ctx.needs_input_grad) else 0, 1 + channels, PIXELS)
         triton_blend.blend[(len(lists.starts) - 1, triton.cdiv(channels, part))](
             lists.starts, lists.entries, means2d, rests, records, features, background, image, alpha,
-            width, height, *lists.tiles, count, CHANNELS=channels, PART=part, **LAUNCHES["blend"],
+            lists.buckets, kept, width, height, *lists.tiles, count, CHANNELS=channels, PART=part, KEEP=len(kept) > 0,
+            **LAUNCHES["blend"],
         )  # fmt: skip
-        ctx.save_for_backward(means2d, rests, records, features, image, alpha)
+        ctx.save_for_backward(means2d, rests, records, features, image, alpha, kept)
         ctx.lists = lists
         return image, alpha
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g_image: Tensor, g_alpha: Tensor) -> tuple[Tensor | None, ...]:
-        means2d, rests, records, features, image, alpha = ctx.saved_tensors
+        means2d, rests, records, features, image, alpha, kept = ctx.saved_tensors
         lists: _TileLists = ctx.lists
         views, channels, height, width = image.shape
         count, part = len(features), min(MOST_CHANNELS, triton.next_power_of_2(channels))
         sums = records.new_empty(len(lists.slots), MOMENTS + channels)
         gradients = [torch.empty_like(tensor) for tensor in (means2d, records, features)]
         with torch.cuda.device_of(records):
-            triton_blend.blend_backward[(len(lists.starts) - 1,)](
+            tiles = len(lists.starts) - 1
+            triton_blend.blend_backward[(lists.pages,)](
                 lists.starts, lists.entries, lists.slots, means2d, rests, records, features, image, alpha,
-                g_image.contiguous(), g_alpha.contiguous(), sums,
+                lists.buckets, kept, g_image.contiguous(), g_alpha.contiguous(), sums, tiles, tiles.bit_length(),
                 width, height, *lists.tiles, count, CHANNELS=channels, **LAUNCHES["blend_backward"],
             )  # fmt: skip
             triton_tiles.gather[(triton.cdiv(count, OWNERS), triton.cdiv(channels, part))](

@@ -16,6 +16,8 @@ from rewild4d.rasterizer import conventions, projection
 SIDE = tl.constexpr(8)
 """Side of a tile in pixels: one warp's, so that sums over its pixels need no shared memory."""
 PIXELS = tl.constexpr(SIDE.value**2)
+BUCKET = tl.constexpr(32)
+"""Gaussians of a tile that one program of the backward pass takes; the blend keeps what it had before each bucket."""
 MOMENTS = tl.constexpr(6)
 """Sums of q, q t, q u, q t^2, q t u, q u^2 that come before the channel sums in a slot, q = dL/dalpha alpha."""
 _MAX_ALPHA = tl.constexpr(conventions.MAX_ALPHA)
@@ -23,7 +25,7 @@ _WEAKEST = tl.constexpr(projection.LOG2_MIN_ALPHA)
 _STRONGEST = tl.constexpr(math.log2(conventions.MAX_ALPHA))
 _LEAST_LEFT = tl.constexpr(conventions.MIN_TRANSMITTANCE)
 
-SIZES = ["width", "height", "across", "down", "count"]
+SIZES = ["tiles", "steps", "width", "height", "across", "down", "count"]
 
 
 @triton.jit
@@ -68,11 +70,15 @@ def _weights(alpha: tl.tensor, left: tl.tensor) -> tuple:
 @triton.jit(do_not_specialize=SIZES)
 def blend(
     starts: tl.tensor, entries: tl.tensor, centres: tl.tensor, rests: tl.tensor, records: tl.tensor,
-    features: tl.tensor, background: tl.tensor, image: tl.tensor, alpha_image: tl.tensor, width: tl.tensor,
-    height: tl.tensor, across: tl.tensor, down: tl.tensor, count: tl.tensor, CHANNELS: tl.constexpr, PART: tl.constexpr,
-    GROUP: tl.constexpr,
+    features: tl.tensor, background: tl.tensor, image: tl.tensor, alpha_image: tl.tensor, buckets: tl.tensor,
+    kept: tl.tensor, width: tl.tensor, height: tl.tensor, across: tl.tensor, down: tl.tensor, count: tl.tensor,
+    CHANNELS: tl.constexpr, PART: tl.constexpr, GROUP: tl.constexpr, KEEP: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Fill image [V, C, h, w] and alpha [V, 1, h, w]; program (tile, part of the channels)."""
+    """Fill image [V, C, h, w] and alpha [V, 1, h, w]; program (tile, part of the channels).
+
+    With KEEP also what was there before each bucket, its number from ``buckets`` [tiles + 1] on: kept [B, 1 + C, P] has
+    the transmittance, 0 where nothing is left to blend, and the channels.
+    """
     tile = tl.program_id(0)
     view, x, y, inside = _pixels(tile, width, height, across, down)
     first, end = tl.load(starts + tile), tl.load(starts + tile + 1)
@@ -81,7 +87,15 @@ def blend(
     left = tl.where(inside, 1.0, 0.0)
     through = left
     total = tl.zeros((PART, PIXELS), tl.float32)
+    start, bucket = first, tl.load(buckets + tile).to(tl.int64)
+    lane = tl.arange(0, PIXELS)
     while (first < end) & (tl.max(left, 0) > _LEAST_LEFT):
+        if KEEP:  # noqa: SIM102 (a constant, and a number of the GPU)
+            if (first - start) % BUCKET == 0:
+                page = kept + (bucket + (first - start) // BUCKET) * ((1 + CHANNELS) * PIXELS)
+                tl.store(page + (1 + channel)[:, None] * PIXELS + lane[None, :], total, real_channel[:, None])
+                if tl.program_id(1) == 0:
+                    tl.store(page + lane, left)
         n, real, _, _, _, alpha = _alphas(entries, first, end, centres, rests, records, x, y, GROUP)
         after, weight = _weights(alpha, left)
         place = (n - view * count)[:, None] * CHANNELS + channel[None, :]
@@ -90,6 +104,12 @@ def blend(
         through = tl.minimum(through, tl.min(tl.where(after > _LEAST_LEFT, after, 1.0), 0))
         left = tl.min(after, 0)
         first += GROUP
+    if KEEP:  # noqa: SIM102
+        if tl.program_id(1) == 0:
+            page = bucket + (first - start + BUCKET - 1) // BUCKET
+            while page < tl.load(buckets + tile + 1):
+                tl.store(kept + page * ((1 + CHANNELS) * PIXELS) + lane, tl.zeros((PIXELS,), tl.float32))
+                page += 1
     behind = tl.load(background + view * CHANNELS + channel, real_channel, 0.0)
     total += behind[:, None] * through[None, :]
     rows = ((view.to(tl.int64) * CHANNELS + channel) * height)[:, None] + y[None, :]
@@ -102,27 +122,38 @@ def blend(
 @triton.jit(do_not_specialize=SIZES)
 def blend_backward(
     starts: tl.tensor, entries: tl.tensor, slots: tl.tensor, centres: tl.tensor, rests: tl.tensor, records: tl.tensor,
-    features: tl.tensor, image: tl.tensor, alpha_image: tl.tensor, g_image: tl.tensor, g_alpha: tl.tensor,
-    sums: tl.tensor, width: tl.tensor, height: tl.tensor, across: tl.tensor, down: tl.tensor, count: tl.tensor,
-    CHANNELS: tl.constexpr, GROUP: tl.constexpr,
+    features: tl.tensor, image: tl.tensor, alpha_image: tl.tensor, buckets: tl.tensor, kept: tl.tensor,
+    g_image: tl.tensor, g_alpha: tl.tensor, sums: tl.tensor, tiles: tl.tensor, steps: tl.tensor, width: tl.tensor,
+    height: tl.tensor, across: tl.tensor, down: tl.tensor, count: tl.tensor, CHANNELS: tl.constexpr,
+    GROUP: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Fill the slots' rows of the sums [E, 6 + C]; program (tile).
+    """Fill the slots' rows of the sums [E, 6 + C]; program (bucket), whose tile is found by binary search.
 
     It goes front to back like the blend: the sum behind a Gaussian is the pixel's total minus the prefix.
     """
-    tile = tl.program_id(0)
+    bucket = tl.program_id(0)
+    if bucket >= tl.load(buckets + tiles):
+        return
+    tile, last = tl.zeros((), tl.int32), tiles
+    for _ in range(steps):  # the last tile whose first bucket is not beyond
+        middle = (tile + last + 1) // 2
+        beyond = tl.load(buckets + middle) > bucket
+        tile, last = tl.where(beyond, tile, middle), tl.where(beyond, middle - 1, last)
     view, x, y, inside = _pixels(tile, width, height, across, down)
-    first, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    first = tl.load(starts + tile) + (bucket - tl.load(buckets + tile)) * BUCKET
+    end = tl.minimum(first + BUCKET, tl.load(starts + tile + 1))
+    page = kept + bucket.to(tl.int64) * ((1 + CHANNELS) * PIXELS) + tl.arange(0, PIXELS)
     pixel = (view.to(tl.int64) * height + y) * width + x
     plane = pixel + view * (CHANNELS - 1) * height.to(tl.int64) * width
     area = height.to(tl.int64) * width
-    left = tl.where(inside, 1.0, 0.0)
-    # the loss's linear share of all that is blended: g.out minus T dL/dalpha
+    left = tl.load(page)
+    # the loss's linear share of all that is blended from here on: g.out minus T dL/dalpha
     through = 1.0 - tl.load(alpha_image + pixel, inside, 1.0)
     behind = -through * tl.load(g_alpha + pixel, inside, 0.0)
     for channel in range(CHANNELS):
         gradient = tl.load(g_image + plane + channel * area, inside, 0.0)
-        behind += gradient * tl.load(image + plane + channel * area, inside, 0.0)
+        drawn_before = tl.load(page + (1 + channel) * PIXELS)
+        behind += gradient * (tl.load(image + plane + channel * area, inside, 0.0) - drawn_before)
     while (first < end) & (tl.max(left, 0) > _LEAST_LEFT):
         n, real, t, u, exponent, alpha = _alphas(entries, first, end, centres, rests, records, x, y, GROUP)
         after, weight = _weights(alpha, left)

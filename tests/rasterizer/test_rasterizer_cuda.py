@@ -137,11 +137,11 @@ def test_kernels_compile_without_a_gpu(
 
 TYPES = {
     **dict.fromkeys(("keys", "first_keys", "starts", "slots", "ends"), "*i64"),
-    **dict.fromkeys(("tiles", "wides", "owners", "entries"), "*i32"),
+    **dict.fromkeys(("wides", "owners", "entries", "buckets"), "*i32"),
     **{"v_cameras": "*fp64", "eps2d": "fp32", "near": "fp32"},
 }
 """Of all arguments that are neither sizes nor single precision arrays."""
-CONSTANTS = {"CHANNELS": 3, "PART": 4, "ANTIALIAS": True, "CAMERAS": True}
+CONSTANTS = {"CHANNELS": 3, "PART": 4, "ANTIALIAS": True, "CAMERAS": True, "KEEP": True}
 
 
 def compile_kernel(name: str, capability: int) -> Any:
@@ -158,7 +158,8 @@ def compile_kernel(name: str, capability: int) -> Any:
         pytest.skip("TRITON_INTERPRET is set: there is nothing to compile")
     constants = CONSTANTS | {word: value for word, value in launch.items() if word.isupper()}
     used = {word: value for word, value in constants.items() if word in kernel.arg_names}
-    types = TYPES | dict.fromkeys(module.SIZES, "i32")
+    types = TYPES | ({} if name == "blend_backward" else {"tiles": "*i32"})
+    types = types | {size: "i32" for size in module.SIZES if size not in types}
     signature = {word: "constexpr" if word in used else types.get(word, "*fp32") for word in kernel.arg_names}
     options = {word: value for word, value in launch.items() if not word.isupper()}
     return compile(ASTSource(kernel, signature, used), GPUTarget("cuda", capability, 32), options=options)

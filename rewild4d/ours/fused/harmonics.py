@@ -18,7 +18,7 @@ from rewild4d.ours.fused.quaternions import dot, times_back
 
 COLORS = Kernel(
     "colours from harmonics",
-    "48244663e4ab",
+    "59c7434dcec6",
     "rewild4d.ours.canonical:Gaussians.seen_rgb",
     "rewild4d.ours.canonical:Gaussians.rotations_to",
 )

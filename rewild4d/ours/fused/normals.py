@@ -17,7 +17,7 @@ from rewild4d.ours.fused.quaternions import unit_grad, unit_row
 
 NORMALS = Kernel(
     "normals",
-    "545359fd8129",
+    "06ebfda50913",
     "rewild4d.ours.losses.regularizers:_normals",
     "rewild4d.ours.losses.regularizers:_disagreement",
 )

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
+from rewild4d.kernels import gpu
 from rewild4d.ours.deform import Posed
 from rewild4d.ours.fused.compactness import COMPACTNESS, LEAST_MASS, compactness
 from rewild4d.ours.fused.normals import LEAST_COVER, NORMALS, disagreement, smallest_axes
@@ -16,9 +17,6 @@ from rewild4d.ours.pose import Pose, aligned
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import constant, look_at, quat_multiply, quat_to_matrix
 from rewild4d.types import OBJECT_DIAGONAL
-
-SQUARINGS = 14
-"""Of a covariance on a GPU: eigenvalues are raised to the power 2^14."""
 
 
 def tv_loss(probabilities: Tensor, resolution: int, delta: float) -> Tensor:
@@ -73,8 +71,10 @@ def top_axes(matrices: Tensor) -> Tensor:
     """
     if matrices.is_cpu:
         return torch.linalg.eigh(matrices)[1][..., -1]
+    if gpu.on_gpu(matrices):
+        return gpu.top_axes(matrices)
     power = matrices.double()
-    for _ in range(SQUARINGS):
+    for _ in range(gpu.SQUARINGS):
         power = power / power.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None].clamp_min(1e-300)
         power = power @ power
     best = power.diagonal(dim1=1, dim2=2).argmax(-1)[:, None, None].expand(-1, 3, 1)
@@ -119,6 +119,8 @@ def _normals(quats: Tensor, log_scales: Tensor, means: Tensor, eye: Tensor) -> T
     """Return the axis of each Gaussian's smallest scale, pointing to ``eye`` [3], [n, 3]."""
     if NORMALS.takes(quats):
         return smallest_axes(quats, log_scales, means, eye)
+    if gpu.on_gpu(quats):
+        return gpu.smallest_axes(quats, log_scales, means, eye)
     axis = log_scales.argmin(-1)[:, None, None].expand(-1, 3, 1)
     normals = quat_to_matrix(quats).gather(-1, axis)[..., 0]
     towards = ((eye - means) * normals.detach()).sum(-1, keepdim=True)
