@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from rewild4d.kernels import gpu
 from rewild4d.kernels.harmonics import C0 as C0
 from rewild4d.kernels.harmonics import C1, C2, C3, HARMONICS, shade, turn
 from rewild4d.types import Splats
@@ -142,6 +143,8 @@ def seen_colors(splats: Splats, eye: Tensor) -> Tensor:
     eye = eye.to(splats.means)
     if _for_kernels(splats.colors, splats.means):
         return shade(splats.colors, splats.means, eye)
+    if gpu.on_gpu(splats.colors, splats.means) and not (splats.colors.requires_grad or splats.means.requires_grad):
+        return gpu.splat_colors(splats.colors, splats.means, eye)
     directions = normalize(splats.means - eye, dim=-1)
     values = basis(directions, round(count**0.5) - 1)
     return (torch.einsum("nk,nkc->nc", values, splats.colors) + 0.5).clamp_min(0)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 from rewild4d.benchmarks import probes
-from rewild4d.benchmarks.results import OURS, Row, timed_row
+from rewild4d.benchmarks.results import OURS, Row, single_row, timed_row
 from rewild4d.benchmarks.scenes import posed_clip, step_config, training
 from rewild4d.benchmarks.timing import measure, per, progress
 from rewild4d.harmonics import seen_colors
@@ -34,8 +34,8 @@ PROFILED = 4
 """Most periods that are profiled: reading the profiler's log takes longer than the steps."""
 SPAN = 10
 """Periods after which the step index restarts, so that long measurements stay at one point of the schedule."""
-OPERATORS = 12
-"""Number of listed operators."""
+OPERATORS, NAMED = 12, 90
+"""Number of listed operators, and most letters of a name."""
 ALL, NONE = "all kernels", "no kernel: plain torch"
 SCENES = {"quick": (2_000, 128), "paper": (20_000, 256)}
 """Preset -> Gaussians and image side of the timed step."""
@@ -59,13 +59,19 @@ def bench_step(
         UserError: no such preset.
     """
     steppers = {size: Stepper(count, size, preset, device) for size in sizes}
-    for stepper in steppers.values():
-        stepper.run_period()  # compiles kernels, untimed
-    samples = measure({size: stepper.run_period for size, stepper in steppers.items()}, repeats, "training step")
-    rows = [
-        timed_row(OURS, STEP, per(samples[size], stepper.period), count, size) for size, stepper in steppers.items()
-    ]
+    calls = {(STEP, size): stepper.run_period for size, stepper in steppers.items()}
+    if device.type == "cuda":
+        calls |= {
+            (f"{STEP}, no CUDA graph", size): partial(stepper.run_period, False) for size, stepper in steppers.items()
+        }
+    for call in (*calls.values(), *calls.values()):
+        call()  # compiles kernels and records graphs, untimed
+    samples = measure(calls, repeats, "training step")
+    rows = [timed_row(OURS, name, per(samples[name, size], steppers[size].period), count, size) for name, size in calls]
     rows.append(REPORTED)
+    if device.type == "cuda":
+        peak = torch.cuda.max_memory_allocated(device) / 2**20
+        rows.append(single_row(OURS, "peak memory", peak, "MiB", count, max(sizes), "of the GPU, all sizes"))
     for size, stepper in steppers.items():
         rows += stepper.operators(min(repeats, PROFILED))
         if probe and device.type == "cpu":
@@ -80,10 +86,11 @@ class Stepper:
     def __init__(self, count: int, size: int, preset: str, device: torch.device = CPU) -> None:
         self.count, self.size, self.device = count, size, device
         self.training, self.first = training(size, count, preset, device)
-        self.period, self.taken = loss_period(self.training.config), 0
+        self.period, self.taken, self.graphs = loss_period(self.training.config), 0, self.training.graphs
 
-    def run_period(self) -> None:
-        """Take `period` steps, as `ours.fit.train` does."""
+    def run_period(self, recorded: bool = True) -> None:
+        """Take `period` steps, as `ours.fit.train` does; on a GPU also without CUDA graphs."""
+        self.training.graphs = self.graphs if recorded else None
         with torch_on_one():
             for _ in range(self.period):
                 self.training.step(self.first + self.taken % (SPAN * self.period))
@@ -91,20 +98,25 @@ class Stepper:
         _wait(self.device)
 
     def operators(self, periods: int) -> list[Row]:
-        """Return the operators of torch and our autograd functions that take most time, as shares of all."""
+        """Return the operators of torch and our autograd functions that take most time, as shares of all; on a GPU its
+        kernels."""
+        on_gpu = self.device.type == "cuda"
         with (
             progress(f"profile of a step at {self.size}²", periods) as bar,
-            profile(activities=[ProfilerActivity.CPU]) as profiler,
+            profile(activities=[ProfilerActivity.CUDA if on_gpu else ProfilerActivity.CPU]) as profiler,
         ):
             for _ in range(periods):
                 self.run_period()
                 bar.update()
         steps = periods * self.period
-        found = sorted(profiler.key_averages(), key=lambda event: -event.self_cpu_time_total)
-        total = sum(event.self_cpu_time_total for event in found)
+        spent = {
+            event: event.self_device_time_total if on_gpu else event.self_cpu_time_total
+            for event in profiler.key_averages()
+        }
+        found, total = sorted(spent, key=lambda event: -spent[event]), sum(spent.values())
         return [
             Row(
-                subject=event.key, quantity="share of a step", value=event.self_cpu_time_total / total, unit="1",
+                subject=event.key[:NAMED], quantity="share of a step", value=spent[event] / total, unit="1",
                 gaussians=self.count, size=self.size, repeats=steps, note=f"{event.count / steps:.3g} calls a step",
             )
             for event in found[:OPERATORS]

@@ -55,7 +55,7 @@ class RunFlags(ComputeFlags, DataFlags):
     """Flags of commands that fit. Help lists the flags of later base classes first.
 
     Attributes:
-        jobs: runs at a time (a case, a method and a seed each); 0 is one for each processor core (one in all on a GPU).
+        jobs: runs at a time (a case, a method and a seed each); 0 is one for each processor core or GPU.
         threads: of torch in each run; other numbers than 1 may change the last digits. Fused kernels use idle cores
             too, without changing results.
         out: folder for runs.

@@ -135,6 +135,15 @@ class _Seen(torch.autograd.Function):
         return v_colors, *[None] * 6
 
 
+def splat_colors(colors: Tensor, means: Tensor, eye: Tensor) -> Tensor:
+    """Return RGB of splats from a viewpoint [3], without gradients, [n, k, 3] -> [n, 3]; twin:
+    `harmonics.seen_colors`."""
+    colors, means = colors.contiguous(), means.contiguous()
+    made = torch.empty_like(means)
+    _launch(_kernels().splat_colours, colors, means, eye.contiguous(), made, len(means), USED=colors.shape[1])
+    return made
+
+
 def top_axes(matrices: Tensor) -> Tensor:
     """Return the unit eigenvectors of the largest eigenvalues of positive matrices [J, 3, 3], without gradients, [J,
     3]; twin: `losses.regularizers.top_axes`."""

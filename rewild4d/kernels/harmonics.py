@@ -18,7 +18,7 @@ from rewild4d.kernels.threads import run_tickets
 
 HARMONICS = Kernel(
     "harmonics of splats",
-    "5ed69d8eccae",
+    "b359f502127f",
     "rewild4d.harmonics:rotated",
     "rewild4d.harmonics:seen_colors",
     "rewild4d.harmonics:basis",

@@ -13,7 +13,7 @@ BLOCK = tl.constexpr(128)
 SIDE = tl.constexpr(16)
 """Matrices of one program of `squared_axes`."""
 
-_C1 = tl.constexpr(harmonics.C1)
+_C0, _C1 = tl.constexpr(harmonics.C0), tl.constexpr(harmonics.C1)
 _C20, _C22, _C24 = (tl.constexpr(harmonics.C2[i]) for i in (0, 2, 4))
 _C30, _C31, _C32, _C33, _C35 = (tl.constexpr(harmonics.C3[i]) for i in (0, 1, 2, 3, 5))
 
@@ -140,20 +140,27 @@ def axes_backward(
 
 
 @triton.jit
+def _plain_direction(means: tl.tensor, eye: tl.tensor, n: tl.tensor, real: tl.tensor) -> tuple:
+    """Return the direction from the eye."""
+    x, y, z = _vector(means, n, real)
+    x, y, z = x - tl.load(eye), y - tl.load(eye + 1), z - tl.load(eye + 2)
+    inverse = 1.0 / tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-12)
+    return x * inverse, y * inverse, z * inverse
+
+
+@triton.jit
 def _direction(
     means: tl.tensor, quats: tl.tensor, rest: tl.tensor, eye: tl.tensor, n: tl.tensor, real: tl.tensor
 ) -> tuple:
     """Return the direction from the eye, turned from the posed to the rest orientation."""
-    x, y, z = _vector(means, n, real)
-    x, y, z = x - tl.load(eye), y - tl.load(eye + 1), z - tl.load(eye + 2)
-    inverse = 1.0 / tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-12)
+    x, y, z = _plain_direction(means, eye, n, real)
     a, b, c, d = _quat(quats, n, real)
     e, f, g, h = _quat(rest, n, real)
     e, f, g, h, _ = _unit(e, f, g, h)
     a, b, c, d = _product(a, b, c, d, e, -f, -g, -h)
     a, b, c, d, _ = _unit(a, b, c, d)
     none = 0.0 * x
-    e, f, g, h = _product(a, -b, -c, -d, none, x * inverse, y * inverse, z * inverse)
+    e, f, g, h = _product(a, -b, -c, -d, none, x, y, z)
     _, x, y, z = _product(e, f, g, h, a, b, c, d)
     return x, y, z
 
@@ -209,6 +216,25 @@ def colours(
     for k in tl.static_range(1, USED):
         value = _value(k, x, y, z) / gain
         r, g, b = _vector(colors, row + k, real)
+        red, green, blue = red + value * r, green + value * g, blue + value * b
+    tl.store(made + 3 * n, tl.maximum(red, 0.0), real)
+    tl.store(made + 3 * n + 1, tl.maximum(green, 0.0), real)
+    tl.store(made + 3 * n + 2, tl.maximum(blue, 0.0), real)
+
+
+@triton.jit(do_not_specialize=["count"])
+def splat_colours(
+    colors: tl.tensor, means: tl.tensor, eye: tl.tensor, made: tl.tensor, count: tl.tensor, USED: tl.constexpr
+) -> None:
+    """Fill made [n, 3] with the colours of splats, all of whose coefficients [n, USED, 3] are in use."""
+    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    real = n < count
+    x, y, z = _plain_direction(means, eye, n, real)
+    red, green, blue = _vector(colors, n * USED, real)
+    red, green, blue = red * _C0 + 0.5, green * _C0 + 0.5, blue * _C0 + 0.5
+    for k in tl.static_range(1, USED):
+        value = _value(k, x, y, z)
+        r, g, b = _vector(colors, n * USED + k, real)
         red, green, blue = red + value * r, green + value * g, blue + value * b
     tl.store(made + 3 * n, tl.maximum(red, 0.0), real)
     tl.store(made + 3 * n + 1, tl.maximum(green, 0.0), real)

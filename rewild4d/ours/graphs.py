@@ -38,6 +38,11 @@ def can_record(device: torch.device) -> bool:
     return device.type == "cuda" and kernel_mode() == "auto" and resolve("auto", device, torch.float32) == "triton"
 
 
+def room_for(pairs: int) -> int:
+    """Return the room of a recorded render that had so many pairs when it was measured."""
+    return max(LEAST, round(SPARE * pairs))
+
+
 class Recorder(Protocol):
     """Records work on a device."""
 
@@ -65,7 +70,7 @@ class CudaRecorder:
         finally:
             current.wait_stream(self.side)
 
-    def record(self, call: Callable[[], None]) -> Callable[[], None]:
+    def record(self, call: Callable[[], object]) -> Callable[[], None]:
         """Record a call without doing its work; return what does the work, on the same tensors."""
         graph = torch.cuda.CUDAGraph()
         self.side.synchronize()
@@ -153,7 +158,7 @@ class StepGraphs:
         return dict(zip(step.names, losses, strict=True))
 
     def _record(self, kind: Kind) -> Step:
-        step = Step(tuple(max(LEAST, round(SPARE * pairs)) for pairs in self.most[kind]))
+        step = Step(tuple(map(room_for, self.most[kind])))
         try:
             record = self.recorder.record
             step.replays = record(lambda: self._compute(kind, step)), record(lambda: self._follow(kind, step))

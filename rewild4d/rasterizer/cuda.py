@@ -126,8 +126,7 @@ class _TileLists(NamedTuple):
         slots: each entry's index in an order by rows, [room].
         counts: entries of each row, [V, N].
         ends: their running sum, [V * N].
-        buckets: first bucket of each tile of each view, and their end, int32, [V * tiles + 1].
-        pages: buckets that there is room for.
+        pages: buckets of entries, see `triton_blend.blend`, that there is room for.
     """
 
     tiles: tuple[int, int]
@@ -136,7 +135,6 @@ class _TileLists(NamedTuple):
     slots: Tensor
     counts: Tensor
     ends: Tensor
-    buckets: Tensor
     pages: int
 
 
@@ -165,9 +163,7 @@ def _list_tiles(
     triton_tiles.start_tiles[(triton.cdiv(max(room, number), ENTRIES),)](
         entry_keys, slots, owners, entries, starts, room, number, room.bit_length(), **LAUNCHES["start_tiles"]
     )
-    lengths = (starts[1:] - starts[:-1] + (BUCKET - 1)) // BUCKET
-    buckets = torch.nn.functional.pad(lengths.cumsum(0, dtype=torch.int32), (1, 0))
-    return _TileLists((across, down), starts, entries, slots, counts, ends, buckets, room // BUCKET + number - 1)
+    return _TileLists((across, down), starts, entries, slots, counts, ends, room // BUCKET + number)
 
 
 class _Blend(torch.autograd.Function):
@@ -184,7 +180,7 @@ class _Blend(torch.autograd.Function):
         kept = features.new_empty(lists.pages if any(ctx.needs_input_grad) else 0, 1 + channels, PIXELS)
         triton_blend.blend[(len(lists.starts) - 1, triton.cdiv(channels, part))](
             lists.starts, lists.entries, means2d, rests, records, features, background, image, alpha,
-            lists.buckets, kept, width, height, *lists.tiles, count, CHANNELS=channels, PART=part, KEEP=len(kept) > 0,
+            kept, width, height, *lists.tiles, count, CHANNELS=channels, PART=part, KEEP=len(kept) > 0,
             **LAUNCHES["blend"],
         )  # fmt: skip
         ctx.save_for_backward(means2d, rests, records, features, image, alpha, kept)
@@ -204,7 +200,7 @@ class _Blend(torch.autograd.Function):
             tiles = len(lists.starts) - 1
             triton_blend.blend_backward[(lists.pages,)](
                 lists.starts, lists.entries, lists.slots, means2d, rests, records, features, image, alpha,
-                lists.buckets, kept, g_image.contiguous(), g_alpha.contiguous(), sums, tiles, tiles.bit_length(),
+                kept, g_image.contiguous(), g_alpha.contiguous(), sums, tiles, tiles.bit_length(),
                 width, height, *lists.tiles, count, CHANNELS=channels, **LAUNCHES["blend_backward"],
             )  # fmt: skip
             triton_tiles.gather[(triton.cdiv(count, OWNERS), triton.cdiv(channels, part))](

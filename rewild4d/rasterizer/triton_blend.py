@@ -70,14 +70,15 @@ def _weights(alpha: tl.tensor, left: tl.tensor) -> tuple:
 @triton.jit(do_not_specialize=SIZES)
 def blend(
     starts: tl.tensor, entries: tl.tensor, centres: tl.tensor, rests: tl.tensor, records: tl.tensor,
-    features: tl.tensor, background: tl.tensor, image: tl.tensor, alpha_image: tl.tensor, buckets: tl.tensor,
-    kept: tl.tensor, width: tl.tensor, height: tl.tensor, across: tl.tensor, down: tl.tensor, count: tl.tensor,
-    CHANNELS: tl.constexpr, PART: tl.constexpr, GROUP: tl.constexpr, KEEP: tl.constexpr,
+    features: tl.tensor, background: tl.tensor, image: tl.tensor, alpha_image: tl.tensor, kept: tl.tensor,
+    width: tl.tensor, height: tl.tensor, across: tl.tensor, down: tl.tensor, count: tl.tensor, CHANNELS: tl.constexpr,
+    PART: tl.constexpr, GROUP: tl.constexpr, KEEP: tl.constexpr,
 ) -> None:  # fmt: skip
     """Fill image [V, C, h, w] and alpha [V, 1, h, w]; program (tile, part of the channels).
 
-    With KEEP also what was there before each bucket, its number from ``buckets`` [tiles + 1] on: kept [B, 1 + C, P] has
-    the transmittance, 0 where nothing is left to blend, and the channels.
+    With KEEP also what was there before each bucket: kept [B, 1 + C, P] has the transmittance, 0 where nothing is left
+    to blend, and the channels. The buckets of a tile are numbered from starts / BUCKET + tile on, so that no two are
+    the same.
     """
     tile = tl.program_id(0)
     view, x, y, inside = _pixels(tile, width, height, across, down)
@@ -87,7 +88,7 @@ def blend(
     left = tl.where(inside, 1.0, 0.0)
     through = left
     total = tl.zeros((PART, PIXELS), tl.float32)
-    start, bucket = first, tl.load(buckets + tile).to(tl.int64)
+    start, bucket = first, first // BUCKET + tile
     lane = tl.arange(0, PIXELS)
     while (first < end) & (tl.max(left, 0) > _LEAST_LEFT):
         if KEEP:  # noqa: SIM102 (a constant, and a number of the GPU)
@@ -107,7 +108,7 @@ def blend(
     if KEEP:  # noqa: SIM102
         if tl.program_id(1) == 0:
             page = bucket + (first - start + BUCKET - 1) // BUCKET
-            while page < tl.load(buckets + tile + 1):
+            while page < bucket + (end - start + BUCKET - 1) // BUCKET:
                 tl.store(kept + page * ((1 + CHANNELS) * PIXELS) + lane, tl.zeros((PIXELS,), tl.float32))
                 page += 1
     behind = tl.load(background + view * CHANNELS + channel, real_channel, 0.0)
@@ -122,7 +123,7 @@ def blend(
 @triton.jit(do_not_specialize=SIZES)
 def blend_backward(
     starts: tl.tensor, entries: tl.tensor, slots: tl.tensor, centres: tl.tensor, rests: tl.tensor, records: tl.tensor,
-    features: tl.tensor, image: tl.tensor, alpha_image: tl.tensor, buckets: tl.tensor, kept: tl.tensor,
+    features: tl.tensor, image: tl.tensor, alpha_image: tl.tensor, kept: tl.tensor,
     g_image: tl.tensor, g_alpha: tl.tensor, sums: tl.tensor, tiles: tl.tensor, steps: tl.tensor, width: tl.tensor,
     height: tl.tensor, across: tl.tensor, down: tl.tensor, count: tl.tensor, CHANNELS: tl.constexpr,
     GROUP: tl.constexpr,
@@ -132,16 +133,17 @@ def blend_backward(
     It goes front to back like the blend: the sum behind a Gaussian is the pixel's total minus the prefix.
     """
     bucket = tl.program_id(0)
-    if bucket >= tl.load(buckets + tiles):
-        return
-    tile, last = tl.zeros((), tl.int32), tiles
+    tile, last = tl.zeros((), tl.int32), tiles - 1
     for _ in range(steps):  # the last tile whose first bucket is not beyond
         middle = (tile + last + 1) // 2
-        beyond = tl.load(buckets + middle) > bucket
+        beyond = tl.load(starts + middle) // BUCKET + middle > bucket
         tile, last = tl.where(beyond, tile, middle), tl.where(beyond, middle - 1, last)
-    view, x, y, inside = _pixels(tile, width, height, across, down)
-    first = tl.load(starts + tile) + (bucket - tl.load(buckets + tile)) * BUCKET
+    start = tl.load(starts + tile)
+    first = start + (bucket - start // BUCKET - tile) * BUCKET
     end = tl.minimum(first + BUCKET, tl.load(starts + tile + 1))
+    if first >= end:
+        return
+    view, x, y, inside = _pixels(tile, width, height, across, down)
     page = kept + bucket.to(tl.int64) * ((1 + CHANNELS) * PIXELS) + tl.arange(0, PIXELS)
     pixel = (view.to(tl.int64) * height + y) * width + x
     plane = pixel + view * (CHANNELS - 1) * height.to(tl.int64) * width

@@ -34,7 +34,7 @@ from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_method
 from rewild4d.running import provenance
 from rewild4d.running.scoring import score
-from rewild4d.running.workers import Workers, share_cores, this_process
+from rewild4d.running.workers import Workers, share_cores, this_process, usable_cores
 from rewild4d.types import Case, Clip, Prior, Truth
 
 STAMP = "fit.json"
@@ -112,7 +112,8 @@ def execute(plan: Plan) -> list[RunRecord]:
                 _prepare(plan, name)
                 records += _run_case(plan, name)
         return records
-    with Workers(jobs, threads, plan.rasterizer) as workers:
+    gpus = usable_cores(plan.device) if plan.device.type == "cuda" else 0
+    with Workers(jobs, threads, plan.rasterizer, gpus) as workers:
         # Every fit of a case starts from its prior, so the priors come first.
         workers.map(_prepare, [(plan, name) for name in plan.cases], lambda *_: None)
         # Fits come first; lower bounds are short and fill the gaps.

@@ -29,9 +29,9 @@ class Threads(NamedTuple):
 
 
 def usable_cores(device: torch.device) -> int:
-    """Return how many processes a device can keep busy: one for each usable core, one in all on a GPU."""
+    """Return how many processes a device can keep busy: one for each usable core, one for each GPU."""
     if device.type == "cuda":
-        return 1
+        return 1 if device.index is not None else max(1, torch.cuda.device_count())
     if hasattr(os, "sched_getaffinity"):  # Linux alone can tell which cores a process may use
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -39,7 +39,8 @@ def usable_cores(device: torch.device) -> int:
 
 def share_cores(threads: int, fits: int, device: torch.device) -> Threads:
     """Choose the threads of each process where so many fits run at a time: kernels use the cores that no fit needs."""
-    return Threads(threads, max(threads, min(usable_cores(device) // max(fits, 1), MOST_THREADS)))
+    cores = 1 if device.type == "cuda" else usable_cores(device)
+    return Threads(threads, max(threads, min(cores // max(fits, 1), MOST_THREADS)))
 
 
 @contextmanager
@@ -60,23 +61,23 @@ def _settle(threads: Threads, rasterizer: str) -> int | None:
 
 
 class Workers:
-    """Processes side by side, each with threads of its own; they end with the `with` block.
+    """Processes side by side, each with threads of its own and one of ``gpus``; they end with the `with` block.
 
     Each is a pool of one: a pool of several is lost as a whole when one of its processes dies.
     """
 
-    def __init__(self, jobs: int, threads: Threads, rasterizer: str) -> None:
-        self._jobs, self._setup = jobs, (threads, rasterizer)
-        self._free: SimpleQueue[ProcessPoolExecutor] = SimpleQueue()
-        for _ in range(jobs):
-            self._free.put(self._pool())
+    def __init__(self, jobs: int, threads: Threads, rasterizer: str, gpus: int = 0) -> None:
+        self._jobs, self._setup, self._gpus = jobs, (threads, rasterizer), gpus
+        self._free: SimpleQueue[tuple[int, ProcessPoolExecutor]] = SimpleQueue()
+        for number in range(jobs):
+            self._free.put((number, self._pool(number)))
 
     def __enter__(self) -> "Workers":
         return self
 
     def __exit__(self, *error: object) -> None:
         for _ in range(self._jobs):
-            self._free.get().shutdown()
+            self._free.get()[1].shutdown()
 
     def map(self, function: Callable[..., T], pieces: Sequence[tuple[Any, ...]], lost: Callable[..., T]) -> list[T]:
         """Return function(*piece) in the order of the pieces; an exception of a call ends the map.
@@ -90,17 +91,17 @@ class Workers:
         stopped = Event()
 
         def work(piece: tuple[Any, ...]) -> T:
-            pool = self._free.get()
+            number, pool = self._free.get()
             try:
                 return pool.submit(_piece, function, piece).result()
             except BrokenProcessPool:
                 pool.shutdown()
-                pool = self._pool()
+                pool = self._pool(number)
                 if stopped.wait(0.5):  # Ctrl-C reaches all processes of a terminal, and a worker may end first
                     raise KeyboardInterrupt from None
                 return lost(*piece)
             finally:
-                self._free.put(pool)
+                self._free.put((number, pool))
 
         with ThreadPoolExecutor(self._jobs, initializer=block_interrupts, initargs=(True,)) as threads:
             try:
@@ -109,20 +110,26 @@ class Workers:
                 stopped.set()
                 raise
 
-    def _pool(self) -> ProcessPoolExecutor:
-        """Return a process that starts with its first piece."""
-        return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), start_worker, self._setup)
+    def _pool(self, number: int) -> ProcessPoolExecutor:
+        """Return a process that starts with its first piece; processes take the GPUs in turn."""
+        gpu = number % self._gpus if self._gpus > 1 else None
+        return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), start_worker, (*self._setup, gpu))
 
 
 def _piece(function: Callable[..., T], piece: tuple[Any, ...]) -> T:
     return function(*piece)
 
 
-def start_worker(threads: Threads, rasterizer: str) -> None:
-    """Set up a worker that ends with its parent: an orphan would write into the folder of the next start."""
+def start_worker(threads: Threads, rasterizer: str, gpu: int | None = None) -> None:
+    """Set up a worker that ends with its parent: an orphan would write into the folder of the next start.
+
+    On a machine with several GPUs "cuda" is ``gpu`` in this process.
+    """
     answer_interrupts(_piece.__code__)
     block_interrupts(False)  # an interpreter that starts prints pages about it
     _settle(threads, rasterizer)
+    if gpu is not None:
+        torch.cuda.set_device(gpu)
 
     def watch() -> None:
         parent = multiprocessing.parent_process()  # not os.getppid: on Windows the number stays when the parent ends

@@ -6,14 +6,17 @@
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from rewild4d.harmonics import seen_colors
 from rewild4d.kernels import gpu
 from rewild4d.ours.canonical import REST_GAIN, Gaussians
 from rewild4d.ours.losses import regularizers
 from rewild4d.transforms import quat_multiply
+from rewild4d.types import Splats
 
 COUNT = 300
 """Of Gaussians: three blocks, the last one not full."""
@@ -64,6 +67,14 @@ def errors(device: str) -> dict[str, list[float]]:
             return own.seen_rgb(means.double(), unit.double(), eye.double(), degree)
 
         found[f"colours of degree {degree}"] = compare(seen, twin, colors, learns=1)
+    splats = Splats(means, unit, means.exp(), means[:, 0].sigmoid(), 0.5 * normal(COUNT, 16, 3))
+
+    def shaded(colors: Tensor) -> Tensor:
+        if colors.dtype == torch.float32:
+            return gpu.splat_colors(colors, means, eye)
+        return seen_colors(replace(splats, colors=colors, means=means.double()), eye)
+
+    found["colours of splats"] = compare(shaded, shaded, splats.colors, learns=0)
     halves = normal(21, 3, 3) + 3 * torch.eye(3, device=device)
     positive = halves @ halves.mT
 

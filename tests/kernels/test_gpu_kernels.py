@@ -14,7 +14,13 @@ from rewild4d.kernels.switch import VARIABLE
 
 needs_triton = pytest.mark.skipif(not gpu._has_triton(), reason="triton is not installed here")
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU here")
-NAMES = {"multiply", "smallest axes", "top axes", *(f"colours of degree {degree}" for degree in (1, 2, 3))}
+NAMES = {
+    "multiply",
+    "smallest axes",
+    "top axes",
+    "colours of splats",
+    *(f"colours of degree {degree}" for degree in (1, 2, 3)),
+}
 
 
 @needs_triton

@@ -137,7 +137,7 @@ def test_kernels_compile_without_a_gpu(
 
 TYPES = {
     **dict.fromkeys(("keys", "first_keys", "starts", "slots", "ends"), "*i64"),
-    **dict.fromkeys(("wides", "owners", "entries", "buckets"), "*i32"),
+    **dict.fromkeys(("wides", "owners", "entries"), "*i32"),
     **{"v_cameras": "*fp64", "eps2d": "fp32", "near": "fp32"},
 }
 """Of all arguments that are neither sizes nor single precision arrays."""
