@@ -13,10 +13,13 @@ from torch import Tensor
 
 from rewild4d.harmonics import seen_colors
 from rewild4d.kernels import gpu
+from rewild4d.kernels.gpu_images import colour_sums
 from rewild4d.ours.canonical import REST_GAIN, Gaussians
 from rewild4d.ours.losses import regularizers
+from rewild4d.ours.losses.images import C1, C2, colour_losses
+from rewild4d.ours.symmetry import Target
 from rewild4d.transforms import quat_multiply
-from rewild4d.types import Splats
+from rewild4d.types import Camera, Splats
 
 COUNT = 300
 """Of Gaussians: three blocks, the last one not full."""
@@ -33,6 +36,14 @@ def compare(made: Callable[..., Tensor], twin: Callable[..., Tensor], *inputs: T
             (result * weights).sum().backward()
         found.append([result.detach(), *(leaf.grad for leaf in leaves[:learns])])
     return [float((one.double() - other).norm() / other.norm()) for one, other in zip(*found, strict=True)]
+
+
+def plain_sums(rgb: Tensor, alpha: Tensor, shown: Tensor, mask: Tensor, colour: Tensor) -> tuple[Tensor, Tensor]:
+    """What `colour_losses` says, times its area."""
+    camera = Camera(torch.eye(4), torch.eye(3), rgb.shape[2], rgb.shape[1])
+    whole = slice(0, rgb.shape[1]), slice(0, rgb.shape[2])
+    target = Target(shown.cpu(), mask.cpu(), camera, 3**-0.5)
+    return tuple(loss.to(rgb) for loss in colour_losses(rgb.cpu(), alpha.cpu(), target, colour.cpu(), whole))  # type: ignore[return-value]
 
 
 def errors(device: str) -> dict[str, list[float]]:
@@ -75,6 +86,14 @@ def errors(device: str) -> dict[str, list[float]]:
         return seen_colors(replace(splats, colors=colors, means=means.double()), eye)
 
     found["colours of splats"] = compare(shaded, shaded, splats.colors, learns=0)
+    rgb, shown, alpha, mask = normal(3, 37, 45), normal(3, 37, 45), normal(1, 37, 45), normal(1, 37, 45)
+    rgb, shown, alpha, mask = (part.sigmoid() for part in (rgb, shown, alpha, mask))
+    colour = torch.tensor((0.2, 0.9, 1.0), device=device)
+    found["L1 and SSIM"] = compare(
+        lambda *images: torch.stack(colour_sums(*images, shown, mask, colour, C1, C2)),
+        lambda *images: torch.stack(plain_sums(*images, shown.double(), mask.double(), colour.double())),
+        rgb, alpha, learns=2,
+    )  # fmt: skip
     halves = normal(21, 3, 3) + 3 * torch.eye(3, device=device)
     positive = halves @ halves.mT
 

@@ -16,6 +16,7 @@ needs_triton = pytest.mark.skipif(not gpu._has_triton(), reason="triton is not i
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU here")
 NAMES = {
     "multiply",
+    "L1 and SSIM",
     "smallest axes",
     "top axes",
     "colours of splats",

@@ -16,7 +16,7 @@ from rewild4d.kernels.threads import run_tickets
 
 COLOUR_LOSSES = Kernel(
     "colour losses",
-    "9b896ed85346",
+    "fc12a830ed81",
     "rewild4d.ours.losses.images:colour_losses",
     "rewild4d.ours.losses.images:ssim_map",
     "rewild4d.ours.losses.images:blur_matrix",

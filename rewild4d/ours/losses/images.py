@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy
 
+from rewild4d.kernels import gpu
+from rewild4d.kernels.gpu_images import colour_sums
 from rewild4d.ours.fused.images import COLOUR_LOSSES, SILHOUETTE, colour_means, matte_loss
 from rewild4d.ours.symmetry import Target
 
@@ -74,6 +76,9 @@ def colour_losses(
     if COLOUR_LOSSES.takes(rgb):
         bounds = (inner[0].start, inner[0].stop, inner[1].start, inner[1].stop)
         return colour_means(rgb, alpha, target.rgb, target.mask, background, _corner_and_size(window), bounds, area)
+    if gpu.on_gpu(rgb) and window == (slice(0, rgb.shape[1]), slice(0, rgb.shape[2])):
+        l1, dissimilarity = colour_sums(rgb, alpha, target.rgb, target.mask, background, C1, C2)
+        return l1 / area, dissimilarity / area
     behind = background[:, None, None]
     x = rgb[:, *window] + (1 - alpha[:, *window]) * behind
     y = target.rgb[:, *window] + (1 - target.mask[:, *window]) * behind
