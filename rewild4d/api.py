@@ -211,7 +211,7 @@ def render(
     if camera is None:
         raise UserError("render: the reconstruction does not know the input camera; give one, such as a frame's.")
     colors, alpha = render_splats(reconstruction.at(time), camera)
-    return (colors + (1 - alpha) * background).clamp(0, 1).permute(1, 2, 0).numpy()
+    return (colors + (1 - alpha) * background).clamp(0, 1).permute(1, 2, 0).cpu().numpy()
 
 
 def evaluate(reconstruction: Reconstruction, case: LoadedCase, progress: bool = True) -> "pd.DataFrame":
