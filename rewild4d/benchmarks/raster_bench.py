@@ -85,7 +85,7 @@ def _recorded(calls: Contenders, device: torch.device) -> Contenders:
             with rooms.measured() as found:
                 call()
             with rooms.given([room_for(int(pairs)) for pairs in found.pairs]):
-                made[RECORDED, quantity] = recorder.record(call)
+                (made[RECORDED, quantity],) = recorder.record(call)
     return made
 
 

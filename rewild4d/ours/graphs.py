@@ -49,15 +49,15 @@ class Recorder(Protocol):
     def stream(self) -> AbstractContextManager[None]:
         """Return the `with` block in which all work is queued, recorded or not."""
 
-    def record(self, call: Callable[[], None]) -> Callable[[], None]:
-        """Record a call without doing its work; return what does the work, on the same tensors."""
+    def record(self, *calls: Callable[[], object]) -> tuple[Callable[[], None], ...]:
+        """Record calls without doing their work; return what does the work of each, on the same tensors."""
 
 
 class CudaRecorder:
-    """CUDA graphs that share their memory, on a stream of their own."""
+    """CUDA graphs on a stream of their own."""
 
     def __init__(self, device: torch.device) -> None:
-        self.side, self.pool = torch.cuda.Stream(device), torch.cuda.graph_pool_handle()
+        self.side = torch.cuda.Stream(device)
 
     @contextmanager
     def stream(self) -> Iterator[None]:
@@ -70,16 +70,22 @@ class CudaRecorder:
         finally:
             current.wait_stream(self.side)
 
-    def record(self, call: Callable[[], object]) -> Callable[[], None]:
-        """Record a call without doing its work; return what does the work, on the same tensors."""
-        graph = torch.cuda.CUDAGraph()
-        self.side.synchronize()
-        graph.capture_begin(pool=self.pool, capture_error_mode="thread_local")
-        try:
-            call()
-        finally:
-            graph.capture_end()
-        return graph.replay
+    def record(self, *calls: Callable[[], object]) -> tuple[Callable[[], None], ...]:
+        """Record calls without doing their work; return what does the work of each, on the same tensors.
+
+        Their graphs share memory that is theirs alone: torch does not use a pool again whose graphs are all gone.
+        """
+        pool, made = torch.cuda.graph_pool_handle(), []
+        for call in calls:
+            graph = torch.cuda.CUDAGraph()
+            self.side.synchronize()
+            graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+            try:
+                call()
+            finally:
+                graph.capture_end()
+            made.append(graph.replay)
+        return tuple(made)
 
 
 @dataclass
@@ -160,8 +166,7 @@ class StepGraphs:
     def _record(self, kind: Kind) -> Step:
         step = Step(tuple(map(room_for, self.most[kind])))
         try:
-            record = self.recorder.record
-            step.replays = record(lambda: self._compute(kind, step)), record(lambda: self._follow(kind, step))
+            step.replays = self.recorder.record(lambda: self._compute(kind, step), lambda: self._follow(kind, step))
         except RuntimeError as error:
             logger.warning("steps are not recorded as CUDA graphs and take longer: %s", error)
             self.records, step.replays = False, ()
