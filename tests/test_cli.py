@@ -75,6 +75,7 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
         (["check"], "check: expected either --dataset (with --data) or --method"),
         (["evaluate", "/no/such/run"], "/no/such/run/record.json: expected a run record"),
         (["make", "artemi"], "Did you mean 'artemis'?"),
+        (["make", "zoo", "--seeds", "150", "--out", "x"], "zoo: expected a seed of 0 to 99 (development) or of 1000"),
         (["make", "artemis", "--rig", "/no.glb", "--clip", "Walk", "--out", "x", "--size", "640"], "got '640'"),
         (
             ["make", "artemis", "--rig", "/no.glb", "--clip", "Walk", "--out", "x", "--size", "640x99999"],

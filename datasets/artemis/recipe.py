@@ -12,25 +12,35 @@ RENDERER = "render-v1"
 """Raised, like the version of the built-in animals, by an edit that changes pictures or truth by more than rounding."""
 
 
-def write_recipe(folder: Path, ingredients: dict[str, Any]) -> None:
+def write_recipe(folder: Path, made_of: dict[str, Any]) -> None:
     """Write the recipe of a finished folder, with a digest of the files that it gave.
 
     Args:
         folder: holds all files, but no recipe yet.
-        ingredients: everything that decides what is rendered, except the processor.
+        made_of: everything that decides what is rendered, except the processor.
     """
-    text = {"ingredients": {"renderer": RENDERER, **ingredients}, "files": _files(folder)}
+    text = {"ingredients": {"renderer": RENDERER, **made_of}, "files": _files(folder)}
     (folder / FILE).write_text(json.dumps(text, indent=1) + "\n", encoding="utf-8")
 
 
 def read_recipe(folder: Path) -> str:
     """Return the digest of the recipe; "" where there is none, or where the files are no longer those rendered."""
+    made_of, files = _read(folder)
+    return digest(json.dumps(made_of, sort_keys=True))[:16] if files and files == _files(folder) else ""
+
+
+def ingredients(folder: Path) -> dict[str, Any]:
+    """Return what a rendered folder says that it was made of; nothing where it has no recipe."""
+    return _read(folder)[0]
+
+
+def _read(folder: Path) -> tuple[dict[str, Any], str]:
+    """Return the ingredients and the digest of the files; empty where there is no recipe."""
     try:
         recipe = json.loads((folder / FILE).read_text(encoding="utf-8"))
-        ingredients, files = recipe["ingredients"], recipe["files"]
+        return dict(recipe["ingredients"]), str(recipe["files"])
     except (OSError, ValueError, KeyError, TypeError):
-        return ""
-    return digest(json.dumps(ingredients, sort_keys=True))[:16] if files == _files(folder) else ""
+        return {}, ""
 
 
 def _files(folder: Path) -> str:

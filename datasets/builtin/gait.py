@@ -67,7 +67,7 @@ def pose(skeleton: Skeleton, gait: Gait, time: float) -> np.ndarray:
             continue
         values = _wave_values(name, gait, time)
         parent = moved[skeleton.parents[j]] if skeleton.parents[j] >= 0 else np.eye(4)
-        local = _about(skeleton.heads[j], _rotation(values["pitch"], values["yaw"], values["roll"]))
+        local = about(skeleton.heads[j], rotation(values["pitch"], values["yaw"], values["roll"]))
         local[:3, 3] += (0.0, values["rise"], values["surge"])
         moved[j] = parent @ local
     for touchdown, foot in zip(gait.touchdown, FEET, strict=True):
@@ -103,7 +103,7 @@ def _place_leg(skeleton: Skeleton, moved: np.ndarray, foot: str, gait: Gait, pha
     bones = [skeleton.names.index(f"{limb}.{i}.{side}") for i in range(4)]
     joints = [skeleton.heads[b] for b in bones] + [skeleton.tails[bones[3]]]
     steps = [(b - a)[1:] for a, b in zip(joints, joints[1:], strict=False)]
-    rest, lengths = [_angle(s) for s in steps], [float(np.linalg.norm(s)) for s in steps]
+    rest, lengths = [angle_of(s) for s in steps], [float(np.linalg.norm(s)) for s in steps]
     parent = moved[skeleton.parents[bones[0]]]
     hip = (parent @ np.append(joints[0], 1.0))[:3]
 
@@ -116,37 +116,37 @@ def _place_leg(skeleton: Skeleton, moved: np.ndarray, foot: str, gait: Gait, pha
     lean = -np.arctan2(forward, joints[0][1])
     fold = np.radians(gait.fold) * share * flexion
     cannon = rest[2] + lean + fold
-    hock = fetlock - lengths[2] * _direction(cannon)
+    hock = fetlock - lengths[2] * direction(cannon)
     reach = hock - hip[1:]
     span = np.clip(np.linalg.norm(reach), abs(lengths[0] - lengths[1]) * 1.001, (lengths[0] + lengths[1]) * 0.999)
     bend = np.arccos((lengths[0] ** 2 + span**2 - lengths[1] ** 2) / (2 * lengths[0] * span))
-    side_of_bend = np.sign(_wrap(rest[0] - _angle(steps[0] + steps[1])))
-    upper = _angle(reach) + side_of_bend * bend
-    knee = hip[1:] + lengths[0] * _direction(upper)
-    lower = _angle(hip[1:] + span * reach / np.linalg.norm(reach) - knee)
+    side_of_bend = np.sign(wrap(rest[0] - angle_of(steps[0] + steps[1])))
+    upper = angle_of(reach) + side_of_bend * bend
+    knee = hip[1:] + lengths[0] * direction(upper)
+    lower = angle_of(hip[1:] + span * reach / np.linalg.norm(reach) - knee)
 
     at = hip
     angles = (upper, lower, cannon, rest[3] + fold)
     for bone, angle, start, length in zip(bones, angles, range(4), lengths, strict=True):
-        moved[bone] = _about(joints[start], _rotation(np.degrees(angle - rest[start]), 0.0, 0.0))
+        moved[bone] = about(joints[start], rotation(np.degrees(angle - rest[start]), 0.0, 0.0))
         moved[bone, :3, 3] += at - joints[start]
-        at = at + np.append(joints[start + 1][0] - joints[start][0], length * _direction(angle))
+        at = at + np.append(joints[start + 1][0] - joints[start][0], length * direction(angle))
 
 
-def _angle(vector: np.ndarray) -> float:
+def angle_of(vector: np.ndarray) -> float:
     """Return the angle of (y, z) from up towards ahead, radians: pitch adds to it."""
     return float(np.arctan2(vector[1], vector[0]))
 
 
-def _direction(angle: float) -> np.ndarray:
+def direction(angle: float) -> np.ndarray:
     return np.array((np.cos(angle), np.sin(angle)))
 
 
-def _wrap(angle: float) -> float:
+def wrap(angle: float) -> float:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def _rotation(pitch: float, yaw: float, roll: float) -> np.ndarray:
+def rotation(pitch: float, yaw: float, roll: float) -> np.ndarray:
     """yaw * pitch * roll in degrees, [3, 3]."""
     (cx, sx), (cy, sy), (cz, sz) = ((np.cos(a), np.sin(a)) for a in np.radians((pitch, yaw, roll)))
     about_x = np.array(((1, 0, 0), (0, cx, -sx), (0, sx, cx)))
@@ -155,7 +155,7 @@ def _rotation(pitch: float, yaw: float, roll: float) -> np.ndarray:
     return about_y @ about_x @ about_z
 
 
-def _about(pivot: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+def about(pivot: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, pivot - rotation @ pivot
     return matrix

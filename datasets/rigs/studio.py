@@ -130,9 +130,9 @@ def render_artemis(
         for animal in animals:
             writer.motion(animal.motion, animal.bones)
             for frame in range(len(animal.bones)):
-                picture = _picture(animal, frame)
+                drawn = picture(animal, frame)
                 for view, camera in enumerate(cameras):
-                    rgb, alpha = picture.render(camera)
+                    rgb, alpha = drawn.render(camera)
                     pending.append(encoder.submit(writer.image, animal.motion, frame, view, rgb, alpha))
                     if len(pending) > PENDING:
                         pending.pop(0).result()
@@ -165,7 +165,7 @@ def _expect_empty(out: Path) -> None:
         raise UserError(f"{out}: expected a new or an empty folder, got one that holds files.")
 
 
-def _picture(animal: AnimatedAnimal, frame: int) -> Picture:
+def picture(animal: AnimatedAnimal, frame: int) -> Picture:
     """Return the animal at one frame; rays are cast relative to its middle, where single precision is best."""
     posed = animal.posed(frame)
     points = np.concatenate(posed)
