@@ -56,7 +56,8 @@ KINDS = {
                     tail_girth=(0.045, 0.025), tail_angle=75, tail_curl=4,
                     leg_girth=(0.21, 0.165, 0.12, 0.125), paws=0.25, ears=0.42, ear_form="round",
                     extras=("trunk", "tusks", "tuft")),
-        ("grey",), ("plain", "belly"), (("walk",), ("stand",), ("turn",), ("walk", "stand")), {**PAINTS, "ear": "77736f", "hoof": "6f6a64"},
+        ("grey",), ("plain", "belly"), (("walk",), ("stand",), ("turn",), ("walk", "stand")),
+        {**PAINTS, "ear": "77736f", "hoof": "6f6a64"},
     ),
     "cat": Kind(
         Proportions(size=0.3, trunk=1.15, girth=(0.19, 0.19, 0.19), neck=0.28, neck_angle=35, neck_girth=(0.15, 0.13),
