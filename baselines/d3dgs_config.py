@@ -7,7 +7,8 @@ from msgspec import Meta
 
 from rewild4d.baselines.common.splatting_config import ImageLoss, Resets, SplatConfig
 from rewild4d.contracts import MethodInfo
-from rewild4d.ours.config import Canonical, Degree, Density, Opacity, Positive, Rate, Share, Weight, Whole
+from rewild4d.ours.config import Canonical, Density
+from rewild4d.ours.numbers import Degree, Opacity, Positive, Rate, Share, Weight, Whole
 
 PAPER = "Yang et al., Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene Reconstruction, CVPR 2024"
 LICENCE = "MIT (written anew from the paper)"

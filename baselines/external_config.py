@@ -6,7 +6,7 @@ import msgspec
 
 from rewild4d.contracts import MethodInfo
 from rewild4d.foreign.programs import TIMEOUT
-from rewild4d.ours.config import Count, Positive
+from rewild4d.ours.numbers import Count, Positive
 
 INFO = MethodInfo(title="anybody's program, by files", paper="that of the program", licence="that of the program")
 

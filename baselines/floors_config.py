@@ -3,7 +3,7 @@
 import msgspec
 
 from rewild4d.contracts import MethodInfo
-from rewild4d.ours.config import Count, Positive
+from rewild4d.ours.numbers import Count, Positive
 
 EMPTY_INFO = MethodInfo(title="empty", paper="", licence="MIT", is_floor=True, uses_prior=False)
 PRIOR_ONLY_INFO = MethodInfo(

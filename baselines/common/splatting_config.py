@@ -2,7 +2,8 @@
 
 import msgspec
 
-from rewild4d.ours.config import Canonical, Count, Density, Opacity, Rate, Size, Weight, Whole
+from rewild4d.ours.config import Canonical, Density
+from rewild4d.ours.numbers import Count, Opacity, Rate, Size, Weight, Whole
 
 
 class GaussianRates(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -1,6 +1,7 @@
 """Training loop: warm-up, then the stage-aware losses of METHOD section 6."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from rewild4d.ours.inputs import StepInput
 from rewild4d.ours.losses.images import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.losses.regularizers import compact_loss, neighbours, random_direction, rigid_loss, smooth_loss
 from rewild4d.ours.losses.skeleton import neighbour_keys, posture
+from rewild4d.ours.losses.skin import StartingSkin, bind_loss, disc_loss
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.pose import blend_poses, pose_distance
 from rewild4d.ours.schedule import exponential, fade, ramp
@@ -47,6 +49,8 @@ class Training(GaussianTraining):
         }
         model.field.logits.requires_grad_(config.skinning.learn)
         super().__init__(model, groups, config, supervision, generator)
+        self.skin = StartingSkin.of(model.gaussians)
+        self.bound: Tensor | None = None
         self.graphs = StepGraphs(self, CudaRecorder(model.pivots.device)) if can_record(model.pivots.device) else None
 
     def step(self, index: int) -> dict[str, float]:
@@ -177,18 +181,39 @@ class Training(GaussianTraining):
             losses["rigid"] = config.rigid * rigid_loss(own.means, deformed.means, self.near)
         if config.steady:
             losses["steady"] = config.steady * (deformed.log_scales - posed.log_scales).square().mean()
+        return losses | self._skin_losses(opacities)
+
+    def _skin_losses(self, opacities: Tensor) -> dict[str, Tensor]:
+        config, own = self.config.skin, self.model.gaussians
+        losses: dict[str, Tensor] = {}
+        if config.disc:
+            losses["disc"] = config.disc * disc_loss(own.scales_log(), opacities, self.skin.log_radius, config)
+        if config.bind:
+            assert self.bound is not None, "`prepare` comes first"
+            losses["bind"] = config.bind * bind_loss(own.means, own.quats, self.skin, self.bound, config)
         return losses
 
     def change_density(self, index: int) -> bool:
         changed = super().change_density(index)
+        self.bound = None if changed else self.bound
         if changed and self.graphs is not None:
             self.graphs.forget()
         return changed
 
     def prepare(self) -> None:
-        """Search each Gaussian's neighbours, where a loss needs them and the set of Gaussians changed."""
+        """Search each Gaussian's neighbours and its point of the skin, where a loss needs them and the set of Gaussians
+        changed."""
         if self.config.geometry.rigid and len(self.model.gaussians) > 1 and self.near is None:
             self.near = neighbours(self.model.gaussians.means, self.config.geometry.rigid_neighbours)
+        if self.config.skin.bind and self.bound is None:
+            self.bound = self.skin.nearest(self.model.gaussians.means)
+
+    def state(self) -> dict[str, Any]:
+        return super().state() | {"bound": self.bound}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        super().restore(state)
+        self.bound = state.get("bound")
 
     def limited(self) -> Tensor:
         """Clip the networks' gradients as `check_gradients` does, without a look at a number; return whether all

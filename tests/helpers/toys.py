@@ -4,7 +4,8 @@ import math
 
 import torch
 
-from rewild4d.ours.config import Canonical, Config, Deform, Density, Geometry, Skinning, WarmUp
+from rewild4d.ours.config import Canonical, Config, Deform, Density, Skinning, WarmUp
+from rewild4d.ours.losses.config import Geometry
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.motion import quats_from_normals, sample_surface
 from rewild4d.priors.template import PARENTS, posed_prior, quadruped

@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from rewild4d.ours.canonical import initial_gaussians
-from rewild4d.ours.config import Canonical, Config, Deform, Geometry, Loss, Pose, PriorUse, Skinning
+from rewild4d.ours.config import Canonical, Config, Deform, Pose, PriorUse, Skinning
 from rewild4d.ours.fit import Training
+from rewild4d.ours.losses.config import Geometry, Loss
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.symmetry import Key, Supervision
 from rewild4d.running.conformance import tiny_case

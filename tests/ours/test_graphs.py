@@ -14,11 +14,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from rewild4d.config import load_preset
 from rewild4d.kernels.switch import VARIABLE
 from rewild4d.ours import fit
-from rewild4d.ours.config import Config, Density, Geometry
+from rewild4d.ours.config import Config, Density
 from rewild4d.ours.fit import Training
 from rewild4d.ours.graphs import CudaRecorder, StepGraphs
 from rewild4d.ours.inputs import StepInput
 from rewild4d.ours.losses import regularizers
+from rewild4d.ours.losses.config import Geometry
 from rewild4d.ours.model import build_model
 from rewild4d.ours.slots import Kind, Slots
 from rewild4d.ours.symmetry import Supervision

@@ -7,10 +7,11 @@ from twins import Make, check_twins, leaves, normal, same_on_any_threads, unit
 
 from rewild4d.kernels.halves import available
 from rewild4d.ours.canonical import Gaussians
-from rewild4d.ours.config import Config, Deform, Loss, Skinning
+from rewild4d.ours.config import Config, Deform, Skinning
 from rewild4d.ours.deform import DeformNetwork, Posed
 from rewild4d.ours.fused.harmonics import seen_rgb
 from rewild4d.ours.fused.skinning import skin_both
+from rewild4d.ours.losses.config import Loss
 from rewild4d.ours.losses.images import colour_losses, silhouette_loss, union_window
 from rewild4d.ours.losses.regularizers import compact_loss
 from rewild4d.ours.model import Model

@@ -10,8 +10,9 @@ from torch import Tensor
 from twins import check_twins, leaves, normal, same_on_any_threads, unit
 
 from rewild4d.ours.canonical import Gaussians
-from rewild4d.ours.config import Config, Deform, Geometry
+from rewild4d.ours.config import Config, Deform
 from rewild4d.ours.config import Pose as PoseConfig
+from rewild4d.ours.losses.config import Geometry
 from rewild4d.ours.losses.skeleton import posture, skeleton_losses
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import Pose, PoseNetwork, blend_poses, pose_distance, time_code

@@ -222,6 +222,12 @@ def neighbours(points: Tensor, count: int) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(index[:, 1:])).to(points.device)
 
 
+def nearest_rows(points: Tensor, queries: Tensor) -> Tensor:
+    """Return the index of the nearest of points [m, 3] for each query, [n, 3] -> [n]."""
+    tree = cKDTree(points.detach().cpu().double().numpy())
+    return torch.from_numpy(tree.query(queries.detach().cpu().double().numpy())[1]).to(queries.device)
+
+
 def rigid_loss(canonical: Tensor, deformed: Tensor, near: Tensor) -> Tensor:
     """Compute the mean change of distance to canonical neighbours ``near`` [n, k] (as isometric as possible)."""
     rest = (canonical.detach()[:, None] - canonical.detach()[near]).norm(dim=-1)

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from rewild4d.ours.config import Geometry
 from rewild4d.ours.fused.skeleton import POSTURE, Weights, posture_and_losses
+from rewild4d.ours.losses.config import Geometry
 from rewild4d.ours.losses.regularizers import attach_loss, limit_loss, sagittal_losses, still_loss, temporal_loss
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import Pose
