@@ -103,7 +103,7 @@ def _place_leg(skeleton: Skeleton, moved: np.ndarray, foot: str, gait: Gait, pha
     bones = [skeleton.names.index(f"{limb}.{i}.{side}") for i in range(4)]
     joints = [skeleton.heads[b] for b in bones] + [skeleton.tails[bones[3]]]
     steps = [(b - a)[1:] for a, b in zip(joints, joints[1:], strict=False)]
-    rest, lengths = [angle_of(s) for s in steps], [float(np.linalg.norm(s)) for s in steps]
+    rest = [angle_of(s) for s in steps]
     parent = moved[skeleton.parents[bones[0]]]
     hip = (parent @ np.append(joints[0], 1.0))[:3]
 
@@ -116,21 +116,41 @@ def _place_leg(skeleton: Skeleton, moved: np.ndarray, foot: str, gait: Gait, pha
     lean = -np.arctan2(forward, joints[0][1])
     fold = np.radians(gait.fold) * share * flexion
     cannon = rest[2] + lean + fold
-    hock = fetlock - lengths[2] * direction(cannon)
+    for bone, matrix in zip(bones, bend_leg(joints, hip, fetlock, cannon, rest[3] + fold), strict=True):
+        moved[bone] = matrix
+
+
+def bend_leg(
+    joints: list[np.ndarray], hip: np.ndarray, fetlock: np.ndarray, cannon: float, toe: float
+) -> list[np.ndarray]:
+    """Return rest-to-posed transforms of a leg's four bones in a plane along the body, each [4, 4]; out of reach it
+    stretches.
+
+    Args:
+        joints: at rest, from the hip to the end of the toe, five of [3].
+        hip: where the leg hangs, [3].
+        fetlock: y and z of the fourth joint, [2].
+        cannon: angle of the third bone (see `angle_of`).
+        toe: angle of the fourth.
+    """
+    steps = [(b - a)[1:] for a, b in zip(joints, joints[1:], strict=False)]
+    rest, lengths = [angle_of(s) for s in steps], [float(np.linalg.norm(s)) for s in steps]
+    hock = fetlock - lengths[2] * _direction(cannon)
     reach = hock - hip[1:]
     span = np.clip(np.linalg.norm(reach), abs(lengths[0] - lengths[1]) * 1.001, (lengths[0] + lengths[1]) * 0.999)
     bend = np.arccos((lengths[0] ** 2 + span**2 - lengths[1] ** 2) / (2 * lengths[0] * span))
-    side_of_bend = np.sign(wrap(rest[0] - angle_of(steps[0] + steps[1])))
+    side_of_bend = np.sign(_wrap(rest[0] - angle_of(steps[0] + steps[1])))
     upper = angle_of(reach) + side_of_bend * bend
-    knee = hip[1:] + lengths[0] * direction(upper)
+    knee = hip[1:] + lengths[0] * _direction(upper)
     lower = angle_of(hip[1:] + span * reach / np.linalg.norm(reach) - knee)
 
     at = hip
-    angles = (upper, lower, cannon, rest[3] + fold)
-    for bone, angle, start, length in zip(bones, angles, range(4), lengths, strict=True):
-        moved[bone] = about(joints[start], rotation(np.degrees(angle - rest[start]), 0.0, 0.0))
-        moved[bone, :3, 3] += at - joints[start]
-        at = at + np.append(joints[start + 1][0] - joints[start][0], length * direction(angle))
+    matrices = []
+    for angle, start, length in zip((upper, lower, cannon, toe), range(4), lengths, strict=True):
+        matrices.append(about(joints[start], rotation(np.degrees(angle - rest[start]), 0.0, 0.0)))
+        matrices[-1][:3, 3] += at - joints[start]
+        at = at + np.append(joints[start + 1][0] - joints[start][0], length * _direction(angle))
+    return matrices
 
 
 def angle_of(vector: np.ndarray) -> float:
@@ -138,11 +158,11 @@ def angle_of(vector: np.ndarray) -> float:
     return float(np.arctan2(vector[1], vector[0]))
 
 
-def direction(angle: float) -> np.ndarray:
+def _direction(angle: float) -> np.ndarray:
     return np.array((np.cos(angle), np.sin(angle)))
 
 
-def wrap(angle: float) -> float:
+def _wrap(angle: float) -> float:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 

@@ -4,7 +4,6 @@ A horse (y up), a tiger (z up) and a giraffe, each with its own size, place and 
 nothing downstream can lean on an axis. Everything is deterministic.
 """
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -14,12 +13,12 @@ import numpy as np
 
 from rewild4d.datasets import surface_nets
 from rewild4d.datasets.artemis import writer as artemis_writer
-from rewild4d.datasets.builtin import anatomy, bodies, coats, gait, implicit
+from rewild4d.datasets.builtin import anatomy, bodies, building, coats, gait, implicit
 from rewild4d.datasets.builtin.gait import Gait, Wave
 from rewild4d.datasets.rigs import animal, closest_points, shading, studio, voxels
 from rewild4d.datasets.rigs.animal import AnimatedAnimal, Surface
 from rewild4d.datasets.rigs.studio import Progress, render_artemis
-from rewild4d.errors import UserError, unknown_name
+from rewild4d.errors import unknown_name
 from rewild4d.files import cache_folder, digest
 
 LICENCE = "CC0 1.0 (made by rewild4d)"
@@ -134,26 +133,13 @@ def rest_surface(name: str) -> Surface:
     if name not in RECIPES:
         raise unknown_name("built-in animal", name, RECIPES)
     recipe = RECIPES[name]
-    skeleton, flesh = anatomy.assemble(recipe.body)
-    vertices, faces = implicit.polygonise(flesh, recipe.body.cell)
-    indices, weights = implicit.skinning(vertices, faces, flesh, len(skeleton.names))
-    labels = np.array([part.paint for part in flesh])[implicit.nearest_part(vertices, flesh)]
-    eye = np.abs(vertices[:, :1]) * (1, 0, 0) + vertices * (0, 1, 1) - recipe.body.eye[:3]
-    labels = np.where(np.linalg.norm(eye, axis=1) < recipe.body.eye[3], "eye", labels)
-    colors = coats.painted(recipe.coat, vertices, surface_nets.normals(vertices, faces), labels, recipe.paints)
-    return Surface(vertices, faces, indices, weights, colors, None, None)
+    return building.dressed(recipe.body, recipe.coat, recipe.paints)[1]
 
 
 def placement(name: str) -> np.ndarray:
     """Return the rigid matrix from an animal's body frame to its world, [4, 4]."""
     recipe = RECIPES[name]
-    angle = np.radians(recipe.heading)
-    matrix = np.eye(4)
-    matrix[:3, :3] = ((np.cos(angle), 0, np.sin(angle)), (0, 1, 0), (-np.sin(angle), 0, np.cos(angle)))
-    # Cyclic steps of the axes are rotations: y to y, or y to z.
-    matrix[:3] = np.roll(matrix[:3], recipe.up - 1, axis=0)
-    matrix[:3, 3] = recipe.place
-    return matrix
+    return building.world_matrix(recipe.heading, recipe.up, recipe.place)
 
 
 @cache
@@ -165,8 +151,7 @@ def build(name: str) -> list[AnimatedAnimal]:
     """
     rest, recipe, world = rest_surface(name), RECIPES[name], placement(name)
     skeleton, _ = anatomy.assemble(recipe.body)
-    vertices = rest.vertices @ world[:3, :3].T + world[:3, 3]
-    surface = Surface(vertices, rest.faces, rest.bone_indices, rest.bone_weights, rest.colors, None, None)
+    surface = building.placed(rest, world)
     return [
         AnimatedAnimal(
             name=name,
@@ -187,7 +172,7 @@ def build(name: str) -> list[AnimatedAnimal]:
 
 def recipe_digest() -> str:
     """SHA-256 over everything that decides what the built-in data looks like: the sources, the size and the count."""
-    made_by = (anatomy, bodies, coats, gait, implicit, surface_nets)
+    made_by = (anatomy, bodies, building, coats, gait, implicit, surface_nets)
     rendered_by = (animal, artemis_writer, closest_points, shading, studio, voxels)
     sources = [Path(module.__file__ or "").read_bytes() for module in (*made_by, *rendered_by)]
     return digest(Path(__file__).read_bytes(), *sources)
@@ -231,27 +216,13 @@ def render(
     Raises:
         UserError: the folder cannot be written, or there is no such animal.
     """
+
+    def job(name: str) -> building.Job:
+        def render_one(folder: Path, shifted: Progress) -> None:
+            render_artemis(build(name), folder, views=views, width=width, height=height, progress=shifted)
+
+        return building.Job(sum(views * len(motion.bones) for motion in build(name)), render_one)
+
     missing = [name for name in names if not (root / name).is_dir()]
-    images = {name: sum(views * len(motion.bones) for motion in build(name)) for name in missing}
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{root}: expected a folder that can be written, but: {error.strerror}.") from error
-    before, total = 0, sum(images.values())
-    for name in missing:
-
-        def shifted(done: int, _: int, before: int = before) -> None:
-            if progress:
-                progress(before + done, total)
-
-        with tempfile.TemporaryDirectory(dir=root.parent, prefix=f".{root.name}-") as scratch:
-            made = Path(scratch) / name
-            render_artemis(build(name), made, views=views, width=width, height=height, progress=shifted)
-            try:
-                made.rename(root / name)
-            except OSError:
-                # Another process was faster: its data are the same.
-                if not (root / name).is_dir():
-                    raise
-        before += images[name]
+    building.render_missing(root, {name: job(name) for name in missing}, progress)
     return root

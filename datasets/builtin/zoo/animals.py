@@ -3,7 +3,6 @@
 Seeds 0 to 99 are animals to develop on. Seeds from 1,000 on are the test set: scored at the end, never tuned on.
 """
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -12,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from rewild4d.datasets import surface_nets
 from rewild4d.datasets.artemis.recipe import ingredients
-from rewild4d.datasets.builtin import anatomy, coats, implicit
+from rewild4d.datasets.builtin import anatomy, building, coats
 from rewild4d.datasets.builtin.zoo import bodies, motions
 from rewild4d.datasets.builtin.zoo import coats as zoo_coats
 from rewild4d.datasets.builtin.zoo.kinds import KINDS, NAMES
@@ -94,15 +92,7 @@ def draw(seed: int) -> ZooAnimal:
 def _rest(seed: int) -> tuple[anatomy.Skeleton, Surface]:
     """Return skeleton and surface at rest in the body frame."""
     animal = draw(seed)
-    body = bodies.body(animal.proportions)
-    skeleton, flesh = anatomy.assemble(body)
-    vertices, faces = implicit.polygonise(flesh, body.cell)
-    indices, weights = implicit.skinning(vertices, faces, flesh, len(skeleton.names))
-    labels = np.array([part.paint for part in flesh])[implicit.nearest_part(vertices, flesh)]
-    eye = np.abs(vertices[:, :1]) * (1, 0, 0) + vertices * (0, 1, 1) - body.eye[:3]
-    labels = np.where(np.linalg.norm(eye, axis=1) < body.eye[3], "eye", labels)
-    colors = coats.painted(animal.coat, vertices, surface_nets.normals(vertices, faces), labels, animal.paints)
-    return skeleton, Surface(vertices, faces, indices, weights, colors)
+    return building.dressed(bodies.body(animal.proportions), animal.coat, animal.paints)
 
 
 def build(seed: int, frames: int = 24) -> AnimatedAnimal:
@@ -117,13 +107,7 @@ def build(seed: int, frames: int = 24) -> AnimatedAnimal:
     """
     animal = draw(seed)
     skeleton, rest = _rest(seed)
-    angle = np.radians(animal.heading)
-    world = np.eye(4)
-    world[:3, :3] = ((np.cos(angle), 0, np.sin(angle)), (0, 1, 0), (-np.sin(angle), 0, np.cos(angle)))
-    world[:3] = np.roll(world[:3], animal.up - 1, axis=0)
-    world[:3, 3] = animal.place
-    vertices = rest.vertices @ world[:3, :3].T + world[:3, 3]
-    surface = Surface(vertices, rest.faces, rest.bone_indices, rest.bone_weights, rest.colors)
+    world = building.world_matrix(animal.heading, animal.up, animal.place)
     size = animal.proportions.size
     lowering = 0.5 * (animal.proportions.neck_angle + 30)
     postures = motions.clip(animal.motions, frames, lowering)
@@ -132,7 +116,7 @@ def build(seed: int, frames: int = 24) -> AnimatedAnimal:
         name=animal.name,
         species=animal.kind,
         licence=LICENCE,
-        surfaces=(surface,),
+        surfaces=(building.placed(rest, world),),
         bone_names=tuple(skeleton.names),
         parents=np.array(skeleton.parents),
         bones_rest=world @ skeleton.rest(),
@@ -170,30 +154,22 @@ def render(
     Raises:
         UserError: a seed is of neither set, the folder cannot be written, or it holds an animal of another size.
     """
-    folders = [root / draw(seed).name for seed in seeds]
     size = {"views": views, "frames": frames, "width": width, "height": height}
-    recipes = {seed: {"zoo": VERSION, "seed": seed, "truth": "mesh", **size} for seed in seeds}
-    missing = [(s, f) for s, f in zip(seeds, folders, strict=True) if not _holds(f, recipes[s])]
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{root}: expected a folder that can be written, but: {error.strerror}.") from error
-    each = views * frames
-    for i, (seed, folder) in enumerate(missing):
+    folders = {root / draw(seed).name: {"zoo": VERSION, "seed": seed, "truth": "mesh", **size} for seed in seeds}
 
-        def shifted(done: int, _: int, before: int = i * each) -> None:
-            if progress:
-                progress(before + done, len(missing) * each)
-
-        animal = build(seed, frames)
-        with tempfile.TemporaryDirectory(dir=root, prefix=f".{folder.name}-") as scratch:
-            made = Path(scratch) / folder.name
+    def job(recipe: dict[str, Any]) -> building.Job:
+        def render_one(folder: Path, shifted: Progress) -> None:
+            animal = build(recipe["seed"], frames)
             render_artemis(
-                [animal], made, views=views, width=width, height=height, recipe=recipes[seed],
+                [animal], folder, views=views, width=width, height=height, recipe=recipe,
                 mesh=joined(animal.surfaces), progress=shifted,
             )  # fmt: skip
-            made.rename(folder)
-    return folders
+
+        return building.Job(views * frames, render_one)
+
+    jobs = {folder.name: job(recipe) for folder, recipe in folders.items() if not _holds(folder, recipe)}
+    building.render_missing(root, jobs, progress)
+    return list(folders)
 
 
 def _holds(folder: Path, recipe: dict[str, Any]) -> bool:

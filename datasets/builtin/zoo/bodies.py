@@ -69,7 +69,8 @@ class Proportions:
 
 
 def jittered(mean: Proportions, rng: np.random.Generator, spread: float = 0.1) -> Proportions:
-    """Return proportions around a mean: lengths times exp of a normal number, angles plus 100 times as many degrees."""
+    """Return proportions around a mean: lengths times exp(n), angles plus 60 n degrees, n normal of that
+    spread."""
     found: dict[str, object] = {}
     for field in fields(mean):
         value = getattr(mean, field.name)
@@ -87,7 +88,7 @@ def jittered(mean: Proportions, rng: np.random.Generator, spread: float = 0.1) -
 
 def body(plan: Proportions) -> Body:
     """Return the body of some proportions, in metres, feet on the ground."""
-    spine, slope = _spine(plan)
+    spine = _spine(plan)
     base = np.array(spine[-1][:3]) + (0.0, 0.35 * plan.girth[2], 0.45 * plan.girth[2])
     neck = _line(base, plan.neck, plan.neck_angle, 2, plan.neck_girth)
     skull, nose = _head(plan, np.array(neck[-1][:3]))
@@ -103,7 +104,7 @@ def body(plan: Proportions) -> Body:
     ]
     if plan.stance == "four":
         chains.append(_leg(plan, "fore", spine[-1]))
-    chains += ornaments.limbs(plan.extras, np.array(spine[-1][:3]), plan.girth[2], slope)
+    chains += ornaments.limbs(plan.extras, np.array(spine[-1][:3]), plan.girth[2])
     landmarks = ornaments.Landmarks(
         np.array(skull[:3]), np.array(nose[-1][:3]), plan.head_girth[0],
         [np.array(n[:3]) for n in neck], plan.neck_girth, [np.array(n[:3]) for n in spine], plan.girth,
@@ -130,8 +131,8 @@ def _scaled(nodes: tuple[Node, ...], scale: float) -> tuple[Node, ...]:
     return tuple((x * scale, y * scale, z * scale, r * scale) for x, y, z, r in nodes)
 
 
-def _spine(plan: Proportions) -> tuple[tuple[Node, ...], float]:
-    """Return four nodes of the spine from the hips to the chest, and its slope in radians."""
+def _spine(plan: Proportions) -> tuple[Node, ...]:
+    """Return four nodes of the spine from the hips to the chest."""
     slope = float(np.radians(plan.pitch))
     middle = 1.0 + 0.06 * (plan.stance == "four")
     start = -plan.trunk / 2 if plan.stance == "four" else -0.3 * plan.trunk * np.cos(slope)
@@ -140,7 +141,7 @@ def _spine(plan: Proportions) -> tuple[tuple[Node, ...], float]:
     for share, radius in zip((0.0, 0.33, 0.67, 1.0), radii, strict=True):
         along = share * plan.trunk
         nodes.append((0.0, middle + along * np.sin(slope), start + along * np.cos(slope), radius))
-    return tuple(nodes), slope
+    return tuple(nodes)
 
 
 def _line(

@@ -13,10 +13,9 @@ from typing import Self
 import numpy as np
 
 from rewild4d.datasets.builtin.anatomy import Skeleton
-from rewild4d.datasets.builtin.gait import FEET, Gait, about, angle_of, direction, foot_path, rotation, wrap
+from rewild4d.datasets.builtin.gait import FEET, Gait, about, angle_of, bend_leg, foot_path, rotation
 
 LEGS = ("hind", "fore")
-ROOT = ("rise", "surge", "pitch", "yaw", "roll")
 
 
 @dataclass(frozen=True)
@@ -24,7 +23,7 @@ class Posture:
     """One moment.
 
     Attributes:
-        root: shift along y and z, and pitch, yaw and roll of the body about its hips, [5] (see `ROOT`).
+        root: shift along y and z, and pitch, yaw and roll of the body about its hips, [5].
         chains: pitch, yaw and roll that each bone of a chain adds to its parent's, by chain, [bones, 3] or [3].
             Yaw and roll of the right one of a pair are mirrored.
         feet: sideways, upward and forward offset of each foot from where it rests, and degrees of its flexion, by the
@@ -296,7 +295,7 @@ def _place_leg(skeleton: Skeleton, moved: np.ndarray, foot: str, offset: np.ndar
     bones = [skeleton.names.index(f"{limb}.{i}.{side}") for i in range(4)]
     joints = [skeleton.heads[b] for b in bones] + [skeleton.tails[bones[3]]]
     steps = [(b - a)[1:] for a, b in zip(joints, joints[1:], strict=False)]
-    rest, lengths = [angle_of(s) for s in steps], [float(np.linalg.norm(s)) for s in steps]
+    rest = [angle_of(s) for s in steps]
     hip = (moved[skeleton.parents[bones[0]]] @ np.append(joints[0], 1.0))[:3]
 
     target = joints[3] + offset[:3] * size
@@ -307,17 +306,6 @@ def _place_leg(skeleton: Skeleton, moved: np.ndarray, foot: str, offset: np.ndar
     goal = np.array((hip[1] - depth, target[2]))
     fold = np.radians(offset[3])
     cannon = rest[2] + fold - np.arctan2(goal[1] - hip[2] - (joints[3][2] - joints[0][2]), joints[0][1])
-    reach = goal - lengths[2] * direction(cannon) - hip[1:]
-    span = np.clip(np.linalg.norm(reach), abs(lengths[0] - lengths[1]) * 1.001, (lengths[0] + lengths[1]) * 0.999)
-    bend = np.arccos((lengths[0] ** 2 + span**2 - lengths[1] ** 2) / (2 * lengths[0] * span))
-    upper = angle_of(reach) + np.sign(wrap(rest[0] - angle_of(steps[0] + steps[1]))) * bend
-    knee = lengths[0] * direction(upper)
-    lower = angle_of(span * reach / np.linalg.norm(reach) - knee)
-
-    sideways, at = about(hip, rotation(0.0, 0.0, lean)), hip
-    angles = (upper, lower, cannon, rest[3] + fold)
-    for bone, angle, start, length in zip(bones, angles, range(4), lengths, strict=True):
-        placed = about(joints[start], rotation(np.degrees(angle - rest[start]), 0.0, 0.0))
-        placed[:3, 3] += at - joints[start]
-        moved[bone] = sideways @ placed
-        at = at + np.append(joints[start + 1][0] - joints[start][0], length * direction(angle))
+    sideways = about(hip, rotation(0.0, 0.0, lean))
+    for bone, matrix in zip(bones, bend_leg(joints, hip, goal, cannon, rest[3] + fold), strict=True):
+        moved[bone] = sideways @ matrix

@@ -53,14 +53,13 @@ def ears(length: float, form: str, at: Landmarks) -> list[Part]:
     return [Part("head", _node(root, radii[0]), _node(tip, radii[1]), 0.2 * length, "ear", squash, mirrored=True)]
 
 
-def limbs(extras: Sequence[str], chest: np.ndarray, girth: float, slope: float) -> list[Chain]:
+def limbs(extras: Sequence[str], chest: np.ndarray, girth: float) -> list[Chain]:
     """Return chains with bones of their own: arms and wings.
 
     Args:
         extras: names of ornaments.
         chest: centre of the chest, [3].
         girth: radius of the chest.
-        slope: rise of the trunk in radians.
     """
     found = []
     shoulder = chest + (0.62 * girth, 0.1 * girth, -0.2 * girth)
@@ -135,22 +134,10 @@ def _nose_horn(at: Landmarks) -> list[Part]:
     return _branch("head", points, (0.06, 0.045, 0.015), "horn", mirrored=False)
 
 
-def _hump(at: Landmarks, *shares: float) -> list[Part]:
-    found = []
-    for share in shares:
-        middle = at.spine[0] + share * (at.spine[-1] - at.spine[0])
-        top = middle + (0, 1.65 * at.girth[1], 0)
-        bone = f"spine.{min(int(share * 3), 2)}"
-        found.append(
-            Part(
-                bone,
-                _node(middle + (0, 0.6 * at.girth[1], 0), 0.8 * at.girth[1]),
-                _node(top, 0.5 * at.girth[1]),
-                0.1,
-                squash=(0.6, 1, 1),
-            )
-        )
-    return found
+def _hump(at: Landmarks) -> list[Part]:
+    middle, height = 0.5 * (at.spine[0] + at.spine[-1]), at.girth[1]
+    low, top = (middle + (0, share * height, 0) for share in (0.6, 1.65))
+    return [Part("spine.1", _node(low, 0.8 * height), _node(top, 0.5 * height), 0.1, squash=(0.6, 1, 1))]
 
 
 def _mane(at: Landmarks) -> list[Part]:
@@ -302,8 +289,7 @@ ORNAMENTS = {
     "horns": _horns,
     "curved-horns": _curved_horns,
     "nose-horn": _nose_horn,
-    "hump": lambda at: _hump(at, 0.5),
-    "two-humps": lambda at: _hump(at, 0.22, 0.75),
+    "hump": _hump,
     "mane": _mane,
     "ruff": _ruff,
     "trunk": _trunk,

@@ -22,7 +22,7 @@ def contact_sheet(seeds: Sequence[int]) -> Image.Image:
         seeds: one row each, from top to bottom.
 
     Returns:
-        RGB, six tiles wide, with each animal's name and clip above its row.
+        RGB, six tiles wide, with each animal's name, clip and coat above its row.
 
     Raises:
         UserError: a seed is of neither set.
@@ -48,5 +48,7 @@ def _row(seed: int) -> np.ndarray:
             share = alpha[..., None] / 255
             tiles.append((rgb * share + 255 * (1 - share)).round().astype(np.uint8))
     row = Image.fromarray(np.concatenate(tiles, axis=1))
-    ImageDraw.Draw(row).text((4, 2), f"{animal.name}: {animal.motion}", fill=(0, 0, 0))
+    ImageDraw.Draw(row).text(
+        (4, 2), f"{animal.name}: {animal.motion}; {animals.draw(seed).description}", fill=(0, 0, 0)
+    )
     return np.asarray(row)
