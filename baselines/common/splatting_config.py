@@ -3,7 +3,7 @@
 import msgspec
 
 from rewild4d.ours.config import Canonical, Density
-from rewild4d.ours.numbers import Count, Opacity, Rate, Size, Weight, Whole
+from rewild4d.ours.numbers import Count, Opacity, Positive, Rate, Size, Weight, Whole
 
 
 class GaussianRates(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -19,6 +19,8 @@ class GaussianRates(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """Opacities."""
     colors: Weight = 2.5e-3
     """Colours."""
+    colors_epsilon: Positive = 1e-15
+    """Adam's epsilon for colours, as in `ours`."""
 
 
 class ImageLoss(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

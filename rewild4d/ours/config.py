@@ -181,6 +181,9 @@ class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """Logits of the opacities."""
     colors: Weight = 2.5e-3
     """Colours."""
+    colors_epsilon: Positive = 1e-15
+    """Adam's epsilon for colours: with 1e-4, Gaussians that are hardly seen move in proportion to their gradient
+    instead of as fast as all."""
     skinning: Rate = (1e-3, 1e-4)
     """Logits of the field."""
     pose: Rate = (6e-4, 1e-5)

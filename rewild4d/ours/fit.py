@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,14 @@ from rewild4d.ours.checkpoint import fit_digest, load_checkpoint
 from rewild4d.ours.coloring import initial_colors
 from rewild4d.ours.config import Config
 from rewild4d.ours.deform import Posed
+from rewild4d.ours.evidence import information
 from rewild4d.ours.gradients import all_finite, clip_gradients, norm_of, require_finite, scale_gradients
 from rewild4d.ours.graphs import CudaRecorder, StepGraphs, can_record
 from rewild4d.ours.inputs import StepInput
 from rewild4d.ours.losses.images import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.losses.regularizers import compact_loss, neighbours, random_direction, rigid_loss, smooth_loss
 from rewild4d.ours.losses.skeleton import neighbour_keys, posture
-from rewild4d.ours.losses.skin import StartingSkin, bind_loss, disc_loss
+from rewild4d.ours.losses.skin import Bond, StartingSkin, bind_loss, disc_loss
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.pose import blend_poses, pose_distance
 from rewild4d.ours.schedule import exponential, fade, ramp
@@ -50,7 +52,7 @@ class Training(GaussianTraining):
         model.field.logits.requires_grad_(config.skinning.learn)
         super().__init__(model, groups, config, supervision, generator)
         self.skin = StartingSkin.of(model.gaussians)
-        self.bound: Tensor | None = None
+        self.bond: Bond | None = None
         self.graphs = StepGraphs(self, CudaRecorder(model.pivots.device)) if can_record(model.pivots.device) else None
 
     def step(self, index: int) -> dict[str, float]:
@@ -186,16 +188,19 @@ class Training(GaussianTraining):
     def _skin_losses(self, opacities: Tensor) -> dict[str, Tensor]:
         config, own = self.config.skin, self.model.gaussians
         losses: dict[str, Tensor] = {}
+        if not config.holds:
+            return losses
+        assert self.bond is not None, "`prepare` comes first"
         if config.disc:
-            losses["disc"] = config.disc * disc_loss(own.scales_log(), opacities, self.skin.log_radius, config)
+            disc = disc_loss(own.scales_log(), opacities, self.bond.firmness, self.skin.log_radius, config)
+            losses["disc"] = config.disc * disc
         if config.bind:
-            assert self.bound is not None, "`prepare` comes first"
-            losses["bind"] = config.bind * bind_loss(own.means, own.quats, self.skin, self.bound, config)
+            losses["bind"] = config.bind * bind_loss(own.means, own.quats, self.skin, self.bond, config)
         return losses
 
     def change_density(self, index: int) -> bool:
         changed = super().change_density(index)
-        self.bound = None if changed else self.bound
+        self.bond = None if changed else self.bond
         if changed and self.graphs is not None:
             self.graphs.forget()
         return changed
@@ -205,15 +210,21 @@ class Training(GaussianTraining):
         changed."""
         if self.config.geometry.rigid and len(self.model.gaussians) > 1 and self.near is None:
             self.near = neighbours(self.model.gaussians.means, self.config.geometry.rigid_neighbours)
-        if self.config.skin.bind and self.bound is None:
-            self.bound = self.skin.nearest(self.model.gaussians.means)
+        held = self.config.skin
+        if held.holds and self.bond is None:
+            if held.evidence and self.skin.information is None:  # the first step: the skin's points are the Gaussians
+                known = information(self.model, self.supervision, self.config.mirrored)
+                self.skin = replace(self.skin, information=known)
+            self.bond = self.skin.bond(self.skin.nearest(self.model.gaussians.means), held.evidence)
 
     def state(self) -> dict[str, Any]:
-        return super().state() | {"bound": self.bound}
+        bond = self.bond and (self.bond.nearest, self.bond.firmness, self.bond.depth)
+        return super().state() | {"bond": bond, "information": self.skin.information}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         super().restore(state)
-        self.bound = state.get("bound")
+        self.skin = replace(self.skin, information=state["information"])
+        self.bond = state["bond"] and Bond(*state["bond"])
 
     def limited(self) -> Tensor:
         """Clip the networks' gradients as `check_gradients` does, without a look at a number; return whether all

@@ -20,6 +20,8 @@ from rewild4d.ours.symmetry import Supervision, Target
 from rewild4d.rasterizer import RasterInfo
 
 LOG_EVERY = 20
+EPSILON = 1e-15
+"""Of Adam, for Gaussians: their gradients are tiny."""
 
 
 class GaussianTraining(ABC):
@@ -52,9 +54,10 @@ class GaussianTraining(ABC):
         own = self.gaussians
         # The rate of the means is set at every step.
         rates = {name: 0.0 if name == "means" else getattr(config.rates, name) for name in NAMES}
-        fixed = [{"params": [getattr(own, name)], "lr": rates[name]} for name in NAMES]
+        fixed = [{"params": [getattr(own, name)], "lr": rates[name], "eps": EPSILON} for name in NAMES]
+        fixed[NAMES.index("colors")]["eps"] = config.rates.colors_epsilon
         on_gpu = own.means.is_cuda  # where graphs may hold the updates
-        self.optimizer = Adam(fixed, eps=1e-15, fused=True, capturable=on_gpu)
+        self.optimizer = Adam(fixed, fused=True, capturable=on_gpu)
         self.others = Adam([{"params": group} for group in groups.values()], eps=1e-8, fused=True, capturable=on_gpu)
         self.density = DensityControl(config.density, len(own), own.means.device)
         self.near: Tensor | None = None

@@ -84,9 +84,17 @@ class Skin(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """Weight of what a Gaussian lacks of an opaque disc of the starting size."""
     bind: Weight = 0.0
     """Weight of the distance from the skin along its normal, and of the angle to that normal."""
+    evidence: Weight = 0.0
+    """Information (share of the frames that see a point, across their lines of sight) at which a hold has half its
+    weight; 0 holds all alike."""
     flat: Positive = 3.0
     """Least ratio of a disc's radius to its thickness."""
     growth: Positive = 1.3
     """Largest scale, in starting radii."""
     reach: Positive = 3.0
     """Distance, in starting radii, beyond which a Gaussian is free."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether a Gaussian is held at all."""
+        return self.disc > 0 or self.bind > 0

@@ -25,11 +25,13 @@ class StartingSkin:
         points: in the object frame at rest, [m, 3].
         normals: unit, [m, 3].
         log_radius: logarithm of a point's radius in the surface.
+        information: what the clip says of each point (`evidence.information`), [m, 3, 3]; None holds all alike.
     """
 
     points: Tensor
     normals: Tensor
     log_radius: float
+    information: Tensor | None = None
 
     @classmethod
     def of(cls, gaussians: Gaussians) -> "StartingSkin":
@@ -42,13 +44,42 @@ class StartingSkin:
         """Return the index of each centre's nearest point, [n, 3] -> [n]."""
         return nearest_rows(self.points, means)
 
+    def bond(self, nearest: Tensor, half: float) -> "Bond":
+        """Return what holds Gaussians whose nearest points are ``nearest``, [n].
+
+        A hold weighs h / (h + i), where h is ``half`` and i what the clip says: of the firmness the smallest eigenvalue
+        of the information, of the depth the information along the normal.
+        """
+        if self.information is None:
+            whole = self.points.new_ones(len(nearest))
+            return Bond(nearest, whole, whole)
+        least = torch.linalg.eigvalsh(self.information)[:, 0].clamp_min(0)
+        along = torch.einsum("na,nab,nb->n", self.normals, self.information, self.normals)
+        firmness, depth = (half / (half + known[nearest]) for known in (least, along))
+        return Bond(nearest, firmness, depth)
+
+
+@dataclass(frozen=True)
+class Bond:
+    """What holds each Gaussian to the skin.
+
+    Attributes:
+        nearest: row of the skin, [n].
+        firmness: weight of the hold, 1 where no frame sees the skin, near 0 where many do from all sides, [n].
+        depth: the same for the distance along the normal, [n].
+    """
+
+    nearest: Tensor
+    firmness: Tensor
+    depth: Tensor
+
 
 def third_axes(quats: Tensor) -> Tensor:
     """Return unit third axes of orientations, [n, 4] -> [n, 3]."""
     return quat_to_matrix(normalize(quats, dim=-1))[..., 2]
 
 
-def disc_loss(log_scales: Tensor, opacities: Tensor, log_radius: float, config: Skin) -> Tensor:
+def disc_loss(log_scales: Tensor, opacities: Tensor, firmness: Tensor, log_radius: float, config: Skin) -> Tensor:
     """Compute the mean over Gaussians of how far they are from opaque discs of the starting size.
 
     The sum of: the squared difference of the first two log scales; the squared excess of the third over their mean less
@@ -57,6 +88,7 @@ def disc_loss(log_scales: Tensor, opacities: Tensor, log_radius: float, config: 
     Args:
         log_scales: [n, 3].
         opacities: [n].
+        firmness: weight of each Gaussian (`Bond`), [n].
         log_radius: of the starting skin.
         config: bounds.
     """
@@ -64,10 +96,10 @@ def disc_loss(log_scales: Tensor, opacities: Tensor, log_radius: float, config: 
     oval = (first - second).square()
     thick = (third - 0.5 * (first + second) + math.log(config.flat)).clamp_min(0).square()
     large = (log_scales - log_radius - math.log(config.growth)).clamp_min(0).square().sum(-1)
-    return (oval + thick + large + (1 - opacities).square()).mean()
+    return (firmness * (oval + thick + large + (1 - opacities).square())).mean()
 
 
-def bind_loss(means: Tensor, quats: Tensor, skin: StartingSkin, nearest: Tensor, config: Skin) -> Tensor:
+def bind_loss(means: Tensor, quats: Tensor, skin: StartingSkin, bond: Bond, config: Skin) -> Tensor:
     """Compute the mean over Gaussians of their squared distance from the skin, in starting radii along its normal, and
     of one less the cosine between both normals.
 
@@ -77,10 +109,10 @@ def bind_loss(means: Tensor, quats: Tensor, skin: StartingSkin, nearest: Tensor,
         means: [n, 3].
         quats: not normalised, [n, 4].
         skin: of the start.
-        nearest: row of ``skin`` for each Gaussian, [n].
+        bond: of each Gaussian; `Bond.depth` weighs its distance, `Bond.firmness` its angle.
         config: bounds.
     """
-    normals = skin.normals[nearest]
-    along = ((means - skin.points[nearest]) * normals).sum(-1) * math.exp(-skin.log_radius)
+    normals = skin.normals[bond.nearest]
+    along = ((means - skin.points[bond.nearest]) * normals).sum(-1) * math.exp(-skin.log_radius)
     facing = (third_axes(quats) * normals).sum(-1)
-    return (along.square().clamp(max=config.reach**2) + 1 - facing).mean()
+    return (bond.depth * along.square().clamp(max=config.reach**2) + bond.firmness * (1 - facing)).mean()

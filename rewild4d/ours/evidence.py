@@ -1,0 +1,96 @@
+"""What a clip's images say of each Gaussian at the start of a fit: in which share of the frames, and from which sides,
+it is seen. A method of ours, not of the paper."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from rewild4d.ours.canonical import Gaussians
+from rewild4d.ours.deform import Posed
+from rewild4d.ours.model import Model
+from rewild4d.ours.symmetry import Key, Supervision
+from rewild4d.rasterizer import rasterize
+from rewild4d.transforms import quat_to_matrix
+from rewild4d.types import Camera
+
+LEAST_COSINE = 0.1
+"""Of a disc seen from its edge: the rasterizer widens it, so that its patch does not vanish."""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One training view of the Gaussians, posed and not deformed.
+
+    Attributes:
+        key: of the view.
+        share: of the training steps that see the view; all shares sum to 1.
+        posed: centres, orientations and log scales in the object frame.
+    """
+
+    key: Key
+    share: float
+    posed: Posed
+
+
+def sightings(model: Model, supervision: Supervision, mirrored: float = 0.0) -> Iterator[Sighting]:
+    """Pose the Gaussians as each training view shows them; a share ``mirrored`` of the steps sees mirror images."""
+    weights = model.field.sample(model.field.probabilities(), model.gaussians.means)
+    for view, share in ((1, 1 - mirrored), (-1, mirrored)):
+        frames = supervision.frames_of(view) if share else []
+        for frame in frames:
+            key = Key(view, view, frame)  # under other keys the pose may not be trained
+            pose = model.pose(supervision.code_times([key]), [key])
+            posed = model.skin(weights, pose.quats[0], model.transforms(pose)[0])[1]
+            yield Sighting(key, share / len(frames), posed)
+
+
+@torch.no_grad()
+def information(model: Model, supervision: Supervision, mirrored: float) -> Tensor:
+    """Return what the clip's images say of each Gaussian's place, in the frame at rest, [n, 3, 3].
+
+    The mean over the training views of v (I - d d^T), with d the line of sight and v the share of the Gaussian that is
+    drawn. An image tells a place across the line of sight and not along it, so that x^T M x is the share of the frames
+    that tell the place along a unit vector x; M is 0 where no frame sees the Gaussian, and its smallest eigenvalue is 0
+    where all see it from one side.
+    """
+    own = model.gaussians
+    total = own.means.new_zeros(len(own), 3, 3)
+    for sighting in sightings(model, supervision, mirrored):
+        camera, posed = supervision.target(sighting.key).camera, sighting.posed
+        visible = visible_share(posed, own, camera)
+        sight = normalize(posed.means - camera.center.to(posed.means), dim=-1)
+        local = torch.einsum("na,nab->nb", sight, own.rotations_to(normalize(posed.quats, dim=-1)))
+        across = torch.eye(3).to(total) - local[:, :, None] * local[:, None, :]
+        total += sighting.share * visible[:, None, None] * across
+    return total
+
+
+@torch.no_grad()
+def visible_share(posed: Posed, gaussians: Gaussians, camera: Camera) -> Tensor:
+    """Return which share of each Gaussian is drawn in an image, 0 to 1, [n].
+
+    What a Gaussian adds to the image, over the area of its disc there: pi times its first two scales.
+
+    Args:
+        posed: where the Gaussians are in the image's frame.
+        gaussians: whose opacities and bounds of scales they have.
+        camera: of the image.
+    """
+    quats, scales = normalize(posed.quats, dim=-1), gaussians.scales(posed.log_scales)
+    with torch.enable_grad():
+        # The image is linear in the colours: the gradient of its sum is what each Gaussian adds.
+        ones = torch.ones(len(scales), 1, device=scales.device, requires_grad=True)
+        image, _, _ = rasterize(
+            posed.means, quats, scales, gaussians.opacities(), ones,
+            camera.world_to_camera[None], camera.intrinsics[None], camera.width, camera.height,
+        )  # fmt: skip
+        (drawn,) = torch.autograd.grad(image.sum(), ones)
+    _, depth = camera.project(posed.means)
+    sight = normalize(posed.means - camera.center.to(posed.means), dim=-1)
+    cosine = (sight * quat_to_matrix(quats)[..., 2]).sum(-1).abs().clamp_min(LEAST_COSINE)
+    pixels = camera.intrinsics[0, 0] * camera.intrinsics[1, 1] / depth.square()
+    return (drawn[:, 0] / (math.pi * scales[:, 0] * scales[:, 1] * cosine * pixels)).clamp(0.0, 1.0)
