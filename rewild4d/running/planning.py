@@ -18,10 +18,9 @@ from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import PRESETS as PRIOR_PRESETS
 from rewild4d.priors.config import STANDARD
 from rewild4d.registry import load_dataset, load_method, names
+from rewild4d.running.older import older, renewed, without_older
 from rewild4d.running.provenance import FROM_TRUTH
 from rewild4d.running.runner import Entry
-
-OLDER = "run before two regularizers, the times of frames and the frame filter were mended (docs/experiments/paper.md)"
 
 
 @dataclass(frozen=True)
@@ -133,18 +132,18 @@ def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[
     under = [tuple(r for r in kept if _is_under(r, condition, spec)) for condition in spec.conditions]
     rows = []
     for row in spec.rows:
-        notes = (row.note,) if row.note else ()
+        notes: tuple[str, ...] = (row.note,) if row.note else ()
         try:
             entry = row_entry(name, row, spec, ())
         except UserError as error:
             rows.append(Entrant(row.label, ((),) * len(under), str(error), notes))
             continue
         own = tuple(
-            _without_older([r for r in found if r.method == entry.method and _equals(r.config, entry.config)])
+            without_older([r for r in found if r.method == entry.method and _equals(r.config, entry.config)])
             for found in under
         )
-        older = any(_is_older(run.config) for found in own for run in found)
-        rows.append(Entrant(row.label, own, "", (*notes, *([OLDER] if older else []))))
+        notes += tuple(dict.fromkeys(note for found in own for run in found if (note := older(run.config))))
+        rows.append(Entrant(row.label, own, "", notes))
     shown = {row.method for row in spec.rows}
     # Lower bounds are shown for the cases of the other rows.
     cases = [{r.case for row in rows for r in row.records[index]} for index in range(len(under))]
@@ -204,29 +203,6 @@ def _beside_equals(record: RunRecord) -> RunRecord:
 def _equals(settings: Any, wanted: msgspec.Struct) -> bool:
     """Compare a record's settings; those newer than the record have their defaults in it."""
     try:
-        return msgspec.convert(_renewed(settings), type=type(wanted)) == wanted
+        return msgspec.convert(renewed(settings, wanted), type=type(wanted)) == wanted
     except msgspec.ValidationError:
         return False
-
-
-def _without_older(found: Sequence[RunRecord]) -> tuple[RunRecord, ...]:
-    """Leave out runs from before the losses of `ours` were mended where there are later ones."""
-    later = tuple(run for run in found if not _is_older(run.config))
-    return later or tuple(found)
-
-
-def _is_older(settings: Any) -> bool:
-    """Tell whether settings of `ours` are of a run from before its losses were mended."""
-    return isinstance(settings, dict) and "compact_power" in settings.get("geometry", {})
-
-
-def _renewed(settings: Any) -> Any:
-    """Drop from older settings of `ours` what has gone since; "w/o Part Anchors" was another ablation then and stays
-    unequal."""
-    if not _is_older(settings):
-        return settings
-    deform, geometry = dict(settings["deform"]), dict(settings["geometry"])
-    if deform.get("anchors"):
-        del deform["anchors"]
-    del geometry["compact_power"]
-    return settings | {"deform": deform, "geometry": geometry}
