@@ -1,35 +1,38 @@
-"""Initial colours of the canonical Gaussians, from the input images where they project."""
+"""Initial colours of the canonical Gaussians, from the input images that show them."""
 
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, normalize
 
+from rewild4d.ours.evidence import sightings, visible_share
+from rewild4d.ours.losses.skin import third_axes
 from rewild4d.ours.model import Model
-from rewild4d.ours.symmetry import Key, Supervision, Target
-from rewild4d.transforms import mirror_points, quat_to_matrix
+from rewild4d.ours.symmetry import Supervision, Target
+from rewild4d.transforms import mirror_points
+
+SEEN = 0.1
+"""Summed weight of the frames from which on a Gaussian counts as seen."""
 
 
 @torch.no_grad()
 def initial_colors(model: Model, supervision: Supervision) -> Tensor:
-    """Average the colour over the frames that see a Gaussian, [n, 3]; take the nearest mirrored one's where none does.
+    """Average the colour over the frames that show a Gaussian, [n, 3]; take the nearest one's that is seen, or whose
+    mirror image is, where none does.
 
-    A Gaussian counts as seen where its normal faces the camera and its pixel lies well inside the mask; occlusion is
-    ignored.
+    A frame weighs the share of the Gaussian that it draws, times the cosine between its normal and the line of sight.
     """
     own = model.gaussians
-    weights = model.field.sample(model.field.probabilities(), own.means)
     total, count = torch.zeros_like(own.means), torch.zeros_like(own.means[:, :1])
-    for frame in supervision.frames_of(1):  # of the others the pose under this key is not trained
-        key = Key(1, 1, frame)
-        pose = model.pose(supervision.code_times([key]), [key])
-        posed = model.skin(weights, pose.quats[0], model.transforms(pose)[0])[1]
-        colours, seen = project_colors(posed.means, quat_to_matrix(posed.quats)[..., 2], supervision.target(key))
-        total, count = total + colours * seen[:, None], count + seen[:, None]
-    known = count[:, 0] > 0
+    for sighting in sightings(model, supervision):
+        posed, target = sighting.posed, supervision.target(sighting.key)
+        colours, weights = project_colors(posed.means, third_axes(posed.quats), target)
+        weights = (weights * visible_share(posed, own, target.camera))[:, None]
+        total, count = total + colours * weights, count + weights
+    known = count[:, 0] > SEEN
     if not known.any():
         return own.rgb().clone()
-    colours = total / count.clamp_min(1)
+    colours = total / count.clamp_min(SEEN)
     sources = torch.cat((own.means[known], mirror_points(own.means[known]))).cpu().numpy()
     _, nearest = cKDTree(sources).query(own.means[~known].cpu().numpy())
     colours[~known] = colours[known].repeat(2, 1)[torch.from_numpy(nearest).to(colours.device)]
@@ -37,10 +40,11 @@ def initial_colors(model: Model, supervision: Supervision) -> Tensor:
 
 
 def project_colors(points: Tensor, normals: Tensor, target: Target) -> tuple[Tensor, Tensor]:
-    """Read the colour of posed points [n, 3] in one image, and whether they are seen, by outward normals [n, 3]."""
+    """Read the colour of posed points [n, 3] in one image, and the cosine between outward normals [n, 3] and the line
+    of sight, 0 where they face away or their pixel is not well inside the mask, [n]."""
     camera = target.camera
     pixels, depth = camera.project(points)
     grid = (pixels / points.new_tensor((camera.width, camera.height)) * 2 - 1)[None, None]
     values = grid_sample(torch.cat((target.rgb, target.mask))[None], grid, align_corners=False)[0, :, 0].T
-    facing = ((camera.center.to(points) - points) * normals).sum(-1) > 0
-    return values[:, :3] / values[:, 3:].clamp_min(1e-3), facing & (depth > 0) & (values[:, 3] > 0.9)
+    cosine = (normalize(camera.center.to(points) - points, dim=-1) * normals).sum(-1).clamp_min(0)
+    return values[:, :3] / values[:, 3:].clamp_min(1e-3), cosine * (depth > 0) * (values[:, 3] > 0.9)

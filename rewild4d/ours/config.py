@@ -141,6 +141,9 @@ class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     open)."""
     pull_until: Weight = 1.0
     """Fraction at which the pull ends (paper: 4k of 20k); above 1 it is still on at the end."""
+    depth: Weight = 0.0
+    """Weight of the squared distance from the prior's posed skin along the line of sight, which one image does not
+    tell, over the squared diagonal. It does not fall."""
 
 
 class WarmUp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

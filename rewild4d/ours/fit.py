@@ -18,13 +18,14 @@ from rewild4d.ours.deform import Posed
 from rewild4d.ours.evidence import information
 from rewild4d.ours.gradients import all_finite, clip_gradients, norm_of, require_finite, scale_gradients
 from rewild4d.ours.graphs import CudaRecorder, StepGraphs, can_record
+from rewild4d.ours.heights import Heights
 from rewild4d.ours.inputs import StepInput
 from rewild4d.ours.losses.images import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.losses.regularizers import compact_loss, neighbours, random_direction, rigid_loss, smooth_loss
-from rewild4d.ours.losses.skeleton import neighbour_keys, posture
+from rewild4d.ours.losses.skeleton import Marks, depth_loss, neighbour_keys, posture
 from rewild4d.ours.losses.skin import Bond, StartingSkin, bind_loss, disc_loss
 from rewild4d.ours.model import Model, build_model
-from rewild4d.ours.pose import blend_poses, pose_distance
+from rewild4d.ours.pose import blend_poses, joint_transforms, pose_distance
 from rewild4d.ours.schedule import exponential, fade, ramp
 from rewild4d.ours.symmetry import Key, Supervision, Target
 from rewild4d.ours.training import GaussianTraining, run_steps
@@ -53,11 +54,20 @@ class Training(GaussianTraining):
         super().__init__(model, groups, config, supervision, generator)
         self.skin = StartingSkin.of(model.gaussians)
         self.bond: Bond | None = None
+        self.heights = Heights(self.skin, config.skin.voxels) if config.skin.heights else None
+        self.marks = Marks.of(model, self.skin.points) if config.prior.depth else None
         self.graphs = StepGraphs(self, CudaRecorder(model.pivots.device)) if can_record(model.pivots.device) else None
 
     def step(self, index: int) -> dict[str, float]:
         """Take one step, from graphs where the model is on a GPU that records them."""
         return super().step(index) if self.graphs is None else self.graphs.step(index)
+
+    def rated(self) -> list[dict[str, Any]]:
+        return super().rated() + ([self.heights.group] if self.heights else [])
+
+    def step_rates(self, index: int) -> list[float]:
+        last = [self.config.skin.heights * 0.01 ** (index / self.config.iterations)] if self.heights else []
+        return super().step_rates(index) + last
 
     def rate(self, name: str, progress: float) -> float:
         rates = self.config.rates
@@ -131,6 +141,10 @@ class Training(GaussianTraining):
         if given.pull is not None:
             losses["prior"] = given.pull * pose_distance(network_pose, *given.prior_pose)
         losses["skeleton"] = skeleton
+        if self.marks is not None:
+            quats, shifts = (part[given.row].squeeze(0) for part in given.prior_pose)
+            before = joint_transforms(quats, shifts, model.pivots)
+            losses["depth"] = config.prior.depth * depth_loss(self.marks, transforms.squeeze(0), before, given.eye)
         if delta is not None:
             losses["tv"] = config.geometry.tv * config.geometry.tv_every * variation
         return losses | self._geometry_losses(given, weights, opacities, posed, deformed), info
@@ -198,6 +212,16 @@ class Training(GaussianTraining):
             losses["bind"] = config.bind * bind_loss(own.means, own.quats, self.skin, self.bond, config)
         return losses
 
+    def update(self, info: RasterInfo | None, target: Target) -> None:
+        means = self.model.gaussians.means
+        before = means.detach().clone() if self.config.skin.follow else None
+        super().update(info, target)
+        if before is not None:
+            assert self.bond is not None, "`prepare` comes first"
+            means.data.lerp_(before, self.bond.firmness[:, None])
+        if self.heights is not None:
+            self.heights.step(self.model.gaussians, self.skin)
+
     def change_density(self, index: int) -> bool:
         changed = super().change_density(index)
         self.bond = None if changed else self.bond
@@ -219,11 +243,15 @@ class Training(GaussianTraining):
 
     def state(self) -> dict[str, Any]:
         bond = self.bond and (self.bond.nearest, self.bond.firmness, self.bond.depth)
-        return super().state() | {"bond": bond, "information": self.skin.information}
+        heights = self.heights and self.heights.state()
+        skin = {"points": self.skin.points, "information": self.skin.information}
+        return super().state() | {"bond": bond, "skin": skin, "heights": heights}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         super().restore(state)
-        self.skin = replace(self.skin, information=state["information"])
+        self.skin = replace(self.skin, **state["skin"])
+        if self.heights is not None:
+            self.heights.restore(state["heights"])
         self.bond = state["bond"] and Bond(*state["bond"])
 
     def limited(self) -> Tensor:

@@ -57,17 +57,22 @@ class SkinningField(nn.Module):
         J]."""
         if FIELD.takes(probabilities, owner=self):
             return sample_grid(probabilities, points, self.origin, self.pitch, self.resolution)[0]
-        last = self.resolution - 1
-        position = ((points.detach() - self.origin) / self.pitch).clamp(0, last)
-        base = position.floor().clamp(max=last - 1)
-        part = position - base
-        x, y, z = (torch.stack((1 - part[:, axis], part[:, axis]), dim=-1) for axis in range(3))
-        factors = torch.einsum("na,nb,nc->nabc", x, y, z).flatten(1)
-        corners = torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3)
-        x, y, z = (base.long()[:, None] + corners).unbind(-1)
-        rows = (x * self.resolution + y) * self.resolution + z
+        rows, factors = trilinear(points.detach(), self.origin, self.pitch, self.resolution)
         chosen = probabilities.index_select(0, rows.flatten()).unflatten(0, rows.shape)
         return torch.einsum("nk,nkj->nj", factors, chosen)
+
+
+def trilinear(points: Tensor, origin: Tensor, pitch: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
+    """Return rows (x slowest) and shares of the eight voxels around points [n, 3] clamped to a cube, both [n, 8]."""
+    last = resolution - 1
+    position = ((points - origin) / pitch).clamp(0, last)
+    base = position.floor().clamp(max=last - 1)
+    part = position - base
+    x, y, z = (torch.stack((1 - part[:, axis], part[:, axis]), dim=-1) for axis in range(3))
+    factors = torch.einsum("na,nb,nc->nabc", x, y, z).flatten(1)
+    corners = torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3)
+    x, y, z = (base.long()[:, None] + corners).unbind(-1)
+    return (x * resolution + y) * resolution + z, factors
 
 
 def build_field(vertices: Tensor, weights: Tensor, mirror: Tensor, config: Skinning) -> SkinningField:

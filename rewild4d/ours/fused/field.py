@@ -17,9 +17,10 @@ from rewild4d.kernels.threads import run_tickets
 
 FIELD = Kernel(
     "skinning field",
-    "da5c18ef1605",
+    "fae36abeba05",
     "rewild4d.ours.skinning:SkinningField.sample",
     "rewild4d.ours.skinning:SkinningField.sample_and_vary",
+    "rewild4d.ours.skinning:trilinear",
     "rewild4d.ours.losses.regularizers:tv_loss",
 )
 RESIDUAL_FIELD = Kernel(

@@ -3,7 +3,9 @@
 import math
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from rewild4d.ours.fused.skeleton import POSTURE, Weights, posture_and_losses
 from rewild4d.ours.losses.config import Geometry
@@ -11,7 +13,11 @@ from rewild4d.ours.losses.regularizers import attach_loss, limit_loss, sagittal_
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import Pose
 from rewild4d.ours.symmetry import Key
+from rewild4d.transforms import skin_points
 from rewild4d.types import OBJECT_DIAGONAL
+
+MARKS = 400
+"""Points of the skin at which depths are compared."""
 
 
 class Neighbours(NamedTuple):
@@ -64,6 +70,40 @@ def posture(
     transforms = model.transforms(poses)
     total = skeleton_losses(model, poses, transforms, config, gaps)
     return Pose(*(tensor[rows] for tensor in poses)), transforms[rows], total
+
+
+class Marks(NamedTuple):
+    """Points of the skin that stand for the body.
+
+    Attributes:
+        points: at rest, [k, 3].
+        weights: skinning weights at the start of the fit, [k, J].
+    """
+
+    points: Tensor
+    weights: Tensor
+
+    @classmethod
+    def of(cls, model: Model, points: Tensor) -> "Marks":
+        """Choose `MARKS` of the points [n, 3] of a model that was not trained yet."""
+        rows = torch.linspace(0, len(points) - 1, min(MARKS, len(points)), device=points.device).long()
+        with torch.no_grad():
+            return cls(points[rows].clone(), model.field.sample(model.field.probabilities(), points[rows]))
+
+
+def depth_loss(marks: Marks, transforms: Tensor, prior_transforms: Tensor, eye: Tensor) -> Tensor:
+    """Compute the mean squared distance of marks from where the prior poses them, along the lines of sight, over the
+    squared diagonal. A method of ours, not of the paper.
+
+    Args:
+        marks: of the body.
+        transforms: rest -> posed, [J, 4, 4].
+        prior_transforms: the prior's, [J, 4, 4].
+        eye: camera centre, [3].
+    """
+    known = skin_points(marks.points, marks.weights, prior_transforms)
+    moved = skin_points(marks.points, marks.weights, transforms) - known
+    return (moved * normalize(known - eye, dim=-1)).sum(-1).square().mean() / OBJECT_DIAGONAL**2
 
 
 def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geometry, gaps: Tensor | None) -> Tensor:

@@ -1,0 +1,83 @@
+"""The skin moved as a whole: each step also moves all Gaussians of a place along their normals alike.
+
+A method of ours, not of the paper. An outline tells how thick a leg is only where the camera sees it from its edge.
+What moves there takes along the sides that no camera sees, and the other leg. It is gradient descent on a smooth,
+mirror-symmetric field of heights: the gradient is smoothed and scaled by one second moment, as Nicolet et al. do on
+meshes ("Large Steps in Inverse Rendering of Geometry", 2021).
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rewild4d.ours.canonical import Gaussians
+from rewild4d.ours.losses.skin import StartingSkin, third_axes
+from rewild4d.ours.skinning import trilinear
+
+BETAS = (0.9, 0.999)
+"""Of the moments, as in Adam."""
+MARGIN = 1.2
+"""Half-size of the cube over half the longest side of the skin."""
+
+
+class Heights:
+    """Moments of the gradient of heights over the skin, on a cube of voxels around it.
+
+    Attributes:
+        group: learning rate "lr", a number or a scalar tensor: the height of a step where the gradient is largest.
+        first: smoothed gradient, x slowest, [R^3].
+        second: smoothed square of its largest entry, scalar.
+        count: steps taken, scalar.
+    """
+
+    def __init__(self, skin: StartingSkin, resolution: int) -> None:
+        low, high = skin.points.aminmax(dim=0)
+        # Centred on the symmetry plane, so that flipping the first axis is exactly the mirror.
+        center = 0.5 * (low + high) * skin.points.new_tensor((0.0, 1.0, 1.0))
+        half = MARGIN * torch.maximum(0.5 * (high - low).max(), skin.points[:, 0].abs().max())
+        self.resolution, self.origin, self.pitch = resolution, center - half, 2 * half / (resolution - 1)
+        self.group: dict[str, Any] = {"lr": 0.0}
+        self.first = skin.points.new_zeros(resolution**3)
+        self.second, self.count = skin.points.new_zeros(()), skin.points.new_zeros(())
+
+    @torch.no_grad()
+    def step(self, gaussians: Gaussians, skin: StartingSkin) -> None:
+        """Move centres by their gradients, and the points of the skin with them, in place."""
+        gradient, normals = gaussians.means.grad, third_axes(gaussians.quats)
+        assert gradient is not None, "`step` comes after backward"
+        rows, factors = self._corners(gaussians.means)
+        along = factors * (gradient * normals).sum(-1, keepdim=True)
+        total = torch.zeros_like(self.first).index_add_(0, rows.flatten(), along.flatten())
+        smooth = smoothed(total.view([self.resolution] * 3)).flatten()
+        self.count += 1
+        self.first.lerp_(smooth, 1 - BETAS[0])
+        self.second.lerp_(smooth.square().max(), 1 - BETAS[1])
+        scale = (self.second / (1 - BETAS[1] ** self.count)).sqrt().clamp_min(torch.finfo(smooth.dtype).tiny)
+        heights = self.first * (-self.group["lr"] / (1 - BETAS[0] ** self.count) / scale)
+        gaussians.means.data.add_((factors * heights[rows]).sum(-1, keepdim=True) * normals)
+        rows, factors = self._corners(skin.points)
+        skin.points.add_((factors * heights[rows]).sum(-1, keepdim=True) * skin.normals)
+
+    def _corners(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        return trilinear(points, self.origin, self.pitch, self.resolution)
+
+    def state(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what `restore` takes."""
+        return self.first, self.second, self.count
+
+    def restore(self, state: tuple[Tensor, Tensor, Tensor]) -> None:
+        """Continue from `state`."""
+        for own, saved in zip(self.state(), state, strict=True):
+            own.copy_(saved)
+
+
+def smoothed(grid: Tensor) -> Tensor:
+    """Average a grid [R, R, R] with its mirror image along the first axis, then each voxel with its neighbours by
+    weights 1/4, 1/2, 1/4 along each axis; voxels outside are 0."""
+    grid = 0.5 * (grid + grid.flip(0))
+    for axis in range(3):
+        grid = grid.movedim(axis, 0)
+        wider = torch.cat((torch.zeros_like(grid[:1]), grid, torch.zeros_like(grid[:1])))
+        grid = (0.25 * wider[:-2] + 0.5 * wider[1:-1] + 0.25 * wider[2:]).movedim(0, axis)
+    return grid

@@ -1,0 +1,144 @@
+"""The skin moved as a whole, poses held in depth, and the colours that a fit starts from, against cases in the head."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import torch
+from toys import TINY
+
+from rewild4d.ours.canonical import Gaussians, attributes
+from rewild4d.ours.coloring import initial_colors
+from rewild4d.ours.config import Canonical, PriorUse
+from rewild4d.ours.fit import Training, train
+from rewild4d.ours.heights import Heights, smoothed
+from rewild4d.ours.losses.config import Skin
+from rewild4d.ours.losses.skeleton import Marks, depth_loss
+from rewild4d.ours.losses.skin import StartingSkin
+from rewild4d.ours.model import build_model
+from rewild4d.ours.symmetry import Supervision
+from rewild4d.types import Clip, Prior
+
+CPU = torch.device("cpu")
+UPRIGHT = torch.tensor((1.0, 0.0, 0.0, 0.0))
+"""Orientation whose third axis is +z."""
+
+
+def quiet(*_: Any) -> None:
+    """Log nothing."""
+
+
+def sheet(points: torch.Tensor) -> Gaussians:
+    count = len(points)
+    return Gaussians(attributes(points, UPRIGHT.expand(count, 4), torch.zeros(count, 3), 0.5, Canonical()), 0.0)
+
+
+def test_a_voxel_spreads_over_its_neighbours_and_their_mirror_images() -> None:
+    grid = torch.zeros(6, 5, 5)
+    grid[1, 2, 2] = 1.0
+    spread = smoothed(grid)
+    assert float(spread[1, 2, 2]) == float(spread[4, 2, 2]) == 0.5 * 0.5**3
+    assert float(spread[0, 1, 2]) == float(spread[5, 1, 2]) == 0.5 * 0.25 * 0.25 * 0.5
+    assert float(spread[2, 2, 2]) == 0.5 * 0.25 * 0.5**2
+    assert float(spread.sum()) == pytest.approx(1.0)
+
+
+def test_what_no_image_speaks_of_moves_with_its_surroundings() -> None:
+    # Only the first is pulled: up, along its normal. Beside it, on the other side of the animal, and far away.
+    points = torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.05, 0.0], [-1.0, 0.0, 0.0], [1.0, 2.0, 0.0]])
+    gaussians = sheet(points)
+    skin, heights = StartingSkin.of(gaussians), Heights(StartingSkin.of(gaussians), 33)
+    gaussians.means.grad = torch.tensor([[0.3, 0.0, -0.1]] + 3 * [[0.0, 0.0, 0.0]])
+    heights.group["lr"] = 0.01
+    heights.step(gaussians, skin)
+    moved = gaussians.means.detach() - points
+    assert not moved[:, :2].any(), "along the normals alone"
+    first, beside, other, far = moved[:, 2].tolist()
+    assert 0.002 < first <= 0.01 and beside == pytest.approx(first, rel=0.2) and far == 0.0
+    assert other == pytest.approx(first, rel=1e-5)
+    torch.testing.assert_close(skin.points, gaussians.means.detach())
+
+
+def test_the_largest_height_of_a_first_step_is_the_rate() -> None:
+    points = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+    gaussians = sheet(points)
+    skin = StartingSkin.of(gaussians)
+    # Pitch 2 * 1.2 / 12 = 0.2: every point lies on a voxel.
+    heights = Heights(skin, 13)
+    gaussians.means.grad = torch.tensor([[0.0, 0.0, 5.0], [0.0, 0.0, 5.0], [0.0, 0.0, 1.0], [0.0, 0.0, -2.5]])
+    heights.group["lr"] = 0.01
+    heights.step(gaussians, skin)
+    torch.testing.assert_close(gaussians.means.detach()[:, 2], torch.tensor((-0.01, -0.01, -0.002, 0.005)))
+
+
+def test_depth_is_held_and_the_image_plane_is_free() -> None:
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
+    marks = Marks(points, torch.ones(2, 1))
+    eye = torch.tensor((0.0, 0.0, -1e4))
+
+    def price(shift: tuple[float, float, float]) -> float:
+        moved = torch.eye(4)
+        moved[:3, 3] = torch.tensor(shift)
+        return float(depth_loss(marks, moved[None], torch.eye(4)[None], eye))
+
+    assert price((0.0, 0.0, 1.0)) == pytest.approx(1 / 5**2, rel=1e-3)  # the diagonal is 5
+    assert price((1.0, -2.0, 0.0)) == pytest.approx(0.0, abs=1e-6)
+
+
+def training(toy: tuple[Clip, Prior], **changed: Any) -> Training:
+    config, generator = msgspec.structs.replace(TINY, **changed), torch.Generator().manual_seed(0)
+    supervision = Supervision(*toy, config.image_size, CPU)
+    return Training(build_model(config, toy[1], generator), supervision, config, generator)
+
+
+def test_a_centre_follows_the_skin_where_its_place_is_not_told(toy: tuple[Clip, Prior]) -> None:
+    held = training(toy, skin=Skin(follow=True))  # evidence 0: no place is told
+    before = held.gaussians.means.detach().clone()
+    held.step(0)
+    assert torch.equal(held.gaussians.means, before)
+    some = training(toy, skin=Skin(follow=True, evidence=0.02))
+    free = training(toy)
+    some.step(0), free.step(0)
+    assert some.bond is not None
+    share = (some.gaussians.means - before).norm(dim=-1) / (free.gaussians.means - before).norm(dim=-1)
+    seen = share.isfinite()
+    torch.testing.assert_close(share[seen].detach(), (1 - some.bond.firmness)[seen], atol=2e-3, rtol=1e-3)
+
+
+def test_heights_move_the_skin_at_a_falling_rate(toy: tuple[Clip, Prior]) -> None:
+    made = training(toy, skin=Skin(follow=True, heights=1e-2))
+    before = made.gaussians.means.detach().clone()
+    made.step(0)
+    moved = (made.gaussians.means.detach() - before).norm(dim=-1)
+    assert 0 < float(moved.max()) <= 1e-2 * (1 + 1e-4)
+    assert made.step_rates(TINY.iterations)[-1] == pytest.approx(1e-4)
+    assert len(made.rated()) == len(made.step_rates(0)) == len(training(toy).rated()) + 1
+
+
+def test_a_fit_with_all_of_it_resumes_to_the_same_bits(toy: tuple[Clip, Prior], tmp_path: Path) -> None:
+    skin = Skin(disc=0.05, bind=0.02, evidence=0.02, heights=1e-3, follow=True)
+    config = msgspec.structs.replace(TINY, skin=skin, prior=PriorUse(depth=100.0))
+
+    def killed(done: int, *_: Any) -> None:
+        if done == config.iterations + config.warmup.regress + config.warmup.iterations:
+            raise KeyboardInterrupt
+
+    whole = train(*toy, config, 0, CPU, quiet, None)
+    with pytest.raises(KeyboardInterrupt):
+        train(*toy, config, 0, CPU, killed, tmp_path)
+    assert (tmp_path / "checkpoint.pt").is_file()
+    resumed = train(*toy, config, 0, CPU, quiet, tmp_path)
+    for (name, a), b in zip(whole.state_dict().items(), resumed.state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
+
+
+def test_first_colours_are_those_of_the_place(toy: tuple[Clip, Prior]) -> None:
+    generator = torch.Generator().manual_seed(0)
+    model, supervision = build_model(TINY, toy[1], generator), Supervision(*toy, TINY.image_size, CPU)
+    colours, along = initial_colors(model, supervision), model.gaussians.means.detach()[:, 2]
+    # The animal is orange in front and blue behind.
+    front, behind = colours[along > 0.3], colours[along < -0.3]
+    for part, wanted in ((front, (0.8, 0.3, 0.1)), (behind, (0.1, 0.4, 0.7))):
+        wrong = (part - torch.tensor(wanted)).abs().amax(-1) > 0.15
+        assert len(part) > 50 and float(wrong.float().mean()) < 0.05
