@@ -10,7 +10,8 @@ animal too, as in the original. Frames without a camera in the world get the pri
 
 `d3dgs-star` is the paper's D-3DGS*. It starts from the prior's surface in its pose of the first frame, coloured from
 the frames, adds the silhouette loss, and sees each frame flipped as well, at time -t with the mirrored camera. It works
-in the object frame, where mirroring is defined, with the root motion that `ours` gets.
+in the object frame, where mirroring is defined, with the root motion that `ours` gets. Settings `skin` hold its
+Gaussians to that surface as in `ours`, off by default.
 
 Differences from the original: time runs from one frame above zero to one, so that t and -t differ; the heads start
 at zero; harmonics rotate with their Gaussian; image gradients for densification are in units of the animal's box, and
@@ -18,6 +19,7 @@ the number of Gaussians is capped; every Gaussian is blurred by at least half an
 schedule is in fractions; the network computes in bfloat16 on CPUs that have it.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar
 
@@ -35,6 +37,8 @@ from rewild4d.foreign.states import read_as
 from rewild4d.ours.canonical import Gaussians, attributes
 from rewild4d.ours.checkpoint import fit_digest, load_fitted, save_fitted
 from rewild4d.ours.config import Canonical
+from rewild4d.ours.deform import Posed
+from rewild4d.ours.evidence import Sighting, training_views
 from rewild4d.ours.motion import Root
 from rewild4d.ours.schedule import exponential, fade, for_clip
 from rewild4d.ours.symmetry import Supervision, Target, match_times
@@ -85,14 +89,20 @@ class D3dgsTraining(SplatTraining):
     def rate(self, name: str, progress: float) -> float:
         return exponential(*self.config.motion.rate, progress)
 
+    def sightings(self) -> Iterator[Sighting]:
+        own = self.gaussians  # the network moves nothing at the start
+        for key, share in training_views(self.supervision, self.mirrored):
+            yield Sighting(key, share, Posed(own.means, nn.functional.normalize(own.quats, dim=-1), own.scales_log()))
+
     def drawn_losses(self, index: int) -> tuple[dict[str, Tensor], RasterInfo, Target]:
+        self.prepare()
         progress, motion = index / self.config.iterations, self.config.motion
         key = self.draw(self.mirrored)
         noise = float(torch.randn((), generator=self.generator)) * motion.noise * fade(progress, motion.noise_until)
         target, time = self.supervision.target(key), key.view * self.supervision.code_times([key], noise)[0]
         shape = self.model.canonical() if progress < motion.warm_up else self.model.deformed(time)
         rgb, alpha, info = self.render(shape, target, progress)
-        return self.image_losses(rgb, alpha, target), info, target
+        return self.image_losses(rgb, alpha, target) | self.skin_losses(self.gaussians.opacities()), info, target
 
 
 class D3dgsReconstruction:

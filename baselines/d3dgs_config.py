@@ -7,7 +7,7 @@ from msgspec import Meta
 
 from rewild4d.baselines.common.splatting_config import ImageLoss, Resets, SplatConfig
 from rewild4d.contracts import MethodInfo
-from rewild4d.ours.config import Canonical, Density
+from rewild4d.ours.config import Canonical, Density, Skin
 from rewild4d.ours.numbers import Degree, Opacity, Positive, Rate, Share, Weight, Whole
 
 PAPER = "Yang et al., Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene Reconstruction, CVPR 2024"
@@ -113,3 +113,4 @@ class D3dgsStarConfig(D3dgsConfig, frozen=True, forbid_unknown_fields=True, kw_o
     """Share of the steps that see a mirror image, at negative times (paper: open)."""
     canonical: StarCanonical = StarCanonical()
     loss: StarLoss = StarLoss()
+    skin: Skin = Skin()

@@ -20,10 +20,11 @@ from the prior's pose of the flipped frame. The results have the poses of the fr
 Differences from the original: positions get no gradient through the skinning grid; a Gaussian rotates by the blended
 quaternion of its joints, not by the blended matrix, which would shrink it; the grid is a cube; neighbours are searched
 when the set of Gaussians changes, not in every step; colours start from the frames; scales are logarithms with a cap;
-the number of Gaussians is capped. The original's unit of length is the template's diagonal here. The schedule is in
-fractions of the original's 10k steps.
+the number of Gaussians is capped. Settings `skin` hold them to the template as in `ours` and are off by default. The
+original's unit of length is the template's diagonal here. The schedule is in fractions of the original's 10k steps.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -43,6 +44,8 @@ from rewild4d.harmonics import C0
 from rewild4d.kernels.threads import torch_on_one
 from rewild4d.ours.canonical import REST_GAIN, Gaussians
 from rewild4d.ours.checkpoint import fit_digest, load_fitted
+from rewild4d.ours.deform import Posed
+from rewild4d.ours.evidence import Sighting, training_views
 from rewild4d.ours.losses.regularizers import neighbours
 from rewild4d.ours.motion import Root
 from rewild4d.ours.schedule import exponential, for_clip
@@ -91,16 +94,27 @@ class GartTraining(SplatTraining):
             return 0.0 if progress < start else exponential(*poses.skinning_rate, (progress - start) / (1 - start))
         return 0.0 if progress < poses.start else poses.rate * (OBJECT_DIAGONAL if name == "shifts" else 1.0)
 
+    def sightings(self) -> Iterator[Sighting]:
+        weights = self.model.field.still(self.model.gaussians.means)
+        for key, share in training_views(self.supervision, self.config.mirrored):
+            shape = posed(self.model.gaussians, weights, *self._table(key)(key.frame))
+            yield Sighting(key, share, Posed(shape.means, shape.quats, self.gaussians.scales_log()))
+
+    def _table(self, key: Key) -> PoseTable:
+        table = self.model.poses if key.view > 0 else self.model.flipped
+        assert table is not None, "mirror images are drawn, so they have poses"
+        return table
+
     def step(self, index: int) -> dict[str, float]:
         done = index - self.config.iterations
         return super().step(index) if done < 0 else self._refine_step(done)
 
     def drawn_losses(self, index: int) -> tuple[dict[str, Tensor], RasterInfo, Target]:
+        self.prepare()
         config, model = self.config, self.model
         progress = index / config.iterations
         key = self.draw(config.mirrored)
-        target, table = self.supervision.target(key), model.poses if key.view > 0 else model.flipped
-        assert table is not None, "mirror images are drawn, so they have poses"
+        target, table = self.supervision.target(key), self._table(key)
         learns = config.skinning.learn and progress >= config.poses.skinning_start
         regularised = learns and index % config.regularisers.every == 0
         if learns:
@@ -109,7 +123,7 @@ class GartTraining(SplatTraining):
             weights, variation = model.field.still(model.gaussians.means), None
         shape = posed(model.gaussians, weights, *table(key.frame))
         rgb, alpha, info = self.render(shape, target, progress)
-        losses = self.image_losses(rgb, alpha, target) | self._alike()
+        losses = self.image_losses(rgb, alpha, target) | self._alike() | self.skin_losses(self.gaussians.opacities())
         if regularised and variation is not None:
             terms = config.regularisers
             losses["residual"] = terms.every * (terms.variation * variation + terms.norm * model.field.norm())

@@ -19,6 +19,7 @@ from rewild4d.ours.config import (
     Positive,
     Rate,
     Share,
+    Skin,
     Skinning,
     Weight,
     Whole,
@@ -141,6 +142,7 @@ class GartConfig(SplatConfig, frozen=True, forbid_unknown_fields=True, kw_only=T
     skinning: GartSkinning = GartSkinning()
     poses: Poses = Poses()
     regularisers: Regularisers = Regularisers()
+    skin: Skin = Skin()
 
 
 class Refine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -2,7 +2,7 @@
 it is seen. A method of ours, not of the paper."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -39,27 +39,35 @@ class Sighting:
 def sightings(model: Model, supervision: Supervision, mirrored: float = 0.0) -> Iterator[Sighting]:
     """Pose the Gaussians as each training view shows them; a share ``mirrored`` of the steps sees mirror images."""
     weights = model.field.sample(model.field.probabilities(), model.gaussians.means)
+    for key, share in training_views(supervision, mirrored):
+        pose = model.pose(supervision.code_times([key]), [key])
+        yield Sighting(key, share, model.skin(weights, pose.quats[0], model.transforms(pose)[0])[1])
+
+
+def training_views(supervision: Supervision, mirrored: float) -> Iterator[tuple[Key, float]]:
+    """List the views that a fit is trained on, and the share of the steps that sees each."""
     for view, share in ((1, 1 - mirrored), (-1, mirrored)):
         frames = supervision.frames_of(view) if share else []
         for frame in frames:
-            key = Key(view, view, frame)  # under other keys the pose may not be trained
-            pose = model.pose(supervision.code_times([key]), [key])
-            posed = model.skin(weights, pose.quats[0], model.transforms(pose)[0])[1]
-            yield Sighting(key, share / len(frames), posed)
+            yield Key(view, view, frame), share / len(frames)  # under other keys the pose may not be trained
 
 
 @torch.no_grad()
-def information(model: Model, supervision: Supervision, mirrored: float) -> Tensor:
+def information(own: Gaussians, views: Iterable[Sighting], supervision: Supervision) -> Tensor:
     """Return what the clip's images say of each Gaussian's place, in the frame at rest, [n, 3, 3].
 
     The mean over the training views of v (I - d d^T), with d the line of sight and v the share of the Gaussian that is
     drawn. An image tells a place across the line of sight and not along it, so that x^T M x is the share of the frames
     that tell the place along a unit vector x; M is 0 where no frame sees the Gaussian, and its smallest eigenvalue is 0
     where all see it from one side.
+
+    Args:
+        own: canonical Gaussians.
+        views: of them (`sightings`).
+        supervision: with the views' cameras.
     """
-    own = model.gaussians
     total = own.means.new_zeros(len(own), 3, 3)
-    for sighting in sightings(model, supervision, mirrored):
+    for sighting in views:
         camera, posed = supervision.target(sighting.key).camera, sighting.posed
         visible = visible_share(posed, own, camera)
         sight = normalize(posed.means - camera.center.to(posed.means), dim=-1)

@@ -1,8 +1,7 @@
 """Training loop: warm-up, then the stage-aware losses of METHOD section 6."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +14,13 @@ from rewild4d.ours.checkpoint import fit_digest, load_checkpoint
 from rewild4d.ours.coloring import initial_colors
 from rewild4d.ours.config import Config
 from rewild4d.ours.deform import Posed
-from rewild4d.ours.evidence import information
+from rewild4d.ours.evidence import Sighting, sightings
 from rewild4d.ours.gradients import all_finite, clip_gradients, norm_of, require_finite, scale_gradients
 from rewild4d.ours.graphs import CudaRecorder, StepGraphs, can_record
-from rewild4d.ours.heights import Heights
 from rewild4d.ours.inputs import StepInput
 from rewild4d.ours.losses.images import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.losses.regularizers import compact_loss, neighbours, random_direction, rigid_loss, smooth_loss
 from rewild4d.ours.losses.skeleton import Marks, depth_loss, neighbour_keys, posture
-from rewild4d.ours.losses.skin import Bond, StartingSkin, bind_loss, disc_loss
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.pose import blend_poses, joint_transforms, pose_distance
 from rewild4d.ours.schedule import exponential, fade, ramp
@@ -52,22 +49,12 @@ class Training(GaussianTraining):
         }
         model.field.logits.requires_grad_(config.skinning.learn)
         super().__init__(model, groups, config, supervision, generator)
-        self.skin = StartingSkin.of(model.gaussians)
-        self.bond: Bond | None = None
-        self.heights = Heights(self.skin, config.skin.voxels) if config.skin.heights else None
-        self.marks = Marks.of(model, self.skin.points) if config.prior.depth else None
+        self.marks = Marks.of(model, model.gaussians.means.detach()) if config.prior.depth else None
         self.graphs = StepGraphs(self, CudaRecorder(model.pivots.device)) if can_record(model.pivots.device) else None
 
     def step(self, index: int) -> dict[str, float]:
         """Take one step, from graphs where the model is on a GPU that records them."""
         return super().step(index) if self.graphs is None else self.graphs.step(index)
-
-    def rated(self) -> list[dict[str, Any]]:
-        return super().rated() + ([self.heights.group] if self.heights else [])
-
-    def step_rates(self, index: int) -> list[float]:
-        last = [self.config.skin.heights * 0.01 ** (index / self.config.iterations)] if self.heights else []
-        return super().step_rates(index) + last
 
     def rate(self, name: str, progress: float) -> float:
         rates = self.config.rates
@@ -197,62 +184,21 @@ class Training(GaussianTraining):
             losses["rigid"] = config.rigid * rigid_loss(own.means, deformed.means, self.near)
         if config.steady:
             losses["steady"] = config.steady * (deformed.log_scales - posed.log_scales).square().mean()
-        return losses | self._skin_losses(opacities)
-
-    def _skin_losses(self, opacities: Tensor) -> dict[str, Tensor]:
-        config, own = self.config.skin, self.model.gaussians
-        losses: dict[str, Tensor] = {}
-        if not config.holds:
-            return losses
-        assert self.bond is not None, "`prepare` comes first"
-        if config.disc:
-            disc = disc_loss(own.scales_log(), opacities, self.bond.firmness, self.skin.log_radius, config)
-            losses["disc"] = config.disc * disc
-        if config.bind:
-            losses["bind"] = config.bind * bind_loss(own.means, own.quats, self.skin, self.bond, config)
-        return losses
-
-    def update(self, info: RasterInfo | None, target: Target) -> None:
-        means = self.model.gaussians.means
-        before = means.detach().clone() if self.config.skin.follow else None
-        super().update(info, target)
-        if before is not None:
-            assert self.bond is not None, "`prepare` comes first"
-            means.data.lerp_(before, self.bond.firmness[:, None])
-        if self.heights is not None:
-            self.heights.step(self.model.gaussians, self.skin)
+        return losses | self.skin_losses(opacities)
 
     def change_density(self, index: int) -> bool:
         changed = super().change_density(index)
-        self.bond = None if changed else self.bond
         if changed and self.graphs is not None:
             self.graphs.forget()
         return changed
 
     def prepare(self) -> None:
-        """Search each Gaussian's neighbours and its point of the skin, where a loss needs them and the set of Gaussians
-        changed."""
+        super().prepare()
         if self.config.geometry.rigid and len(self.model.gaussians) > 1 and self.near is None:
             self.near = neighbours(self.model.gaussians.means, self.config.geometry.rigid_neighbours)
-        held = self.config.skin
-        if held.holds and self.bond is None:
-            if held.evidence and self.skin.information is None:  # the first step: the skin's points are the Gaussians
-                known = information(self.model, self.supervision, self.config.mirrored)
-                self.skin = replace(self.skin, information=known)
-            self.bond = self.skin.bond(self.skin.nearest(self.model.gaussians.means), held.evidence)
 
-    def state(self) -> dict[str, Any]:
-        bond = self.bond and (self.bond.nearest, self.bond.firmness, self.bond.depth)
-        heights = self.heights and self.heights.state()
-        skin = {"points": self.skin.points, "information": self.skin.information}
-        return super().state() | {"bond": bond, "skin": skin, "heights": heights}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        super().restore(state)
-        self.skin = replace(self.skin, **state["skin"])
-        if self.heights is not None:
-            self.heights.restore(state["heights"])
-        self.bond = state["bond"] and Bond(*state["bond"])
+    def sightings(self) -> Iterator[Sighting]:
+        return sightings(self.model, self.supervision, self.config.mirrored)
 
     def limited(self) -> Tensor:
         """Clip the networks' gradients as `check_gradients` does, without a look at a number; return whether all

@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,7 +14,10 @@ from rewild4d.contracts import Log
 from rewild4d.ours.canonical import NAMES, Gaussians
 from rewild4d.ours.checkpoint import save_checkpoint
 from rewild4d.ours.density import DensityControl
+from rewild4d.ours.evidence import Sighting
 from rewild4d.ours.gradients import all_finite, require_finite
+from rewild4d.ours.holding import HeldSkin
+from rewild4d.ours.losses.config import Skin
 from rewild4d.ours.schedule import exponential
 from rewild4d.ours.symmetry import Supervision, Target
 from rewild4d.rasterizer import RasterInfo
@@ -30,11 +33,12 @@ class GaussianTraining(ABC):
     Attributes:
         model: all that learns; its attribute ``gaussians`` are the canonical Gaussians.
         groups: parameters beside the Gaussians', by name.
-        config: of the method; read are `iterations`, `rates` and `density`.
+        config: of the method; read are `iterations`, `rates`, `density` and, where there is one, `skin`.
         supervision: the clip's images and cameras.
         generator: the only source of randomness.
         optimizer: one group per attribute, in the order of `canonical.NAMES`.
         others: one group for each of `groups`.
+        held: what holds them to the skin that the fit starts from; None where nothing does.
         near: neighbours of each Gaussian, for methods that compare them; None where they are to be searched, [n, k].
     """
 
@@ -61,6 +65,8 @@ class GaussianTraining(ABC):
         self.others = Adam([{"params": group} for group in groups.values()], eps=1e-8, fused=True, capturable=on_gpu)
         self.density = DensityControl(config.density, len(own), own.means.device)
         self.near: Tensor | None = None
+        skin: Skin = getattr(config, "skin", Skin())
+        self.held = HeldSkin(skin, own, self.sightings, supervision) if skin.used else None
 
     @property
     def gaussians(self) -> Gaussians:
@@ -77,6 +83,19 @@ class GaussianTraining(ABC):
     def rate(self, name: str, progress: float) -> float:
         """Return the learning rate of one of `groups`."""
 
+    def sightings(self) -> Iterable[Sighting]:
+        """Show the Gaussians in all training views; for methods that hold them to a skin."""
+        raise NotImplementedError
+
+    def prepare(self) -> None:
+        """Search what losses need of each Gaussian, where the set of Gaussians changed; comes before the losses."""
+        if self.held is not None:
+            self.held.prepare(self.gaussians)
+
+    def skin_losses(self, opacities: Tensor) -> dict[str, Tensor]:
+        """Compute the weighted losses that hold Gaussians with opacities [n] to the skin."""
+        return {} if self.held is None else self.held.losses(self.gaussians, opacities)
+
     def step(self, index: int) -> dict[str, float]:
         """Take one step; return the figures for the log."""
         for group, rate in zip(self.rated(), self.step_rates(index), strict=True):
@@ -92,13 +111,15 @@ class GaussianTraining(ABC):
 
     def rated(self) -> list[dict[str, Any]]:
         """Return the optimizers' groups whose learning rates follow a schedule, in the order of `step_rates`."""
-        return [self.optimizer.param_groups[NAMES.index("means")], *self.others.param_groups]
+        means = self.optimizer.param_groups[NAMES.index("means")]
+        return [means, *self.others.param_groups, *(self.held.groups() if self.held else ())]
 
     def step_rates(self, index: int) -> list[float]:
-        """Return the learning rates of a step: of the means, then of `groups`."""
+        """Return the learning rates of a step: of the means, then of `groups`, then of the skin."""
         progress = index / self.config.iterations
         first, last = self.config.rates.means
-        return [exponential(first, last, progress), *(self.rate(name, progress) for name in self.groups)]
+        others = [self.rate(name, progress) for name in self.groups]
+        return [exponential(first, last, progress), *others, *(self.held.rates(progress) if self.held else ())]
 
     def checked(self, index: int, losses: dict[str, float]) -> dict[str, float]:
         """Return the losses; raise a FloatingPointError where one is not finite."""
@@ -121,14 +142,19 @@ class GaussianTraining(ABC):
         """Show a render's ``info``, if any, to the density control, and follow the gradients."""
         if info is not None:
             self.density.observe(info, target.side, max(target.camera.width, target.camera.height))
+        before = self.gaussians.means.detach().clone() if self.held else None
         self.optimizer.step()
         self.others.step()
+        if self.held and before is not None:
+            self.held.move(self.gaussians, before)
 
     def change_density(self, index: int) -> bool:
         """Densify and prune if that is due after a step; tell whether it was."""
         total = self.config.iterations
         due = self.density.round_if_due(index, total, self.gaussians, self.optimizer, self.generator)
         self.near = None if due else self.near
+        if due and self.held:
+            self.held.forget()
         return due
 
     def logged(self, losses: Mapping[str, float]) -> dict[str, float]:
@@ -143,7 +169,7 @@ class GaussianTraining(ABC):
     def state(self) -> dict[str, Any]:
         """Return what a resumed fit needs beside the generator."""
         optimizers = zip(self.SAVED, map(_saved, (self.optimizer, self.others)), strict=True)
-        others = {"density": self.density.state(), "near": self.near}
+        others = {"density": self.density.state(), "near": self.near, "held": self.held and self.held.state()}
         return {"model": self.model.state_dict(), **dict(optimizers), **others}
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -161,6 +187,8 @@ class GaussianTraining(ABC):
         self.density.restore(state["density"])
         # A new search would find neighbours of the present positions, not of those at the last change.
         self.near = state.get("near")
+        if self.held is not None:
+            self.held.restore(state["held"])
 
 
 def _saved(optimizer: Adam) -> dict[str, Any]:

@@ -63,7 +63,7 @@ def test_information_is_a_mean_over_the_views(toy: tuple[Clip, Prior]) -> None:
         views = list(sightings(model, supervision, mirrored))
         assert math.isclose(sum(each.share for each in views), 1.0)
         assert {each.key for each in views} == {Key(v, v, t) for v in ((1, -1) if mirrored else (1,)) for t in range(5)}
-        found = information(model, supervision, mirrored)
+        found = information(model.gaussians, sightings(model, supervision, mirrored), supervision)
         # The trace of I - d d^T is 2: half of the trace is the mean share that is drawn.
         mean = sum(
             each.share * visible_share(each.posed, model.gaussians, supervision.target(each.key).camera)
@@ -79,7 +79,8 @@ def test_one_line_of_sight_tells_nothing_along_it(toy: tuple[Clip, Prior]) -> No
     supervision = Supervision(*toy, TINY.image_size, torch.device("cpu"))
     supervision.usable = ([2], [2])
     model = build_model(TINY, toy[1], torch.Generator().manual_seed(0))
-    found, own = information(model, supervision, 0.0), model.gaussians
+    own = model.gaussians
+    found = information(own, sightings(model, supervision), supervision)
     (view,) = sightings(model, supervision)
     sight = normalize(view.posed.means - supervision.target(view.key).camera.center.float(), dim=-1)
     rest = torch.einsum("na,nab->nb", sight, own.rotations_to(normalize(view.posed.quats, dim=-1))).detach()

@@ -100,10 +100,10 @@ def test_a_centre_follows_the_skin_where_its_place_is_not_told(toy: tuple[Clip, 
     some = training(toy, skin=Skin(follow=True, evidence=0.02))
     free = training(toy)
     some.step(0), free.step(0)
-    assert some.bond is not None
+    assert some.held is not None and some.held.bond is not None
     share = (some.gaussians.means - before).norm(dim=-1) / (free.gaussians.means - before).norm(dim=-1)
     seen = share.isfinite()
-    torch.testing.assert_close(share[seen].detach(), (1 - some.bond.firmness)[seen], atol=2e-3, rtol=1e-3)
+    torch.testing.assert_close(share[seen].detach(), (1 - some.held.bond.firmness)[seen], atol=2e-3, rtol=1e-3)
 
 
 def test_heights_move_the_skin_at_a_falling_rate(toy: tuple[Clip, Prior]) -> None:

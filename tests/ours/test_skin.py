@@ -122,26 +122,27 @@ def test_a_step_has_both_losses_and_a_new_set_finds_new_points(toy: tuple[Clip, 
     density = Density(start=0.0, end=1.0, every=0.125, gradient=0.0, cap=260)
     made = training(toy, skin=Skin(disc=0.05, bind=0.02), density=density)
     first = made.step(0)
+    held = made.held
     assert first["disc"] > 0 and "bind" in first
-    assert made.bond is not None and len(made.bond.nearest) == len(made.gaussians)
+    assert held is not None and held.bond is not None and len(held.bond.nearest) == len(made.gaussians)
     made.step(1)
-    assert len(made.gaussians) == 260 and made.bond is None
-    assert made.step(2)["bind"] >= 0 and made.bond is not None and len(made.bond.nearest) == 260
+    assert len(made.gaussians) == 260 and held.bond is None
+    assert made.step(2)["bind"] >= 0 and held.bond is not None and len(held.bond.nearest) == 260
     assert {"disc", "bind"}.isdisjoint(training(toy).step(0)), "off by default"
 
 
 def test_a_resumed_fit_keeps_the_evidence_of_the_start(toy: tuple[Clip, Prior]) -> None:
-    held = Skin(disc=0.05, bind=0.02, evidence=0.02)
-    made = training(toy, skin=held)
+    config = Skin(disc=0.05, bind=0.02, evidence=0.02)
+    made, resumed = training(toy, skin=config), training(toy, skin=config)
     made.step(0)
-    assert made.skin.information is not None and made.bond is not None
-    assert 0.0 < float(made.bond.firmness.min()) < float(made.bond.firmness.max()) <= 1.0
-    first = made.skin.information.clone()
+    held, again = made.held, resumed.held
+    assert held is not None and again is not None and held.skin.information is not None and held.bond is not None
+    assert 0.0 < float(held.bond.firmness.min()) < float(held.bond.firmness.max()) <= 1.0
+    first = held.skin.information.clone()
     made.step(1)
-    resumed = training(toy, skin=held)
     resumed.restore(made.state())
-    assert resumed.skin.information is not None and torch.equal(resumed.skin.information, first)
-    assert resumed.bond is not None and torch.equal(resumed.bond.firmness, made.bond.firmness)
+    assert again.skin.information is not None and torch.equal(again.skin.information, first)
+    assert again.bond is not None and torch.equal(again.bond.firmness, held.bond.firmness)
 
 
 def test_epsilon_of_the_colours_is_set(toy: tuple[Clip, Prior]) -> None:
