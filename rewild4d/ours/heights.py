@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.ours.canonical import Gaussians
-from rewild4d.ours.losses.skin import StartingSkin, third_axes
+from rewild4d.ours.losses.skin import StartingSkin
 from rewild4d.ours.skinning import trilinear
 
 BETAS = (0.9, 0.999)
@@ -42,9 +42,10 @@ class Heights:
         self.second, self.count = skin.points.new_zeros(()), skin.points.new_zeros(())
 
     @torch.no_grad()
-    def step(self, gaussians: Gaussians, skin: StartingSkin) -> None:
-        """Move centres by their gradients, and the points of the skin with them, in place."""
-        gradient, normals = gaussians.means.grad, third_axes(gaussians.quats)
+    def step(self, gaussians: Gaussians, skin: StartingSkin, nearest: Tensor) -> None:
+        """Move centres by their gradients along the normals of their points of the skin, in place, and the skin with
+        them; ``nearest`` [n] are the points' rows."""
+        gradient, normals = gaussians.means.grad, skin.normals[nearest]
         assert gradient is not None, "`step` comes after backward"
         rows, factors = self._corners(gaussians.means)
         along = factors * (gradient * normals).sum(-1, keepdim=True)

@@ -53,7 +53,7 @@ class HeldSkin:
 
     def prepare(self, gaussians: Gaussians) -> None:
         """Find each Gaussian's point of the skin, where it is used and the set of Gaussians changed."""
-        if not self.config.holds or self.bond is not None:
+        if self.bond is not None:
             return
         if (
             self.config.evidence and self.skin.information is None
@@ -82,7 +82,7 @@ class HeldSkin:
         if self.config.follow:
             gaussians.means.data.lerp_(before, self._bond().firmness[:, None])
         if self.heights is not None:
-            self.heights.step(gaussians, self.skin)
+            self.heights.step(gaussians, self.skin, self._bond().nearest)
 
     def forget(self) -> None:
         """Find the points of the skin again: the set of Gaussians changed."""

@@ -66,7 +66,7 @@ class GaussianTraining(ABC):
         self.density = DensityControl(config.density, len(own), own.means.device)
         self.near: Tensor | None = None
         skin: Skin = getattr(config, "skin", Skin())
-        self.held = HeldSkin(skin, own, self.sightings, supervision) if skin.used else None
+        self.held = HeldSkin(skin, own, self.sightings, supervision) if skin.holds else None
 
     @property
     def gaussians(self) -> Gaussians:

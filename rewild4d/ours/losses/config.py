@@ -105,10 +105,5 @@ class Skin(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 
     @property
     def holds(self) -> bool:
-        """Whether a Gaussian is held at all."""
-        return self.disc > 0 or self.bind > 0 or self.follow
-
-    @property
-    def used(self) -> bool:
-        """Whether any of it acts."""
-        return self.holds or self.heights > 0
+        """Whether a Gaussian needs its point of the skin at all."""
+        return self.disc > 0 or self.bind > 0 or self.heights > 0 or self.follow
