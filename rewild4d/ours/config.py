@@ -143,7 +143,8 @@ class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """Fraction at which the pull ends (paper: 4k of 20k); above 1 it is still on at the end."""
     depth: Weight = 0.0
     """Weight of the squared distance from the prior's posed skin along the line of sight, which one image does not
-    tell, over the squared diagonal. It does not fall."""
+    tell, over the squared diagonal. It does not fall, and is weaker where frames from several sides tell the place
+    (`skin.evidence`)."""
 
 
 class WarmUp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -1,7 +1,7 @@
 """Training loop: warm-up, then the stage-aware losses of METHOD section 6."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,7 @@ class Training(GaussianTraining):
         }
         model.field.logits.requires_grad_(config.skinning.learn)
         super().__init__(model, groups, config, supervision, generator)
-        self.marks = Marks.of(model, model.gaussians.means.detach()) if config.prior.depth else None
+        self.marks: Marks | None = None
         self.graphs = StepGraphs(self, CudaRecorder(model.pivots.device)) if can_record(model.pivots.device) else None
 
     def step(self, index: int) -> dict[str, float]:
@@ -194,8 +194,18 @@ class Training(GaussianTraining):
 
     def prepare(self) -> None:
         super().prepare()
+        if self.config.prior.depth and self.marks is None:
+            bond = self.held and self.held.bond
+            self.marks = Marks.of(self.model, bond.firmness if bond else None)
         if self.config.geometry.rigid and len(self.model.gaussians) > 1 and self.near is None:
             self.near = neighbours(self.model.gaussians.means, self.config.geometry.rigid_neighbours)
+
+    def state(self) -> dict[str, Any]:
+        return super().state() | {"marks": self.marks and tuple(self.marks)}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        super().restore(state)
+        self.marks = state["marks"] and Marks(*state["marks"])
 
     def sightings(self) -> Iterator[Sighting]:
         return sightings(self.model, self.supervision, self.config.mirrored)

@@ -96,8 +96,8 @@ def test_evidence_weakens_a_hold() -> None:
     # The first is seen by all frames, from the side alone; the second by a half, from many sides.
     seen = replace(skin, information=torch.stack((torch.diag(torch.tensor((1.0, 0.0, 0.98))), 0.06 * torch.eye(3))))
     bond = seen.bond(rows, 0.02)
-    torch.testing.assert_close(bond.firmness, torch.tensor((0.02 / 0.08, 1.0, 0.02 / 0.08)))
-    torch.testing.assert_close(bond.depth, torch.tensor((0.02 / 0.08, 0.02 / 1.0, 0.02 / 0.08)))
+    torch.testing.assert_close(bond.firmness, torch.tensor((4 / (4 + 36), 1.0, 4 / (4 + 36))))
+    torch.testing.assert_close(bond.depth, torch.tensor((4 / (4 + 36), 4 / (4 + 98**2), 4 / (4 + 36))))
 
 
 def test_nearest_is_the_nearest() -> None:

@@ -100,7 +100,7 @@ class Skin(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     voxels: Annotated[int, Meta(ge=2)] = 32
     """Voxels along each axis of the field of heights."""
     follow: bool = False
-    """Let a centre move on its own only as far as frames from several sides tell its place (`evidence`; 0: not at
+    """Let a centre move on its own only as far as frames from several sides tell its place (`evidence`; with 0 not at
     all)."""
 
     @property

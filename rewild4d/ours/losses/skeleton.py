@@ -78,22 +78,26 @@ class Marks(NamedTuple):
     Attributes:
         points: at rest, [k, 3].
         weights: skinning weights at the start of the fit, [k, J].
+        firmness: of the hold on each, [k].
     """
 
     points: Tensor
     weights: Tensor
+    firmness: Tensor
 
     @classmethod
-    def of(cls, model: Model, points: Tensor) -> "Marks":
-        """Choose `MARKS` of the points [n, 3] of a model that was not trained yet."""
-        rows = torch.linspace(0, len(points) - 1, min(MARKS, len(points)), device=points.device).long()
-        with torch.no_grad():
-            return cls(points[rows].clone(), model.field.sample(model.field.probabilities(), points[rows]))
+    @torch.no_grad()
+    def of(cls, model: Model, firmness: Tensor | None) -> "Marks":
+        """Choose `MARKS` of the Gaussians of a model that was not trained yet; ``firmness`` [n] is 1 where None."""
+        means = model.gaussians.means.detach()
+        rows = torch.linspace(0, len(means) - 1, min(MARKS, len(means)), device=means.device).long()
+        held = torch.ones_like(means[:, 0]) if firmness is None else firmness
+        return cls(means[rows].clone(), model.field.sample(model.field.probabilities(), means[rows]), held[rows])
 
 
 def depth_loss(marks: Marks, transforms: Tensor, prior_transforms: Tensor, eye: Tensor) -> Tensor:
-    """Compute the mean squared distance of marks from where the prior poses them, along the lines of sight, over the
-    squared diagonal. A method of ours, not of the paper.
+    """Compute the mean over marks of the squared distance from where the prior poses them, along the lines of sight,
+    times their firmness, over the squared diagonal. A method of ours, not of the paper.
 
     Args:
         marks: of the body.
@@ -103,7 +107,8 @@ def depth_loss(marks: Marks, transforms: Tensor, prior_transforms: Tensor, eye: 
     """
     known = skin_points(marks.points, marks.weights, prior_transforms)
     moved = skin_points(marks.points, marks.weights, transforms) - known
-    return (moved * normalize(known - eye, dim=-1)).sum(-1).square().mean() / OBJECT_DIAGONAL**2
+    along = (moved * normalize(known - eye, dim=-1)).sum(-1)
+    return (marks.firmness * along.square()).mean() / OBJECT_DIAGONAL**2
 
 
 def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geometry, gaps: Tensor | None) -> Tensor:

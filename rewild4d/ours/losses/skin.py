@@ -47,15 +47,15 @@ class StartingSkin:
     def bond(self, nearest: Tensor, half: float) -> "Bond":
         """Return what holds Gaussians whose nearest points are ``nearest``, [n].
 
-        A hold weighs h / (h + i), where h is ``half`` and i what the clip says: of the firmness the smallest eigenvalue
-        of the information, of the depth the information along the normal.
+        A hold weighs h^2 / (h^2 + i^2), where h is ``half`` and i what the clip says: of the firmness the smallest
+        eigenvalue of the information, of the depth the information along the normal.
         """
         if self.information is None:
             whole = self.points.new_ones(len(nearest))
             return Bond(nearest, whole, whole)
         least = torch.linalg.eigvalsh(self.information)[:, 0].clamp_min(0)
         along = torch.einsum("na,nab,nb->n", self.normals, self.information, self.normals)
-        firmness, depth = (half / (half + known[nearest]) for known in (least, along))
+        firmness, depth = (half**2 / (half**2 + known[nearest].square()) for known in (least, along))
         return Bond(nearest, firmness, depth)
 
 
