@@ -82,7 +82,7 @@ def test_depth_is_held_and_the_image_plane_is_free() -> None:
         moved[:3, 3] = torch.tensor(shift)
         return float(depth_loss(marks, moved[None], torch.eye(4)[None], eye))
 
-    assert price((0.0, 0.0, 1.0)) == pytest.approx(0.75 / 5**2, rel=1e-3)  # the diagonal is 5
+    assert price((0.0, 0.0, 1.0)) == pytest.approx((1 + 0.5**2) / 2 / 5**2, rel=1e-3)  # the diagonal is 5
     assert price((1.0, -2.0, 0.0)) == pytest.approx(0.0, abs=1e-6)
 
 

@@ -97,7 +97,8 @@ class Marks(NamedTuple):
 
 def depth_loss(marks: Marks, transforms: Tensor, prior_transforms: Tensor, eye: Tensor) -> Tensor:
     """Compute the mean over marks of the squared distance from where the prior poses them, along the lines of sight,
-    times their firmness, over the squared diagonal. A method of ours, not of the paper.
+    times the square of their firmness, over the squared diagonal: a camera that moves leaves poses free. A method of
+    ours, not of the paper.
 
     Args:
         marks: of the body.
@@ -108,7 +109,7 @@ def depth_loss(marks: Marks, transforms: Tensor, prior_transforms: Tensor, eye: 
     known = skin_points(marks.points, marks.weights, prior_transforms)
     moved = skin_points(marks.points, marks.weights, transforms) - known
     along = (moved * normalize(known - eye, dim=-1)).sum(-1)
-    return (marks.firmness * along.square()).mean() / OBJECT_DIAGONAL**2
+    return (marks.firmness * along).square().mean() / OBJECT_DIAGONAL**2
 
 
 def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geometry, gaps: Tensor | None) -> Tensor:
