@@ -141,10 +141,10 @@ class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     open)."""
     pull_until: Weight = 1.0
     """Fraction at which the pull ends (paper: 4k of 20k); above 1 it is still on at the end."""
-    depth: Weight = 0.0
-    """Weight of the squared distance from the prior's posed skin along the line of sight, which one image does not
-    tell, over the squared diagonal. It does not fall, and is weaker where frames from several sides tell the place
-    (`skin.evidence`)."""
+    untold: Weight = 0.0
+    """Weight of the squared distance from the prior's posed skin (diagonals) as far as an image does not tell it: where
+    the skin is hidden, and along the line of sight where it is seen. It does not fall; places that frames from several
+    sides tell are free (`skin.evidence`)."""
 
 
 class WarmUp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -20,7 +20,8 @@ from rewild4d.ours.graphs import CudaRecorder, StepGraphs, can_record
 from rewild4d.ours.inputs import StepInput
 from rewild4d.ours.losses.images import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.losses.regularizers import compact_loss, neighbours, random_direction, rigid_loss, smooth_loss
-from rewild4d.ours.losses.skeleton import Marks, depth_loss, neighbour_keys, posture
+from rewild4d.ours.losses.skeleton import neighbour_keys, posture
+from rewild4d.ours.losses.untold import Marks, untold_loss
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.pose import blend_poses, joint_transforms, pose_distance
 from rewild4d.ours.schedule import exponential, fade, ramp
@@ -102,6 +103,7 @@ class Training(GaussianTraining):
             degree=min(config.canonical.sh_degree, int(progress / config.canonical.sh_every)),
             varies=acts and config.skinning.learn and geometry.tv > 0 and index % geometry.tv_every == 0,
             compacts=acts and geometry.compact > 0 and index % geometry.compact_every == 0,
+            shown=torch.zeros(0) if self.marks is None else self.marks.shown[int(key.view < 0), key.frame],
         )  # fmt: skip
 
     def losses_of(self, given: StepInput) -> tuple[dict[str, Tensor], RasterInfo | None]:
@@ -131,7 +133,8 @@ class Training(GaussianTraining):
         if self.marks is not None:
             quats, shifts = (part[given.row].squeeze(0) for part in given.prior_pose)
             before = joint_transforms(quats, shifts, model.pivots)
-            losses["depth"] = config.prior.depth * depth_loss(self.marks, transforms.squeeze(0), before, given.eye)
+            untold = untold_loss(self.marks, transforms.squeeze(0), before, given.eye, given.shown)
+            losses["untold"] = config.prior.untold * untold
         if delta is not None:
             losses["tv"] = config.geometry.tv * config.geometry.tv_every * variation
         return losses | self._geometry_losses(given, weights, opacities, posed, deformed), info
@@ -194,9 +197,9 @@ class Training(GaussianTraining):
 
     def prepare(self) -> None:
         super().prepare()
-        if self.config.prior.depth and self.marks is None:
+        if self.config.prior.untold and self.marks is None:
             bond = self.held and self.held.bond
-            self.marks = Marks.of(self.model, bond.firmness if bond else None)
+            self.marks = Marks.of(self.model, bond.firmness if bond else None, self.sightings(), self.supervision)
         if self.config.geometry.rigid and len(self.model.gaussians) > 1 and self.near is None:
             self.near = neighbours(self.model.gaussians.means, self.config.geometry.rigid_neighbours)
 

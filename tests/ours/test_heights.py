@@ -1,4 +1,4 @@
-"""The skin moved as a whole, poses held in depth, and the colours that a fit starts from, against cases in the head."""
+"""The skin moved as a whole, poses held where no image tells them, and first colours, against cases in the head."""
 
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ from rewild4d.ours.config import Canonical, PriorUse
 from rewild4d.ours.fit import Training, train
 from rewild4d.ours.heights import Heights, smoothed
 from rewild4d.ours.losses.config import Skin
-from rewild4d.ours.losses.skeleton import Marks, depth_loss
 from rewild4d.ours.losses.skin import StartingSkin
+from rewild4d.ours.losses.untold import Marks, untold_loss
 from rewild4d.ours.model import build_model
 from rewild4d.ours.symmetry import Supervision
 from rewild4d.types import Clip, Prior
@@ -72,18 +72,29 @@ def test_the_largest_height_of_a_first_step_is_the_rate() -> None:
     torch.testing.assert_close(gaussians.means.detach()[:, 2], torch.tensor((-0.01, -0.01, -0.002, 0.005)))
 
 
-def test_depth_is_held_and_the_image_plane_is_free() -> None:
+def test_what_an_image_does_not_tell_is_held() -> None:
     points = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
-    marks = Marks(points, torch.ones(2, 1), torch.tensor((1.0, 0.5)))
+    marks = Marks(points, torch.ones(2, 1), torch.tensor((1.0, 0.5)), torch.zeros(2, 1, 2))
     eye = torch.tensor((0.0, 0.0, -1e4))
 
-    def price(shift: tuple[float, float, float]) -> float:
+    def price(shift: tuple[float, float, float], shown: tuple[float, float]) -> float:
         moved = torch.eye(4)
         moved[:3, 3] = torch.tensor(shift)
-        return float(depth_loss(marks, moved[None], torch.eye(4)[None], eye))
+        return float(untold_loss(marks, moved[None], torch.eye(4)[None], eye, torch.tensor(shown)))
 
-    assert price((0.0, 0.0, 1.0)) == pytest.approx((1 + 0.5**2) / 2 / 5**2, rel=1e-3)  # the diagonal is 5
-    assert price((1.0, -2.0, 0.0)) == pytest.approx(0.0, abs=1e-6)
+    # The diagonal is 5, firmness 1 and 1/2.
+    assert price((0.0, 0.0, 1.0), (1.0, 1.0)) == pytest.approx((1 + 0.5**2) / 2 / 5**2, rel=1e-3)
+    assert price((1.0, -2.0, 0.0), (1.0, 1.0)) == pytest.approx(0.0, abs=1e-6)
+    assert price((1.0, -2.0, 0.0), (0.0, 0.6)) == pytest.approx((5 + 0.5**2 * 0.4 * 5) / 2 / 5**2, rel=1e-3)
+
+
+def test_marks_know_where_they_are_shown(toy: tuple[Clip, Prior]) -> None:
+    made = training(toy, prior=PriorUse(untold=100.0))
+    assert made.step(0)["untold"] >= 0
+    marks = made.marks
+    assert marks is not None and marks.shown.shape == (2, len(toy[0].frames), len(marks.points))
+    assert 0.2 < float(marks.shown.mean()) < 0.8 and float(marks.shown.max()) == 1.0
+    assert torch.equal(marks.firmness, torch.ones(len(marks.points))), "without evidence all are held alike"
 
 
 def training(toy: tuple[Clip, Prior], **changed: Any) -> Training:
@@ -118,7 +129,7 @@ def test_heights_move_the_skin_at_a_falling_rate(toy: tuple[Clip, Prior]) -> Non
 
 def test_a_fit_with_all_of_it_resumes_to_the_same_bits(toy: tuple[Clip, Prior], tmp_path: Path) -> None:
     skin = Skin(disc=0.05, bind=0.02, evidence=0.02, heights=1e-3, follow=True)
-    config = msgspec.structs.replace(TINY, skin=skin, prior=PriorUse(depth=100.0))
+    config = msgspec.structs.replace(TINY, skin=skin, prior=PriorUse(untold=100.0))
 
     def killed(done: int, *_: Any) -> None:
         if done == config.iterations + config.warmup.regress + config.warmup.iterations:

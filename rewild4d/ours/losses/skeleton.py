@@ -3,9 +3,7 @@
 import math
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from rewild4d.ours.fused.skeleton import POSTURE, Weights, posture_and_losses
 from rewild4d.ours.losses.config import Geometry
@@ -13,11 +11,7 @@ from rewild4d.ours.losses.regularizers import attach_loss, limit_loss, sagittal_
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import Pose
 from rewild4d.ours.symmetry import Key
-from rewild4d.transforms import skin_points
 from rewild4d.types import OBJECT_DIAGONAL
-
-MARKS = 400
-"""Points of the skin at which depths are compared."""
 
 
 class Neighbours(NamedTuple):
@@ -70,46 +64,6 @@ def posture(
     transforms = model.transforms(poses)
     total = skeleton_losses(model, poses, transforms, config, gaps)
     return Pose(*(tensor[rows] for tensor in poses)), transforms[rows], total
-
-
-class Marks(NamedTuple):
-    """Points of the skin that stand for the body.
-
-    Attributes:
-        points: at rest, [k, 3].
-        weights: skinning weights at the start of the fit, [k, J].
-        firmness: of the hold on each, [k].
-    """
-
-    points: Tensor
-    weights: Tensor
-    firmness: Tensor
-
-    @classmethod
-    @torch.no_grad()
-    def of(cls, model: Model, firmness: Tensor | None) -> "Marks":
-        """Choose `MARKS` of the Gaussians of a model that was not trained yet; ``firmness`` [n] is 1 where None."""
-        means = model.gaussians.means.detach()
-        rows = torch.linspace(0, len(means) - 1, min(MARKS, len(means)), device=means.device).long()
-        held = torch.ones_like(means[:, 0]) if firmness is None else firmness
-        return cls(means[rows].clone(), model.field.sample(model.field.probabilities(), means[rows]), held[rows])
-
-
-def depth_loss(marks: Marks, transforms: Tensor, prior_transforms: Tensor, eye: Tensor) -> Tensor:
-    """Compute the mean over marks of the squared distance from where the prior poses them, along the lines of sight,
-    times the square of their firmness, over the squared diagonal: a camera that moves leaves poses free. A method of
-    ours, not of the paper.
-
-    Args:
-        marks: of the body.
-        transforms: rest -> posed, [J, 4, 4].
-        prior_transforms: the prior's, [J, 4, 4].
-        eye: camera centre, [3].
-    """
-    known = skin_points(marks.points, marks.weights, prior_transforms)
-    moved = skin_points(marks.points, marks.weights, transforms) - known
-    along = (moved * normalize(known - eye, dim=-1)).sum(-1)
-    return (marks.firmness * along).square().mean() / OBJECT_DIAGONAL**2
 
 
 def skeleton_losses(model: Model, pose: Pose, transforms: Tensor, config: Geometry, gaps: Tensor | None) -> Tensor:
