@@ -34,10 +34,9 @@ from rewild4d.baselines.d3dgs_config import INFO, STAR_INFO, D3dgsConfig, D3dgsS
 from rewild4d.baselines.d3dgs_network import DeformationNetwork
 from rewild4d.contracts import Log, MethodInfo
 from rewild4d.foreign.states import read_as
-from rewild4d.ours.canonical import Gaussians, attributes
+from rewild4d.ours.canonical import Gaussians, Posed, attributes
 from rewild4d.ours.checkpoint import fit_digest, load_fitted, save_fitted
 from rewild4d.ours.config import Canonical
-from rewild4d.ours.deform import Posed
 from rewild4d.ours.evidence import Sighting, training_views
 from rewild4d.ours.motion import Root
 from rewild4d.ours.schedule import exponential, fade, for_clip

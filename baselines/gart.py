@@ -42,9 +42,8 @@ from rewild4d.contracts import Log, MethodInfo
 from rewild4d.foreign.states import read_as
 from rewild4d.harmonics import C0
 from rewild4d.kernels.threads import torch_on_one
-from rewild4d.ours.canonical import REST_GAIN, Gaussians
+from rewild4d.ours.canonical import REST_GAIN, Gaussians, Posed
 from rewild4d.ours.checkpoint import fit_digest, load_fitted
-from rewild4d.ours.deform import Posed
 from rewild4d.ours.evidence import Sighting, training_views
 from rewild4d.ours.losses.regularizers import neighbours
 from rewild4d.ours.motion import Root

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +20,14 @@ NAMES = ("means", "quats", "log_scales", "logit_opacities", "colors")
 """Learnable attributes, in the order of the optimizer's groups."""
 REST_GAIN = 20.0
 """Factor on the stored coefficients above degree 0: under Adam it divides their learning rate, as in 3DGS."""
+
+
+class Posed(NamedTuple):
+    """Gaussians after skinning or deformation: means [n, 3], unit quats [n, 4], log scales [n, 3]."""
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
 
 
 class Gaussians(nn.Module):

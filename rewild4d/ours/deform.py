@@ -1,11 +1,10 @@
 """Part-conditioned deformation: cross-attention from every Gaussian to the parts, beyond skinning."""
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor, nn
 
 from rewild4d.kernels.simd import LANES
+from rewild4d.ours.canonical import Posed
 from rewild4d.ours.config import Deform as DeformConfig
 from rewild4d.ours.fused.deformation import DEFORMATION, deform
 from rewild4d.ours.fused.folding import Layers, fold
@@ -14,14 +13,6 @@ from rewild4d.ours.inputs import Scalar
 from rewild4d.ours.pose import seed_linears
 from rewild4d.transforms import quat_multiply
 from rewild4d.types import OBJECT_DIAGONAL
-
-
-class Posed(NamedTuple):
-    """Gaussians after skinning or deformation: means [n, 3], unit quats [n, 4], log scales [n, 3]."""
-
-    means: Tensor
-    quats: Tensor
-    log_scales: Tensor
 
 
 class DeformNetwork(nn.Module):

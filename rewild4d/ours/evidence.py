@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from rewild4d.ours.canonical import Gaussians
-from rewild4d.ours.deform import Posed
+from rewild4d.ours.canonical import Gaussians, Posed
 from rewild4d.ours.model import Model
 from rewild4d.ours.symmetry import Key, Supervision
 from rewild4d.rasterizer import rasterize

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from rewild4d.contracts import Log
 from rewild4d.kernels.threads import torch_on_one
+from rewild4d.ours.canonical import Posed
 from rewild4d.ours.checkpoint import fit_digest, load_checkpoint
 from rewild4d.ours.coloring import initial_colors
 from rewild4d.ours.config import Config
-from rewild4d.ours.deform import Posed
 from rewild4d.ours.evidence import Sighting, sightings
 from rewild4d.ours.gradients import all_finite, clip_gradients, norm_of, require_finite, scale_gradients
 from rewild4d.ours.graphs import CudaRecorder, StepGraphs, can_record

@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor, nn
 
-from rewild4d.ours.canonical import Gaussians, initial_gaussians
+from rewild4d.ours.canonical import Gaussians, Posed, initial_gaussians
 from rewild4d.ours.config import Config
-from rewild4d.ours.deform import DeformNetwork, Posed
+from rewild4d.ours.deform import DeformNetwork
 from rewild4d.ours.fused.skinning import SKINNING, skin_both
 from rewild4d.ours.inputs import Scalar
 from rewild4d.ours.pose import Pose, PoseNetwork, joint_transforms, time_code

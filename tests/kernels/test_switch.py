@@ -28,8 +28,9 @@ from rewild4d.kernels.switch import (
     twin_digest,
     without_kernels,
 )
+from rewild4d.ours.canonical import Posed
 from rewild4d.ours.config import Deform, Pose
-from rewild4d.ours.deform import DeformNetwork, Posed
+from rewild4d.ours.deform import DeformNetwork
 from rewild4d.ours.losses import regularizers
 from rewild4d.ours.pose import PoseNetwork
 

@@ -7,9 +7,8 @@ import torch
 from torch.nn.functional import normalize
 from toys import TINY
 
-from rewild4d.ours.canonical import Gaussians, attributes
+from rewild4d.ours.canonical import Gaussians, Posed, attributes
 from rewild4d.ours.config import Canonical
-from rewild4d.ours.deform import Posed
 from rewild4d.ours.evidence import information, sightings, visible_share
 from rewild4d.ours.model import build_model
 from rewild4d.ours.symmetry import Key, Supervision

@@ -6,9 +6,9 @@ from torch import Tensor
 from twins import Make, check_twins, leaves, normal, same_on_any_threads, unit
 
 from rewild4d.kernels.halves import available
-from rewild4d.ours.canonical import Gaussians
+from rewild4d.ours.canonical import Gaussians, Posed
 from rewild4d.ours.config import Config, Deform, Skinning
-from rewild4d.ours.deform import DeformNetwork, Posed
+from rewild4d.ours.deform import DeformNetwork
 from rewild4d.ours.fused.harmonics import seen_rgb
 from rewild4d.ours.fused.skinning import skin_both
 from rewild4d.ours.losses.config import Loss

@@ -5,9 +5,10 @@ import torch
 from torch import Tensor
 from twins import normal, unit
 
+from rewild4d.ours.canonical import Posed
 from rewild4d.ours.config import Deform
 from rewild4d.ours.config import Pose as PoseConfig
-from rewild4d.ours.deform import DeformNetwork, Posed
+from rewild4d.ours.deform import DeformNetwork
 from rewild4d.ours.pose import PoseNetwork
 
 LAYERS = ("query", "skip", "key", "value", "project", "up", "down", "out")

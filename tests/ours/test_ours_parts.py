@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from rewild4d.ours.canonical import NAMES, Gaussians
+from rewild4d.ours.canonical import NAMES, Gaussians, Posed
 from rewild4d.ours.config import Config, Deform, Density, Pose, Skinning
-from rewild4d.ours.deform import DeformNetwork, Posed
+from rewild4d.ours.deform import DeformNetwork
 from rewild4d.ours.density import replace_gaussians
 from rewild4d.ours.losses.images import colour_losses, silhouette_loss, ssim_map, union_window
 from rewild4d.ours.losses.regularizers import (

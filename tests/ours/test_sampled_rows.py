@@ -5,8 +5,9 @@ import pytest
 import torch
 from twins import normal, unit
 
+from rewild4d.ours.canonical import Posed
 from rewild4d.ours.config import Deform
-from rewild4d.ours.deform import DeformNetwork, Posed
+from rewild4d.ours.deform import DeformNetwork
 from rewild4d.ours.fused.sampled_rows import sample_rows
 
 

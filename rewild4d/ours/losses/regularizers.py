@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from rewild4d.kernels import gpu
-from rewild4d.ours.deform import Posed
+from rewild4d.ours.canonical import Posed
 from rewild4d.ours.fused.compactness import COMPACTNESS, LEAST_MASS, compactness
 from rewild4d.ours.fused.normals import LEAST_COVER, NORMALS, disagreement, smallest_axes
 from rewild4d.ours.pose import Pose, aligned
