@@ -5,9 +5,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from rewild4d.ours.evidence import sightings, visible_share
+from rewild4d.ours.evidence import visible_share
 from rewild4d.ours.losses.skin import third_axes
-from rewild4d.ours.model import Model
+from rewild4d.ours.model import Model, sightings
 from rewild4d.ours.symmetry import Supervision, Target
 from rewild4d.transforms import mirror_points
 

@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from rewild4d.ours.canonical import Gaussians, Posed
-from rewild4d.ours.model import Model
 from rewild4d.ours.symmetry import Key, Supervision
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import quat_to_matrix
@@ -35,14 +34,6 @@ class Sighting:
     posed: Posed
 
 
-def sightings(model: Model, supervision: Supervision, mirrored: float = 0.0) -> Iterator[Sighting]:
-    """Pose the Gaussians as each training view shows them; a share ``mirrored`` of the steps sees mirror images."""
-    weights = model.field.sample(model.field.probabilities(), model.gaussians.means)
-    for key, share in training_views(supervision, mirrored):
-        pose = model.pose(supervision.code_times([key]), [key])
-        yield Sighting(key, share, model.skin(weights, pose.quats[0], model.transforms(pose)[0])[1])
-
-
 def training_views(supervision: Supervision, mirrored: float) -> Iterator[tuple[Key, float]]:
     """List the views that a fit is trained on, and the share of the steps that sees each."""
     for view, share in ((1, 1 - mirrored), (-1, mirrored)):
@@ -62,7 +53,7 @@ def information(own: Gaussians, views: Iterable[Sighting], supervision: Supervis
 
     Args:
         own: canonical Gaussians.
-        views: of them (`sightings`).
+        views: of them.
         supervision: with the views' cameras.
     """
     total = own.means.new_zeros(len(own), 3, 3)

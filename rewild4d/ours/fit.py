@@ -14,7 +14,7 @@ from rewild4d.ours.canonical import Posed
 from rewild4d.ours.checkpoint import fit_digest, load_checkpoint
 from rewild4d.ours.coloring import initial_colors
 from rewild4d.ours.config import Config
-from rewild4d.ours.evidence import Sighting, sightings
+from rewild4d.ours.evidence import Sighting
 from rewild4d.ours.gradients import all_finite, clip_gradients, norm_of, require_finite, scale_gradients
 from rewild4d.ours.graphs import CudaRecorder, StepGraphs, can_record
 from rewild4d.ours.inputs import StepInput
@@ -22,7 +22,7 @@ from rewild4d.ours.losses.images import WINDOW, colour_losses, silhouette_loss, 
 from rewild4d.ours.losses.regularizers import compact_loss, neighbours, random_direction, rigid_loss, smooth_loss
 from rewild4d.ours.losses.skeleton import neighbour_keys, posture
 from rewild4d.ours.losses.untold import Marks, untold_loss
-from rewild4d.ours.model import Model, build_model
+from rewild4d.ours.model import Model, build_model, sightings
 from rewild4d.ours.pose import blend_poses, joint_transforms, pose_distance
 from rewild4d.ours.schedule import exponential, fade, ramp
 from rewild4d.ours.symmetry import Key, Supervision, Target

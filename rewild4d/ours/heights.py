@@ -13,10 +13,12 @@ from torch import Tensor
 
 from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.losses.skin import StartingSkin
-from rewild4d.ours.skinning import trilinear
+from rewild4d.ours.skinning import cube_around, trilinear
 
 BETAS = (0.9, 0.999)
 """Of the moments, as in Adam."""
+VOXELS = 32
+"""Along each axis."""
 MARGIN = 1.2
 """Half-size of the cube over half the longest side of the skin."""
 
@@ -31,12 +33,9 @@ class Heights:
         count: steps taken, scalar.
     """
 
-    def __init__(self, skin: StartingSkin, resolution: int) -> None:
-        low, high = skin.points.aminmax(dim=0)
-        # Centred on the symmetry plane, so that flipping the first axis is exactly the mirror.
-        center = 0.5 * (low + high) * skin.points.new_tensor((0.0, 1.0, 1.0))
-        half = MARGIN * torch.maximum(0.5 * (high - low).max(), skin.points[:, 0].abs().max())
-        self.resolution, self.origin, self.pitch = resolution, center - half, 2 * half / (resolution - 1)
+    def __init__(self, skin: StartingSkin, resolution: int = VOXELS) -> None:
+        self.resolution = resolution
+        self.origin, self.pitch = cube_around(skin.points, MARGIN, resolution)
         self.group: dict[str, Any] = {"lr": 0.0}
         self.first = skin.points.new_zeros(resolution**3)
         self.second, self.count = skin.points.new_zeros(()), skin.points.new_zeros(())

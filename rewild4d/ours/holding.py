@@ -12,6 +12,7 @@ from rewild4d.ours.evidence import Sighting, information
 from rewild4d.ours.heights import Heights
 from rewild4d.ours.losses.config import Skin
 from rewild4d.ours.losses.skin import Bond, StartingSkin, bind_loss, disc_loss
+from rewild4d.ours.schedule import exponential
 from rewild4d.ours.symmetry import Supervision
 
 FALL = 0.01
@@ -41,11 +42,12 @@ class HeldSkin:
         self.config, self.sightings, self.supervision = config, sightings, supervision
         self.skin = StartingSkin.of(gaussians)
         self.bond: Bond | None = None
-        self.heights = Heights(self.skin, config.voxels) if config.heights else None
+        self.heights = Heights(self.skin) if config.heights else None
 
     def rates(self, progress: float) -> list[float]:
         """Return the learning rates of `groups` at a share of the fit."""
-        return [self.config.heights * FALL**progress for _ in self.groups()]
+        first = self.config.heights
+        return [exponential(first, FALL * first, progress) for _ in self.groups()]
 
     def groups(self) -> list[dict[str, Any]]:
         """Return what has a learning rate, as groups of an optimizer."""
@@ -55,9 +57,8 @@ class HeldSkin:
         """Find each Gaussian's point of the skin, where it is used and the set of Gaussians changed."""
         if self.bond is not None:
             return
-        if (
-            self.config.evidence and self.skin.information is None
-        ):  # the first step: the skin's points are the Gaussians
+        # In the first step the skin's points are the Gaussians.
+        if self.config.evidence and self.skin.information is None:
             known = information(gaussians, self.sightings(), self.supervision)
             self.skin = replace(self.skin, information=known)
         self.bond = self.skin.bond(self.skin.nearest(gaussians.means), self.config.evidence)

@@ -32,7 +32,7 @@ class StepInput:
         degree: of the harmonics in use.
         varies: whether L_tv acts.
         compacts: whether L_compact acts.
-        shown: share of each mark that the view draws (`skeleton.Marks`), [k]; empty where there are no marks.
+        shown: share of each mark that the view draws (`untold.Marks`), [k]; empty where there are no marks.
     """
 
     target: Target

@@ -1,16 +1,19 @@
 """The learnable model, and its two branches."""
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor, nn
 
 from rewild4d.ours.canonical import Gaussians, Posed, initial_gaussians
 from rewild4d.ours.config import Config
 from rewild4d.ours.deform import DeformNetwork
+from rewild4d.ours.evidence import Sighting, training_views
 from rewild4d.ours.fused.skinning import SKINNING, skin_both
 from rewild4d.ours.inputs import Scalar
 from rewild4d.ours.pose import Pose, PoseNetwork, joint_transforms, time_code
 from rewild4d.ours.skinning import SkinningField, build_field
-from rewild4d.ours.symmetry import Key
+from rewild4d.ours.symmetry import Key, Supervision
 from rewild4d.transforms import skin_points, skin_quats
 from rewild4d.types import Prior
 
@@ -102,6 +105,14 @@ class Model(nn.Module):
         """Return skinned Gaussians of the appearance branch at a pose of one code, and the same deformed."""
         posed = self.skin(weights, pose.quats[0], self.transforms(pose)[0])[1]
         return posed, self.deformed(pose, weights, posed, strength or None)
+
+
+def sightings(model: Model, supervision: Supervision, mirrored: float = 0.0) -> Iterator[Sighting]:
+    """Pose the Gaussians as each training view shows them; a share ``mirrored`` of the steps sees mirror images."""
+    weights = model.field.sample(model.field.probabilities(), model.gaussians.means)
+    for key, share in training_views(supervision, mirrored):
+        pose = model.pose(supervision.code_times([key]), [key])
+        yield Sighting(key, share, model.skin(weights, pose.quats[0], model.transforms(pose)[0])[1])
 
 
 def build_model(config: Config, prior: Prior, generator: torch.Generator) -> Model:

@@ -75,21 +75,29 @@ def trilinear(points: Tensor, origin: Tensor, pitch: Tensor, resolution: int) ->
     return (x * resolution + y) * resolution + z, factors
 
 
+def cube_around(points: Tensor, margin: float, resolution: int) -> tuple[Tensor, Tensor]:
+    """Return the first corner [3] and the pitch (scalar) of a cube of voxels around points [n, 3].
+
+    Its half-size is ``margin`` times half their longest side.
+    """
+    low, high = points.amin(0), points.amax(0)
+    half = margin * 0.5 * (high - low).max()
+    center = 0.5 * (low + high)
+    # The cube is centred on the symmetry plane, so that flipping rows is exactly the mirror.
+    center = center * center.new_tensor((0.0, 1.0, 1.0))
+    half = torch.maximum(half, points[:, 0].abs().max())
+    return center - half, 2 * half / (resolution - 1)
+
+
 def build_field(vertices: Tensor, weights: Tensor, mirror: Tensor, config: Skinning) -> SkinningField:
     """Spread the prior's skinning weights [n, J] over a cube around its rest shape [n, 3].
 
     Per voxel the inverse-distance mean of the nearest vertices' weights, then sweeps of neighbour averaging.
     """
-    low, high = vertices.amin(0), vertices.amax(0)
-    half = config.margin * 0.5 * (high - low).max()
-    center = 0.5 * (low + high)
-    # The cube is centred on the symmetry plane, so that flipping rows is exactly the mirror.
-    center = center * center.new_tensor((0.0, 1.0, 1.0))
-    half = torch.maximum(half, vertices[:, 0].abs().max())
     size = config.resolution
-    pitch = 2 * half / (size - 1)
+    origin, pitch = cube_around(vertices, config.margin, size)
     ticks = torch.arange(size, dtype=torch.float64) * pitch.double()
-    grid = torch.cartesian_prod(ticks, ticks, ticks) + (center - half).double()
+    grid = torch.cartesian_prod(ticks, ticks, ticks) + origin.double()
     count = min(config.neighbours, len(vertices))
     distance, nearest = cKDTree(vertices.double().numpy()).query(grid.numpy(), k=count)
     influence = 1.0 / np.clip(distance.reshape(-1, count), 1e-4, 1.0)
@@ -97,7 +105,7 @@ def build_field(vertices: Tensor, weights: Tensor, mirror: Tensor, config: Skinn
     start = np.einsum("vk,vkj->vj", influence, weights.double().numpy()[nearest.reshape(-1, count)])
     spread = _sweep(torch.from_numpy(start).view(size, size, size, -1), config)
     logits = (spread.reshape(size**3, -1) + config.floor).log()
-    return SkinningField(logits, center - half, pitch.repeat(3), mirror, config.tied)
+    return SkinningField(logits, origin, pitch.repeat(3), mirror, config.tied)
 
 
 def _sweep(field: Tensor, config: Skinning) -> Tensor:

@@ -83,9 +83,9 @@ class GaussianTraining(ABC):
     def rate(self, name: str, progress: float) -> float:
         """Return the learning rate of one of `groups`."""
 
+    @abstractmethod
     def sightings(self) -> Iterable[Sighting]:
-        """Show the Gaussians in all training views; for methods that hold them to a skin."""
-        raise NotImplementedError
+        """Show the Gaussians in all training views, as they are placed at the start."""
 
     def prepare(self) -> None:
         """Search what losses need of each Gaussian, where the set of Gaussians changed; comes before the losses."""

@@ -1,11 +1,13 @@
-"""Run records with chosen values."""
+"""Run records with chosen values, and tables of chosen rows."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 
 from rewild4d.leaderboard.layout import Table
 from rewild4d.leaderboard.records import RunRecord, Timing
+from rewild4d.leaderboard.specs import Condition, Line, Spec
 from rewild4d.metrics.score import Score
 
 PROTOCOL = {"name": "p-v1", "title": "P", "scores": ["psnr"], "floors": ["empty"], "digest": "d"}
@@ -50,3 +52,12 @@ def texts(made: Table) -> dict[str, tuple[str, str, str]]:
 def still(record: RunRecord) -> RunRecord:
     """A record without what may differ between two equal runs."""
     return msgspec.structs.replace(record, timing=Timing("", 0, 0, 0))
+
+
+def spec(rows: Sequence[Line], **changes: Any) -> Spec:
+    """A table of rows under one condition."""
+    fields: dict[str, Any] = {
+        "title": "Demo", "dataset": "artemis", "scores": ("psnr", "iou"), "rows": tuple(rows),
+        "conditions": (Condition(protocol="artemis-sweep-128"),), "preset": "quick", "seeds": (0,),
+    }  # fmt: skip
+    return Spec(**{**fields, **changes})

@@ -9,8 +9,8 @@ from toys import TINY
 
 from rewild4d.ours.canonical import Gaussians, Posed, attributes
 from rewild4d.ours.config import Canonical
-from rewild4d.ours.evidence import information, sightings, visible_share
-from rewild4d.ours.model import build_model
+from rewild4d.ours.evidence import information, visible_share
+from rewild4d.ours.model import build_model, sightings
 from rewild4d.ours.symmetry import Key, Supervision
 from rewild4d.types import Camera, Clip, Prior
 

@@ -1,9 +1,8 @@
 """Settings of the losses of `ours`; conventions as in rewild4d/ours/config.py."""
 
-from typing import Annotated, Literal
+from typing import Literal
 
 import msgspec
-from msgspec import Meta
 
 from rewild4d.ours.numbers import Count, Positive, Size, Weight
 
@@ -94,11 +93,8 @@ class Skin(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """Largest scale, in starting radii."""
     reach: Positive = 3.0
     """Distance, in starting radii, beyond which a Gaussian is free."""
-
     heights: Weight = 0.0
     """Rate at which the skin moves as a whole along its normals, falling to a hundredth (heights.py); 0 for none."""
-    voxels: Annotated[int, Meta(ge=2)] = 32
-    """Voxels along each axis of the field of heights."""
     follow: bool = False
     """Let a centre move on its own only as far as frames from several sides tell its place (`evidence`; with 0 not at
     all)."""

@@ -1,0 +1,62 @@
+"""Records from before a preset was mended: they stand for their row, with a note, until there are later ones."""
+
+from typing import Any
+
+import msgspec
+from records_for_tests import PROTOCOL, psnr, record, spec
+
+from rewild4d.leaderboard.records import RunRecord
+from rewild4d.leaderboard.specs import Line
+from rewild4d.leaderboard.tables import Entrant
+from rewild4d.priors.config import QUICK
+from rewild4d.running import planning
+from rewild4d.running.older import LOSSES, MIRRORS
+
+
+def test_runs_from_before_the_losses_were_mended_stand_for_their_row_until_there_are_later_ones() -> None:
+    found = spec(
+        [Line(label="Ours", method="ours"), Line(label="bare", method="ours", settings={"pose": {"anchors": False}})]
+    )
+    now = msgspec.to_builtins(planning.row_entry("t", found.rows[0], found, ()).config)
+    then = now | {
+        "deform": now["deform"] | {"anchors": True}, "geometry": now["geometry"] | {"compact_power": 2.0},
+        "pose": {name: value for name, value in now["pose"].items() if name != "anchors"},
+    }  # fmt: skip
+    without = then | {"deform": then["deform"] | {"anchors": False}}
+    protocol = PROTOCOL | {"name": "artemis-sweep-128", "scores": ["psnr"]}
+
+    def run(config: dict[str, Any], value: float) -> RunRecord:
+        prior = {"choice": "template", "config": msgspec.to_builtins(QUICK)}
+        return record(
+            config=config, preset="quick", protocol=protocol, prior=prior, scores=psnr(value), run_id=str(value)
+        )
+
+    (ours, other), _ = planning.entrants("t", found, [run(then, 1.0), run(without, 2.0)])
+    assert [r.run_id for r in ours.records[0]] == ["1.0"] and LOSSES in ours.notes
+    assert other.records == ((),), "the older ablation kept anchors in the pose network"
+    (ours, _), _ = planning.entrants("t", found, [run(then, 1.0), run(now, 3.0)])
+    assert [r.run_id for r in ours.records[0]] == ["3.0"] and not ours.notes
+
+
+def test_runs_of_gart_from_before_it_had_mirror_images_stand_for_its_row_with_a_note() -> None:
+    found = spec([Line(label="GART", method="gart")])
+    now = msgspec.to_builtins(planning.row_entry("t", found.rows[0], found, ()).config)
+    assert now["mirrored"] == 0.125
+    then = {name: value for name, value in now.items() if name != "mirrored"}
+    protocol = PROTOCOL | {"name": "artemis-sweep-128", "scores": ["psnr"]}
+    prior = {"choice": "template", "config": msgspec.to_builtins(QUICK)}
+
+    def row(*configs: dict[str, Any]) -> Entrant:
+        runs = [
+            record(
+                method="gart", config=config, preset="quick", protocol=protocol, prior=prior, scores=psnr(float(index)),
+                run_id=str(index),
+            )
+            for index, config in enumerate(configs)
+        ]  # fmt: skip
+        return planning.entrants("t", found, runs)[0][0]
+
+    old, new, none = row(then), row(then, now), row(now | {"mirrored": 0.0})
+    assert [r.run_id for r in old.records[0]] == ["0"] and MIRRORS in old.notes
+    assert [r.run_id for r in new.records[0]] == ["1"] and not new.notes
+    assert none.records == ((),), "a run that was asked to have none is another row"
