@@ -142,9 +142,9 @@ class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     pull_until: Weight = 1.0
     """Fraction at which the pull ends (paper: 4k of 20k); above 1 it is still on at the end."""
     untold: Weight = 0.0
-    """Weight of the squared distance from the prior's posed skin (diagonals) as far as an image does not tell it: where
-    the skin is hidden, and along the line of sight where it is seen. It does not fall; places that frames from several
-    sides tell are free (`skin.evidence`)."""
+    """Weight of the squared distance from the prior's posed skin as far as an image does not tell it: where the skin is
+    hidden, and along the line of sight where it is seen; over the prior's mean squared error where the image tells it.
+    It does not fall; places that frames from several sides tell are free (`skin.evidence`)."""
 
 
 class WarmUp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

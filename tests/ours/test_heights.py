@@ -15,7 +15,7 @@ from rewild4d.ours.fit import Training, train
 from rewild4d.ours.heights import Heights, smoothed
 from rewild4d.ours.losses.config import Skin
 from rewild4d.ours.losses.skin import StartingSkin
-from rewild4d.ours.losses.untold import Marks, untold_loss
+from rewild4d.ours.losses.untold import DOUBT, Marks, untold_loss
 from rewild4d.ours.model import build_model
 from rewild4d.ours.symmetry import Supervision
 from rewild4d.types import Clip, Prior
@@ -72,20 +72,28 @@ def test_the_largest_height_of_a_first_step_is_the_rate() -> None:
     torch.testing.assert_close(gaussians.means.detach()[:, 2], torch.tensor((-0.01, -0.01, -0.002, 0.005)))
 
 
-def test_what_an_image_does_not_tell_is_held() -> None:
+def price(shift: tuple[float, float, float], shown: tuple[float, float]) -> float:
+    """The loss of two marks of firmness 1 and 1/2 that a far camera sees along +z, moved away from the prior."""
     points = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
     marks = Marks(points, torch.ones(2, 1), torch.tensor((1.0, 0.5)), torch.zeros(2, 1, 2))
-    eye = torch.tensor((0.0, 0.0, -1e4))
+    moved, eye = torch.eye(4), torch.tensor((0.0, 0.0, -1e4))
+    moved[:3, 3] = torch.tensor(shift)
+    return float(untold_loss(marks, moved[None], torch.eye(4)[None], eye, torch.tensor(shown)))
 
-    def price(shift: tuple[float, float, float], shown: tuple[float, float]) -> float:
-        moved = torch.eye(4)
-        moved[:3, 3] = torch.tensor(shift)
-        return float(untold_loss(marks, moved[None], torch.eye(4)[None], eye, torch.tensor(shown)))
 
-    # The diagonal is 5, firmness 1 and 1/2.
-    assert price((0.0, 0.0, 1.0), (1.0, 1.0)) == pytest.approx((1 + 0.5**2) / 2 / 5**2, rel=1e-3)
+def test_what_an_image_does_not_tell_is_held() -> None:
+    # The diagonal is 5.
+    along = (1 + 0.5**2) / 2 / 5**2
+    assert price((0.0, 0.0, 1.0), (1.0, 1.0)) == pytest.approx(along / DOUBT**2, rel=1e-3)
     assert price((1.0, -2.0, 0.0), (1.0, 1.0)) == pytest.approx(0.0, abs=1e-6)
-    assert price((1.0, -2.0, 0.0), (0.0, 0.6)) == pytest.approx((5 + 0.5**2 * 0.4 * 5) / 2 / 5**2, rel=1e-3)
+
+
+def test_a_prior_that_images_contradict_holds_less() -> None:
+    along, across = (1 + 0.5**2) / 2 / 5**2, (3**2 + 4**2) / 2 / 5**2
+    assert price((3.0, 4.0, 1.0), (1.0, 1.0)) == pytest.approx(along / (across + DOUBT**2), rel=1e-3)
+    # The first is hidden, the second not quite: it alone tells how far off the prior is.
+    hidden = (1 + 0.5**2 * 0.4) / 2 * (3**2 + 4**2) / 5**2
+    assert price((3.0, 4.0, 0.0), (0.0, 0.6)) == pytest.approx(hidden / (across + DOUBT**2), rel=1e-3)
 
 
 def test_marks_know_where_they_are_shown(toy: tuple[Clip, Prior]) -> None:

@@ -13,6 +13,8 @@ from rewild4d.ours.symmetry import Supervision
 from rewild4d.transforms import skin_points
 from rewild4d.types import OBJECT_DIAGONAL
 
+DOUBT = 0.003
+"""Error of a component of the prior's places where images agree with it, over the diagonal."""
 MARKS = 400
 """Points of the skin at which poses are compared."""
 
@@ -56,11 +58,13 @@ class Marks(NamedTuple):
 
 
 def untold_loss(marks: Marks, transforms: Tensor, prior_transforms: Tensor, eye: Tensor, shown: Tensor) -> Tensor:
-    """Compute how far marks are from where the prior poses them, as far as an image does not tell it.
+    """Compute how far marks are from where the prior poses them as far as an image does not tell it, against how far
+    off the prior is where the image does.
 
-    The mean over the marks of f^2 ((1 - v) |d|^2 + v (d . s)^2) over the squared diagonal, with f the firmness, v the
-    share that is shown, d the distance and s the line of sight: hidden ones count in full, others along that line. The
-    square leaves poses free where a camera that moves has told the place from several sides.
+    The mean over the marks of f^2 ((1 - v) |d|^2 + v (d . s)^2), with f the firmness, v the share that is shown, d the
+    distance and s the line of sight: hidden ones count in full, others along that line. The square leaves poses free
+    where a camera that moves has told the place from several sides. Divided by the mean square of a component of d
+    across the line of sight, weighed by v, plus that of `DOUBT`: a prior whose poses the images contradict holds less.
 
     Args:
         marks: of the body.
@@ -70,7 +74,8 @@ def untold_loss(marks: Marks, transforms: Tensor, prior_transforms: Tensor, eye:
         shown: share of each mark that the view draws, [k].
     """
     known = skin_points(marks.points, marks.weights, prior_transforms)
-    apart = skin_points(marks.points, marks.weights, transforms) - known
-    along = (apart * normalize(known - eye, dim=-1)).sum(-1).square()
-    untold = (1 - shown) * apart.square().sum(-1) + shown * along
-    return (marks.firmness.square() * untold).mean() / OBJECT_DIAGONAL**2
+    apart = (skin_points(marks.points, marks.weights, transforms) - known) / OBJECT_DIAGONAL
+    square, along = apart.square().sum(-1), (apart * normalize(known - eye, dim=-1)).sum(-1).square()
+    told = (shown * (square - along)).sum().detach() / (2 * shown.sum()).clamp_min(1.0)
+    untold = (1 - shown) * square + shown * along
+    return (marks.firmness.square() * untold).mean() / (told + DOUBT**2)
