@@ -28,6 +28,8 @@ class Heights:
 
     Attributes:
         group: learning rate "lr", a number or a scalar tensor: the height of a step where the gradient is largest.
+        rows: voxels around each point of the skin at the start, [m, 8].
+        factors: their trilinear weights, [m, 8].
         first: smoothed gradient, x slowest, [R^3].
         second: smoothed square of its largest entry, scalar.
         count: steps taken, scalar.
@@ -35,32 +37,29 @@ class Heights:
 
     def __init__(self, skin: StartingSkin, resolution: int = VOXELS) -> None:
         self.resolution = resolution
-        self.origin, self.pitch = cube_around(skin.points, MARGIN, resolution)
         self.group: dict[str, Any] = {"lr": 0.0}
+        self.rows, self.factors = trilinear(skin.points, *cube_around(skin.points, MARGIN, resolution), resolution)
         self.first = skin.points.new_zeros(resolution**3)
         self.second, self.count = skin.points.new_zeros(()), skin.points.new_zeros(())
 
     @torch.no_grad()
     def step(self, gaussians: Gaussians, skin: StartingSkin, nearest: Tensor) -> None:
-        """Move centres by their gradients along the normals of their points of the skin, in place, and the skin with
-        them; ``nearest`` [n] are the points' rows."""
+        """Move the skin along its normals by the gradients of the centres, in place, and each centre with its point of
+        the skin, whose row is in ``nearest`` [n]."""
         gradient, normals = gaussians.means.grad, skin.normals[nearest]
         assert gradient is not None, "`step` comes after backward"
-        rows, factors = self._corners(gaussians.means)
-        along = factors * (gradient * normals).sum(-1, keepdim=True)
-        total = torch.zeros_like(self.first).index_add_(0, rows.flatten(), along.flatten())
+        along = torch.zeros_like(skin.points[:, 0]).index_add_(0, nearest, (gradient * normals).sum(-1))
+        spread = (self.factors * along[:, None]).flatten()
+        total = torch.zeros_like(self.first).index_add_(0, self.rows.flatten(), spread)
         smooth = smoothed(total.view([self.resolution] * 3)).flatten()
         self.count += 1
         self.first.lerp_(smooth, 1 - BETAS[0])
         self.second.lerp_(smooth.square().max(), 1 - BETAS[1])
         scale = (self.second / (1 - BETAS[1] ** self.count)).sqrt().clamp_min(torch.finfo(smooth.dtype).tiny)
-        heights = self.first * (-self.group["lr"] / (1 - BETAS[0] ** self.count) / scale)
-        gaussians.means.data.add_((factors * heights[rows]).sum(-1, keepdim=True) * normals)
-        rows, factors = self._corners(skin.points)
-        skin.points.add_((factors * heights[rows]).sum(-1, keepdim=True) * skin.normals)
-
-    def _corners(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        return trilinear(points, self.origin, self.pitch, self.resolution)
+        field = self.first * (-self.group["lr"] / (1 - BETAS[0] ** self.count) / scale)
+        heights = (self.factors * field[self.rows]).sum(-1, keepdim=True)
+        gaussians.means.data.add_(heights[nearest] * normals)
+        skin.points.add_(heights * skin.normals)
 
     def state(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return what `restore` takes."""

@@ -230,9 +230,15 @@ def nearest_rows(points: Tensor, queries: Tensor) -> Tensor:
 
 def rigid_loss(canonical: Tensor, deformed: Tensor, near: Tensor) -> Tensor:
     """Compute the mean change of distance to canonical neighbours ``near`` [n, k] (as isometric as possible)."""
-    rest = (canonical.detach()[:, None] - canonical.detach()[near]).norm(dim=-1)
-    moved = ((deformed[:, None] - deformed[near]).square().sum(-1) + 1e-12).sqrt()
-    return (moved - rest).abs().mean()
+    rest, moved = (squared_lengths(points, near) for points in (canonical.detach(), deformed))
+    return ((moved + 1e-12).sqrt() - rest.sqrt()).abs().mean()
+
+
+def squared_lengths(points: Tensor, near: Tensor) -> Tensor:
+    """Return squared distances from points [n, 3] to those of rows ``near`` [n, k], [k, n]."""
+    columns = points.t().contiguous()  # gathers and sums along rows of n are twice as fast as along rows of 3
+    ends = columns.index_select(1, near.t().flatten()).view(3, near.shape[1], len(points))
+    return (ends - columns[:, None]).square().sum(0)
 
 
 def relative_angles(quats: Tensor, parents: Tensor) -> Tensor:
