@@ -33,6 +33,15 @@ class Sighting:
     share: float
     posed: Posed
 
+    @torch.no_grad()
+    def seen(self, own: Gaussians, supervision: Supervision) -> tuple[Tensor, Tensor]:
+        """Return the share of each Gaussian of ``own`` that is drawn, [n], and its line of sight in the frame at rest,
+        unit, [n, 3]."""
+        camera, posed = supervision.target(self.key).camera, self.posed
+        sight = normalize(posed.means - camera.center.to(posed.means), dim=-1)
+        local = torch.einsum("na,nab->nb", sight, own.rotations_to(normalize(posed.quats, dim=-1)))
+        return visible_share(posed, own, camera), local
+
 
 def training_views(supervision: Supervision, mirrored: float) -> Iterator[tuple[Key, float]]:
     """List the views that a fit is trained on, and the share of the steps that sees each."""
@@ -58,13 +67,14 @@ def information(own: Gaussians, views: Iterable[Sighting], supervision: Supervis
     """
     total = own.means.new_zeros(len(own), 3, 3)
     for sighting in views:
-        camera, posed = supervision.target(sighting.key).camera, sighting.posed
-        visible = visible_share(posed, own, camera)
-        sight = normalize(posed.means - camera.center.to(posed.means), dim=-1)
-        local = torch.einsum("na,nab->nb", sight, own.rotations_to(normalize(posed.quats, dim=-1)))
-        across = torch.eye(3).to(total) - local[:, :, None] * local[:, None, :]
-        total += sighting.share * visible[:, None, None] * across
+        total += sighting.share * told(*sighting.seen(own, supervision))
     return total
+
+
+def told(visible: Tensor, sight: Tensor) -> Tensor:
+    """Return v (I - d d^T), [..., 3, 3], of shares v [...] that are drawn and lines of sight d [..., 3]."""
+    across = torch.eye(3).to(sight) - sight[..., :, None] * sight[..., None, :]
+    return visible[..., None, None] * across
 
 
 @torch.no_grad()

@@ -103,7 +103,7 @@ class Training(GaussianTraining):
             degree=min(config.canonical.sh_degree, int(progress / config.canonical.sh_every)),
             varies=acts and config.skinning.learn and geometry.tv > 0 and index % geometry.tv_every == 0,
             compacts=acts and geometry.compact > 0 and index % geometry.compact_every == 0,
-            shown=torch.zeros(0) if self.marks is None else self.marks.shown[int(key.view < 0), key.frame],
+            marks=torch.zeros(0) if self.marks is None else self.marks.views[int(key.view < 0), key.frame],
         )  # fmt: skip
 
     def losses_of(self, given: StepInput) -> tuple[dict[str, Tensor], RasterInfo | None]:
@@ -133,7 +133,7 @@ class Training(GaussianTraining):
         if self.marks is not None:
             quats, shifts = (part[given.row].squeeze(0) for part in given.prior_pose)
             before = joint_transforms(quats, shifts, model.pivots)
-            untold = untold_loss(self.marks, transforms.squeeze(0), before, given.eye, given.shown)
+            untold = untold_loss(self.marks, transforms.squeeze(0), before, given.eye, given.marks)
             losses["untold"] = config.prior.untold * untold
         if delta is not None:
             losses["tv"] = config.geometry.tv * config.geometry.tv_every * variation
@@ -198,8 +198,7 @@ class Training(GaussianTraining):
     def prepare(self) -> None:
         super().prepare()
         if self.config.prior.untold and self.marks is None:
-            bond = self.held and self.held.bond
-            self.marks = Marks.of(self.model, bond.firmness if bond else None, self.sightings(), self.supervision)
+            self.marks = Marks.of(self.model, self.config.skin.evidence, self.sightings(), self.supervision)
         if self.config.geometry.rigid and len(self.model.gaussians) > 1 and self.near is None:
             self.near = neighbours(self.model.gaussians.means, self.config.geometry.rigid_neighbours)
 

@@ -32,7 +32,7 @@ class StepInput:
         degree: of the harmonics in use.
         varies: whether L_tv acts.
         compacts: whether L_compact acts.
-        shown: share of each mark that the view draws (`untold.Marks`), [k]; empty where there are no marks.
+        marks: what the view says of each mark (`untold.Marks.views`), [2, k]; empty where there are no marks.
     """
 
     target: Target
@@ -51,7 +51,7 @@ class StepInput:
     degree: int
     varies: bool
     compacts: bool
-    shown: Tensor
+    marks: Tensor
 
     def to(self, device: torch.device) -> "StepInput":
         """Move all but the target, whose images are there already, to a device."""
@@ -68,5 +68,5 @@ class StepInput:
             prior_pose=(quats.to(device), shifts.to(device)),
             background=self.background.to(device),
             direction=None if self.direction is None else self.direction.to(device),
-            shown=self.shown.to(device),
+            marks=self.marks.to(device),
         )

@@ -97,7 +97,7 @@ class Slots:
         """Return the input that the slots hold, as tensors on the device."""
         (
             world_to_camera, intrinsics, side, eye, codes, flipped, row, background, blend, pull, ramp, gaps, quats,
-            shifts, direction, shown,
+            shifts, direction, marks,
         ) = self.placed[:_FIXED]  # fmt: skip
         rgb, mask = self.images[kind.size]
         width, height = kind.size
@@ -125,7 +125,7 @@ class Slots:
             degree=kind.degree,
             varies=kind.varies,
             compacts=kind.compacts,
-            shown=shown,
+            marks=marks,
         )
 
 
@@ -140,5 +140,5 @@ def _numbers(given: StepInput, rates: list[float]) -> list[Scalar]:
         target.camera.world_to_camera, target.camera.intrinsics, target.side, given.eye, given.codes, given.flipped,
         given.row, given.background, given.blend or 0.0, given.pull or 0.0, given.ramp or 0.0,
         torch.zeros(0, 2) if given.gaps is None else given.gaps, *given.prior_pose,
-        torch.zeros(3) if given.direction is None else given.direction, given.shown, *rates,
+        torch.zeros(3) if given.direction is None else given.direction, given.marks, *rates,
     ]  # fmt: skip

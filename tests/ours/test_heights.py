@@ -15,7 +15,7 @@ from rewild4d.ours.fit import Training, train
 from rewild4d.ours.heights import Heights, smoothed
 from rewild4d.ours.losses.config import Skin
 from rewild4d.ours.losses.skin import StartingSkin
-from rewild4d.ours.losses.untold import DOUBT, Marks, untold_loss
+from rewild4d.ours.losses.untold import DOUBT, Marks, pose_firmness, untold_loss
 from rewild4d.ours.model import build_model
 from rewild4d.ours.symmetry import Supervision
 from rewild4d.types import Clip, Prior
@@ -75,10 +75,10 @@ def test_the_largest_height_of_a_first_step_is_the_rate() -> None:
 def price(shift: tuple[float, float, float], shown: tuple[float, float]) -> float:
     """The loss of two marks of firmness 1 and 1/2 that a far camera sees along +z, moved away from the prior."""
     points = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
-    marks = Marks(points, torch.ones(2, 1), torch.tensor((1.0, 0.5)), torch.zeros(2, 1, 2))
+    marks = Marks(points, torch.ones(2, 1), torch.zeros(2, 1, 2, 2))
     moved, eye = torch.eye(4), torch.tensor((0.0, 0.0, -1e4))
     moved[:3, 3] = torch.tensor(shift)
-    return float(untold_loss(marks, moved[None], torch.eye(4)[None], eye, torch.tensor(shown)))
+    return float(untold_loss(marks, moved[None], torch.eye(4)[None], eye, torch.tensor((shown, (1.0, 0.5)))))
 
 
 def test_what_an_image_does_not_tell_is_held() -> None:
@@ -96,13 +96,34 @@ def test_a_prior_that_images_contradict_holds_less() -> None:
     assert price((3.0, 4.0, 0.0), (0.0, 0.6)) == pytest.approx(hidden / (across + DOUBT**2), rel=1e-3)
 
 
+def test_frames_close_in_time_tell_the_pose_of_a_bone_from_several_sides() -> None:
+    # Two bones of two marks each, in five frames of six: the second mark of each is hidden.
+    along_x, along_z = torch.diag(torch.tensor((0.0, 1.0, 1.0))), torch.diag(torch.tensor((1.0, 1.0, 0.0)))
+    weights = torch.tensor(((1.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.0, 1.0)))
+    information = torch.zeros(2, 6, 4, 3, 3)
+    information[0, :5, 0] = along_z
+    information[0, :5, 2] = torch.stack((along_x, along_z, along_x, along_z, along_x))
+    firmness = pose_firmness(information, weights, 0.1)
+    # Of five frames two see bone 2 along z, half of its marks are hidden: 2 / 5 / 2.
+    told = 0.1**2 / (0.1**2 + 0.2**2)
+    torch.testing.assert_close(firmness[0, 2], torch.tensor((1.0, 1.0, told, told)))
+    # The last frame has frames 3 to 5 alone, and nothing is seen in the last: 1 / 3 / 2.
+    told = 0.1**2 / (0.1**2 + (1 / 6) ** 2)
+    torch.testing.assert_close(firmness[0, 5], torch.tensor((1.0, 1.0, told, told)))
+    assert torch.equal(firmness[1], torch.ones(6, 4)), "mirror images are frames of their own"
+
+
 def test_marks_know_where_they_are_shown(toy: tuple[Clip, Prior]) -> None:
     made = training(toy, prior=PriorUse(untold=100.0))
     assert made.step(0)["untold"] >= 0
     marks = made.marks
-    assert marks is not None and marks.shown.shape == (2, len(toy[0].frames), len(marks.points))
-    assert 0.2 < float(marks.shown.mean()) < 0.8 and float(marks.shown.max()) == 1.0
-    assert torch.equal(marks.firmness, torch.ones(len(marks.points))), "without evidence all are held alike"
+    assert marks is not None and marks.views.shape == (2, len(toy[0].frames), 2, len(marks.points))
+    shown, firmness = marks.views.unbind(2)
+    assert 0.2 < float(shown.mean()) < 0.8 and float(shown.max()) == 1.0
+    assert torch.equal(firmness, torch.ones_like(firmness)), "without evidence all are held alike"
+    made = training(toy, prior=PriorUse(untold=100.0), skin=Skin(evidence=0.03))
+    made.step(0)
+    assert made.marks is not None and 0 < float(made.marks.views[:, :, 1].min()) < 0.9
 
 
 def training(toy: tuple[Clip, Prior], **changed: Any) -> Training:

@@ -47,16 +47,20 @@ class StartingSkin:
     def bond(self, nearest: Tensor, half: float) -> "Bond":
         """Return what holds Gaussians whose nearest points are ``nearest``, [n].
 
-        A hold weighs h^2 / (h^2 + i^2), where h is ``half`` and i what the clip says: of the firmness the smallest
-        eigenvalue of the information, of the depth the information along the normal.
+        `firmness_of` the smallest eigenvalue of the information, and for the depth of the information along the normal.
         """
         if self.information is None:
             whole = self.points.new_ones(len(nearest))
             return Bond(nearest, whole, whole)
-        least = torch.linalg.eigvalsh(self.information)[:, 0].clamp_min(0)
+        least = torch.linalg.eigvalsh(self.information)[:, 0]
         along = torch.einsum("na,nab,nb->n", self.normals, self.information, self.normals)
-        firmness, depth = (half**2 / (half**2 + known[nearest].square()) for known in (least, along))
+        firmness, depth = (firmness_of(known, half)[nearest] for known in (least, along))
         return Bond(nearest, firmness, depth)
+
+
+def firmness_of(known: Tensor, half: float) -> Tensor:
+    """Return the weight of a hold on what images tell ``known`` of: h^2 / (h^2 + i^2), [...]."""
+    return half**2 / (half**2 + known.square())
 
 
 @dataclass(frozen=True)
