@@ -43,9 +43,9 @@ class Heights:
         self.second, self.count = skin.points.new_zeros(()), skin.points.new_zeros(())
 
     @torch.no_grad()
-    def step(self, gaussians: Gaussians, skin: StartingSkin, nearest: Tensor) -> None:
+    def step(self, gaussians: Gaussians, skin: StartingSkin, nearest: Tensor, share: Tensor) -> None:
         """Move the skin along its normals by the gradients of the centres, in place, and each centre with its point of
-        the skin, whose row is in ``nearest`` [n]."""
+        the skin, whose row is in ``nearest`` [n]; a point moves by its ``share`` [m] of the height."""
         gradient, normals = gaussians.means.grad, skin.normals[nearest]
         assert gradient is not None, "`step` comes after backward"
         along = torch.zeros_like(skin.points[:, 0]).index_add_(0, nearest, (gradient * normals).sum(-1))
@@ -57,7 +57,7 @@ class Heights:
         self.second.lerp_(smooth.square().max(), 1 - BETAS[1])
         scale = (self.second / (1 - BETAS[1] ** self.count)).sqrt().clamp_min(torch.finfo(smooth.dtype).tiny)
         field = self.first * (-self.group["lr"] / (1 - BETAS[0] ** self.count) / scale)
-        heights = (self.factors * field[self.rows]).sum(-1, keepdim=True)
+        heights = share[:, None] * (self.factors * field[self.rows]).sum(-1, keepdim=True)
         gaussians.means.data.add_(heights[nearest] * normals)
         skin.points.add_(heights * skin.normals)
 

@@ -24,6 +24,7 @@ class HeldSkin:
 
     Attributes:
         skin: of the start; moved by `heights`.
+        holds: firmness of each of its points, and of the distance from it (`StartingSkin.holds`); None until `prepare`.
         bond: what holds each Gaussian; None where it is to be found.
         heights: that move the skin, or None.
     """
@@ -41,6 +42,7 @@ class HeldSkin:
         """
         self.config, self.sightings, self.supervision = config, sightings, supervision
         self.skin = StartingSkin.of(gaussians)
+        self.holds: tuple[Tensor, Tensor] | None = None
         self.bond: Bond | None = None
         self.heights = Heights(self.skin) if config.heights else None
 
@@ -55,13 +57,15 @@ class HeldSkin:
 
     def prepare(self, gaussians: Gaussians) -> None:
         """Find each Gaussian's point of the skin, where it is used and the set of Gaussians changed."""
-        if self.bond is not None:
-            return
-        # In the first step the skin's points are the Gaussians.
-        if self.config.evidence and self.skin.information is None:
-            known = information(gaussians, self.sightings(), self.supervision)
-            self.skin = replace(self.skin, information=known)
-        self.bond = self.skin.bond(self.skin.nearest(gaussians.means), self.config.evidence)
+        if self.holds is None:
+            # In the first step the skin's points are the Gaussians.
+            if self.config.evidence and self.skin.information is None:
+                known = information(gaussians, self.sightings(), self.supervision)
+                self.skin = replace(self.skin, information=known)
+            self.holds = self.skin.holds(self.config.evidence)
+        if self.bond is None:
+            rows = self.skin.nearest(gaussians.means)
+            self.bond = Bond(rows, *(hold[rows] for hold in self.holds))
 
     def losses(self, gaussians: Gaussians, opacities: Tensor) -> dict[str, Tensor]:
         """Compute the weighted losses of Gaussians with opacities [n]."""
@@ -78,12 +82,14 @@ class HeldSkin:
 
     @torch.no_grad()
     def move(self, gaussians: Gaussians, before: Tensor) -> None:
-        """Undo what centres moved by themselves from ``before`` [n, 3] where nothing tells their place, then move the
-        skin with them."""
+        """Undo what centres moved by themselves from ``before`` [n, 3] as far as nothing tells their place, and move
+        them with the skin."""
         if self.config.follow:
             gaussians.means.data.lerp_(before, self._bond().firmness[:, None])
         if self.heights is not None:
-            self.heights.step(gaussians, self.skin, self._bond().nearest)
+            assert self.holds is not None, "`prepare` comes first"
+            share = self.holds[0] if self.config.follow else torch.ones_like(self.holds[0])
+            self.heights.step(gaussians, self.skin, self._bond().nearest, share)
 
     def forget(self) -> None:
         """Find the points of the skin again: the set of Gaussians changed."""

@@ -51,7 +51,7 @@ def test_what_no_image_speaks_of_moves_with_its_surroundings() -> None:
     skin, heights = StartingSkin.of(gaussians), Heights(StartingSkin.of(gaussians), 33)
     gaussians.means.grad = torch.tensor([[0.3, 0.0, -0.1]] + 3 * [[0.0, 0.0, 0.0]])
     heights.group["lr"] = 0.01
-    heights.step(gaussians, skin, torch.arange(4))
+    heights.step(gaussians, skin, torch.arange(4), torch.ones(4))
     moved = gaussians.means.detach() - points
     assert not moved[:, :2].any(), "along the normals alone"
     first, beside, other, far = moved[:, 2].tolist()
@@ -68,8 +68,8 @@ def test_the_largest_height_of_a_first_step_is_the_rate() -> None:
     heights = Heights(skin, 13)
     gaussians.means.grad = torch.tensor([[0.0, 0.0, 5.0], [0.0, 0.0, 5.0], [0.0, 0.0, 1.0], [0.0, 0.0, -2.5]])
     heights.group["lr"] = 0.01
-    heights.step(gaussians, skin, torch.arange(4))
-    torch.testing.assert_close(gaussians.means.detach()[:, 2], torch.tensor((-0.01, -0.01, -0.002, 0.005)))
+    heights.step(gaussians, skin, torch.arange(4), torch.tensor((1.0, 0.5, 1.0, 1.0)))
+    torch.testing.assert_close(gaussians.means.detach()[:, 2], torch.tensor((-0.01, -0.005, -0.002, 0.005)))
 
 
 def price(shift: tuple[float, float, float], shown: tuple[float, float]) -> float:

@@ -97,7 +97,7 @@ class Skin(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """Rate at which the skin moves as a whole along its normals, falling to a hundredth (heights.py); 0 for none."""
     follow: bool = False
     """Let a centre move on its own only as far as frames from several sides tell its place (`evidence`; with 0 not at
-    all)."""
+    all), and with the skin (`heights`) as far as they do not."""
 
     @property
     def holds(self) -> bool:

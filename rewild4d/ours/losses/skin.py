@@ -44,18 +44,16 @@ class StartingSkin:
         """Return the index of each centre's nearest point, [n, 3] -> [n]."""
         return nearest_rows(self.points, means)
 
-    def bond(self, nearest: Tensor, half: float) -> "Bond":
-        """Return what holds Gaussians whose nearest points are ``nearest``, [n].
+    def holds(self, half: float) -> tuple[Tensor, Tensor]:
+        """Return the firmness of each point and of its distance along the normal, both [m].
 
-        `firmness_of` the smallest eigenvalue of the information, and for the depth of the information along the normal.
+        `firmness_of` the smallest eigenvalue of the information, and of the information along the normal.
         """
         if self.information is None:
-            whole = self.points.new_ones(len(nearest))
-            return Bond(nearest, whole, whole)
+            return torch.ones_like(self.points[:, 0]), torch.ones_like(self.points[:, 0])
         least = torch.linalg.eigvalsh(self.information)[:, 0]
         along = torch.einsum("na,nab,nb->n", self.normals, self.information, self.normals)
-        firmness, depth = (firmness_of(known, half)[nearest] for known in (least, along))
-        return Bond(nearest, firmness, depth)
+        return firmness_of(least, half), firmness_of(along, half)
 
 
 def firmness_of(known: Tensor, half: float) -> Tensor:
