@@ -29,14 +29,19 @@ def test_settings_follow_the_length_of_the_clip() -> None:
     assert for_clip_of_ours(made, 300) == made
 
 
-def test_what_is_beyond_the_paper_is_off_in_standard() -> None:
+def test_what_is_beyond_the_paper_differs_from_standard_in_these_three_alone() -> None:
     standard, beyond = (load_preset("ours", Config, name) for name in ("standard", "beyond"))
-    changed = {name for name in standard.__struct_fields__ if getattr(standard, name) != getattr(beyond, name)}
-    assert changed == {"canonical", "geometry", "loss", "skin", "prior", "rates", "density"}
     geometry = msgspec.structs.replace(standard.geometry, limb_plane=100.0, sideways=1000.0)
-    assert (beyond.geometry, beyond.loss) == (geometry, msgspec.structs.replace(standard.loss, isolated=False))
+    loss = msgspec.structs.replace(standard.loss, isolated=False)
+    assert beyond == msgspec.structs.replace(standard, geometry=geometry, loss=loss)
     assert standard.loss.isolated and standard.geometry.limb_plane == standard.geometry.sideways == 0
-    assert beyond.skin.holds and beyond.prior.untold and not standard.skin.holds and not standard.prior.untold
+
+
+def test_a_camera_at_one_side_has_its_own_preset_beyond_the_paper() -> None:
+    beyond, one_side = (load_preset("ours", Config, name) for name in ("beyond", "one-side"))
+    changed = {name for name in beyond.__struct_fields__ if getattr(beyond, name) != getattr(one_side, name)}
+    assert changed == {"canonical", "skin", "prior", "rates", "density"}
+    assert one_side.skin.holds and one_side.prior.untold and not beyond.skin.holds and not beyond.prior.untold
 
 
 def test_settings_follow_whether_the_cameras_are_known() -> None:
