@@ -36,7 +36,7 @@ class RunChoice:
         case: names or patterns of cases ("wolf/Run", "wolf/*"); all (of real videos: quadrupeds) where it is left out.
         protocol: what is held out and measured (see `list`); the data set's default where it is left out.
         preset: settings and length of the fit: quick, standard or paper; of `ours` also beyond, which is standard with
-            terms that the paper does not have, for known cameras.
+            terms that the paper does not have, for known cameras, and one-side, for a camera that stays at one side.
         seeds: one run for each.
         prior: "template" (fitted to the clip), "coarse:<noise>" (from the truth plus noise, for studies), "rig" (the
             data set's own shape and skeleton, an upper bound) or a file (of a real video, by `prior fit` or `prior
