@@ -64,8 +64,7 @@ class HeldSkin:
                 self.skin = replace(self.skin, information=known)
             self.holds = self.skin.holds(self.config.evidence)
         if self.bond is None:
-            rows = self.skin.nearest(gaussians.means)
-            self.bond = Bond(rows, *(hold[rows] for hold in self.holds))
+            self.bond = Bond.at(self.skin.nearest(gaussians.means), self.holds)
 
     def losses(self, gaussians: Gaussians, opacities: Tensor) -> dict[str, Tensor]:
         """Compute the weighted losses of Gaussians with opacities [n]."""

@@ -90,13 +90,15 @@ def test_each_hold_counts_by_its_own_weight() -> None:
 def test_evidence_weakens_a_hold() -> None:
     points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     skin = skin_of(points, 0.1)  # normals are +z
-    firmness, depth = skin.holds(0.02)
-    assert torch.equal(firmness, torch.ones(2)) and torch.equal(depth, torch.ones(2))
+    rows = torch.tensor((1, 0, 1))
+    alike = Bond.at(rows, skin.holds(0.02))
+    assert torch.equal(alike.firmness, torch.ones(3)) and torch.equal(alike.depth, torch.ones(3))
     # The first is seen by all frames, from the side alone; the second by a few, from many sides.
     seen = replace(skin, information=torch.stack((torch.diag(torch.tensor((1.0, 0.0, 0.98))), 0.06 * torch.eye(3))))
-    firmness, depth = seen.holds(0.02)
-    torch.testing.assert_close(firmness, torch.tensor((1.0, 4 / (4 + 36))))
-    torch.testing.assert_close(depth, torch.tensor((4 / (4 + 98**2), 4 / (4 + 36))))
+    bond = Bond.at(rows, seen.holds(0.02))
+    assert torch.equal(bond.nearest, rows)
+    torch.testing.assert_close(bond.firmness, torch.tensor((4 / (4 + 36), 1.0, 4 / (4 + 36))))
+    torch.testing.assert_close(bond.depth, torch.tensor((4 / (4 + 36), 4 / (4 + 98**2), 4 / (4 + 36))))
 
 
 def test_nearest_is_the_nearest() -> None:

@@ -75,6 +75,11 @@ class Bond:
     firmness: Tensor
     depth: Tensor
 
+    @classmethod
+    def at(cls, nearest: Tensor, holds: tuple[Tensor, Tensor]) -> "Bond":
+        """Return what holds Gaussians at rows ``nearest`` [n] of a skin with such `StartingSkin.holds`."""
+        return cls(nearest, *(hold[nearest] for hold in holds))
+
 
 def third_axes(quats: Tensor) -> Tensor:
     """Return unit third axes of orientations, [n, 4] -> [n, 3]."""
