@@ -13,6 +13,9 @@ TITLES = {
     "iou_rigid": "mask IoU after rigid motion",
     "chamfer_relative": "CD / diagonal", "chamfer_relative_framewise": "CD / diagonal, per frame",
     "chamfer_relative_30k": "CD / diagonal, 30k points", "fscore_1_30k": "F@1 %, 30k points",
+    "chamfer_relative_drawn": "CD / diagonal, drawn surface",
+    "fscore_1_drawn": "F@1 %, drawn surface", "fscore_2_drawn": "F@2 %, drawn surface",
+    "fscore_5_drawn": "F@5 %, drawn surface",
     "fscore_1": "F@1 %", "fscore_2": "F@2 %", "fscore_5": "F@5 %",
     "kid_v": "KID-16V", "fvd_f": "FVD-F", "fvd_diag": "FVD-Diag", "kvd_f": "KVD-F", "kvd_diag": "KVD-Diag",
 }  # fmt: skip
@@ -21,6 +24,7 @@ DIGITS = {
     "chamfer_relative": 4,
     "chamfer_relative_framewise": 4,
     "chamfer_relative_30k": 4,
+    "chamfer_relative_drawn": 4,
     "kid_v": 4,
     "fvd_f": 1,
     "fvd_diag": 1,

@@ -2,7 +2,7 @@
 
 The name of an image score is a metric and a region: "psnr", "ssim_fg", "lpips_alex_crop"; without a region it covers
 the full frame; "_rigid" behind it says that a rigid motion laid the reconstruction on the true shape first. The name of
-a geometry score is a quantity, an alignment and a number of points.
+a geometry score is a quantity, an alignment, a sampling of the prediction and a number of points.
 """
 
 from typing import Literal
@@ -25,12 +25,17 @@ THRESHOLDS = (1, 2, 5)
 Fit = Literal["sequence", "frame", "none"]
 ALIGNMENTS: dict[Fit, str] = {"sequence": "", "frame": "_framewise", "none": "_unaligned"}
 """Alignment of predictions to the truth (see `metrics.geometry`) -> end of the score's name."""
+SAMPLINGS = ("", "_drawn")
+"""End of a name: points of the prediction are centres of Gaussians, or lie on the surface that these draw."""
 DENSE = {"": None, "_30k": 30_000}
 """End of a name -> points of each cloud; None is the protocol's own number."""
 QUANTITIES = ("chamfer", "chamfer_to_truth", "chamfer_to_prediction", "chamfer_relative") + tuple(
     f"fscore_{percent}" for percent in THRESHOLDS
 )
-GEOMETRY = tuple(quantity + end + dense for dense in DENSE for end in ALIGNMENTS.values() for quantity in QUANTITIES)
+GEOMETRY = tuple(
+    quantity + end + sampling + dense
+    for dense in DENSE for sampling in SAMPLINGS for end in ALIGNMENTS.values() for quantity in QUANTITIES
+)  # fmt: skip
 
 KINDS = {
     "kid_v": {"kid_v": "KID-V"},

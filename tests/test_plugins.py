@@ -60,7 +60,7 @@ def test_a_package_brings_its_data_sets_protocols(install: Install) -> None:
     files = {"their_package/__init__.py": "class Mine: pass\n", "their_package/mine.toml": PROTOCOL}
     install(("datasets", "mine", "their_package:Mine"), ("protocols", "mine", "their_package"), files=files)
     assert find_protocol("mine", None).name == "mine-64-v1"
-    assert "mine-64-v1" in load_protocols() and "artemis-sweep-256-v3" in load_protocols()
+    assert "mine-64-v1" in load_protocols() and "artemis-sweep-256-v4" in load_protocols()
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_a_package_that_cannot_be_used_hides_no_other(
     with pytest.raises(SystemExit) as stop:
         cli.main(["list"])
     said = capsys.readouterr().out
-    assert stop.value.code == 0 and "artemis-sweep-256-v3" in said
+    assert stop.value.code == 0 and "artemis-sweep-256-v4" in said
     assert f"broken       cannot be used: method 'broken': expected an object at {target}" in said
     assert "mine         no description" in said
 

@@ -15,7 +15,7 @@ from rewild4d.evaluation.protocol import find_protocol
 from rewild4d.running.conformance import tiny_case
 
 made = tiny_case(frames=6)
-case = rw.LoadedCase(made.clip, made.truth, find_protocol("artemis", "artemis-sweep-128-v3"), made)
+case = rw.LoadedCase(made.clip, made.truth, find_protocol("artemis", "artemis-sweep-128-v4"), made)
 print(f"{case.clip.name}: {len(case.clip.frames)} frames, {len(case.truth.held_out)} held-out images")
 
 # %% [markdown]

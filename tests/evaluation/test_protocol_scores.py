@@ -62,7 +62,7 @@ def quiet(*_: object) -> None:
 
 
 def asking(*scores: str) -> Protocol:
-    base = find_protocol("artemis", "artemis-sweep-128-v3")
+    base = find_protocol("artemis", "artemis-sweep-128-v4")
     return msgspec.structs.replace(base, scores=scores, points=700, novel=NovelViews(frames=2, clip=16, stride=8))
 
 
@@ -76,7 +76,7 @@ def test_a_protocol_is_never_changed_once_it_was_used() -> None:
 
 
 def test_the_default_is_the_newest_of_the_defaults() -> None:
-    assert find_protocol("artemis", None).name == "artemis-sweep-256-v3"
+    assert find_protocol("artemis", None).name == "artemis-sweep-256-v4"
 
 
 @pytest.mark.parametrize(
@@ -104,6 +104,19 @@ def test_the_exact_shape_is_at_the_floor_and_carries_its_alignment(case: Case, e
     assert "truth of 1418 points" in dense.note and (dense.value or 0) >= (agreement.value or 0)
     assert [(one["fit"], one["points"]) for one in found.alignments] == [("sequence", 700), ("sequence", 30_000)]
     assert [one["scale"] for one in found.alignments] == pytest.approx([1, 1], abs=0.01)
+
+
+def test_the_drawn_surface_of_the_exact_shape_is_scored_beside_its_centres(case: Case, exact: Reconstruction) -> None:
+    wanted = asking("chamfer_relative", "chamfer_relative_drawn", "fscore_5_drawn")
+    found = evaluate(exact, case.clip, case.truth, wanted, quiet, CPU)
+    centres, drawn, agreement = (found.scores[name] for name in wanted.scores)
+    floor = drawn.floor or 0
+    assert floor / 2 < (drawn.value or 0) < 2 * floor and drawn.value != centres.value
+    assert (agreement.value or 0) > 0.9
+    assert drawn.note.startswith(
+        "points of the surface that Gaussians draw in 32 views of 256 pixels; prediction of 700"
+    )
+    assert [one["sampling"].split()[0] for one in found.alignments] == ["centres", "points"]
 
 
 def test_without_geometry_the_score_says_so(case: Case, exact: Reconstruction) -> None:

@@ -63,7 +63,7 @@ def mapping(folder: Path) -> Path:
 
 
 def protocol(folder: Path) -> Path:
-    return _written(folder / "p.toml", (ROOM / "protocols" / "artemis-sweep-256-v3.toml").read_text())
+    return _written(folder / "p.toml", (ROOM / "protocols" / "artemis-sweep-256-v4.toml").read_text())
 
 
 def table(folder: Path) -> Path:

@@ -62,7 +62,7 @@ def test_records_of_an_older_protocol_are_printed_by_it_and_that_is_said(capsys:
     words = ("table", "artemis", "--runs", str(RESULTS / "2026-11-23-artemis-standard"))
     assert call(*words) == 0
     out = capsys.readouterr().out
-    assert "By protocol artemis-sweep-256-v2, as no row has a record of artemis-sweep-256-v3 here." in out
+    assert "By protocol artemis-sweep-256-v2, as no row has a record of artemis-sweep-256-v4 here." in out
     assert "`artemis-sweep-256-v2`" in out and "| D-3DGS | 21.91 ± " in out
-    assert call(*words, "--protocol", "artemis-sweep-256-v3") == 0
+    assert call(*words, "--protocol", "artemis-sweep-256-v4") == 0
     assert "21.91" not in capsys.readouterr().out, "a version that is named stays"

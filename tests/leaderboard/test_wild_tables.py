@@ -164,8 +164,8 @@ def test_distances_that_were_not_computed_say_why(tmp_path: Path, capsys: pytest
     [
         ("input-view", "davis-512-v2", "camel", "standard", FOOTAGE),
         ("input-view", "davis-512-v2", "camel", "quick", FOOTAGE),
-        ("artemis", "artemis-sweep-256-v3", "wolf/Run", "standard", STANDARD),
-        ("artemis", "artemis-sweep-256-v3", "wolf/Run", "quick", QUICK),
+        ("artemis", "artemis-sweep-256-v4", "wolf/Run", "standard", STANDARD),
+        ("artemis", "artemis-sweep-256-v4", "wolf/Run", "quick", QUICK),
     ],
 )
 def test_a_row_takes_only_runs_whose_prior_was_fitted_as_the_tables_is(
