@@ -29,18 +29,24 @@ def test_settings_follow_the_length_of_the_clip() -> None:
     assert for_clip_of_ours(made, 300) == made
 
 
-def test_what_is_beyond_the_paper_differs_from_standard_in_these_three_alone() -> None:
+def test_what_is_beyond_the_paper_differs_from_standard_in_these_alone() -> None:
     standard, beyond = (load_preset("ours", Config, name) for name in ("standard", "beyond"))
-    geometry = msgspec.structs.replace(standard.geometry, limb_plane=100.0, sideways=1000.0)
-    loss = msgspec.structs.replace(standard.loss, isolated=False)
-    assert beyond == msgspec.structs.replace(standard, geometry=geometry, loss=loss)
+    replace = msgspec.structs.replace
+    assert beyond == replace(
+        standard,
+        geometry=replace(standard.geometry, limb_plane=100.0, sideways=1000.0, temporal=2.0, still=0.0),
+        loss=replace(standard.loss, isolated=False),
+        prior=replace(standard.prior, pull=5.0, pull_until=0.35),
+        rates=replace(standard.rates, deform=(2e-3, 1e-5)),
+        density=replace(standard.density, cap=14_000, end=0.9),
+    )
     assert standard.loss.isolated and standard.geometry.limb_plane == standard.geometry.sideways == 0
 
 
 def test_a_camera_at_one_side_has_its_own_preset_beyond_the_paper() -> None:
     beyond, one_side = (load_preset("ours", Config, name) for name in ("beyond", "one-side"))
     changed = {name for name in beyond.__struct_fields__ if getattr(beyond, name) != getattr(one_side, name)}
-    assert changed == {"canonical", "skin", "prior", "rates", "density"}
+    assert changed == {"canonical", "skin", "prior", "rates", "density", "geometry"}
     assert one_side.skin.holds and one_side.prior.untold and not beyond.skin.holds and not beyond.prior.untold
 
 
