@@ -36,7 +36,6 @@ def test_what_is_beyond_the_paper_differs_from_standard_in_these_alone() -> None
         standard,
         geometry=replace(standard.geometry, limb_plane=100.0, sideways=1000.0, temporal=2.0, still=0.0),
         loss=replace(standard.loss, isolated=False),
-        prior=replace(standard.prior, pull=5.0, pull_until=0.35),
         rates=replace(standard.rates, deform=(2e-3, 1e-5)),
         density=replace(standard.density, cap=14_000, end=0.9),
     )
