@@ -141,6 +141,9 @@ class PriorUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     open)."""
     pull_until: Weight = 1.0
     """Fraction at which the pull ends (paper: 4k of 20k); above 1 it is still on at the end."""
+    pull_turn: Weight = 0.0
+    """How well the frames beside one tell its depth (`ours.evidence.turn`: 0.07 for a camera that turns by 10 degrees a
+    frame) above which the pull falls in proportion; 0 for never."""
     untold: Weight = 0.0
     """Weight of the squared distance from the prior's posed skin as far as an image does not tell it: where the skin is
     hidden, and along the line of sight where it is seen; over the prior's mean squared error where the image tells it.

@@ -19,6 +19,10 @@ LEAST_COSINE = 0.1
 """Of a disc seen from its edge: the rasterizer widens it, so that its patch does not vanish."""
 
 
+NEAR = 2
+"""Frames on either side that tell a pose too, since poses are smooth over time."""
+
+
 @dataclass(frozen=True)
 class Sighting:
     """One training view of the Gaussians, posed and not deformed.
@@ -41,6 +45,34 @@ class Sighting:
         sight = normalize(posed.means - camera.center.to(posed.means), dim=-1)
         local = torch.einsum("na,nab->nb", sight, own.rotations_to(normalize(posed.quats, dim=-1)))
         return visible_share(posed, own, camera), local
+
+
+def turn(centers: Tensor, positions: Tensor) -> Tensor:
+    """Return how well the frames beside each one tell the depth that it does not tell itself, in [0, 1], [T].
+
+    The mean of sin^2 of the angle between its line of sight, to the origin of the object frame, and those of the frames
+    at most `NEAR` away: 0 for a camera that stands still before an animal that does not turn, 0.07 where it turns by 10
+    degrees a frame and 0.5 by 30.
+
+    Args:
+        centers: of the cameras in the object frame, float64, [T, 3].
+        positions: of the frames in the video (`symmetry.frame_positions`), float64, [T].
+    """
+    sights = normalize(centers, dim=-1)
+    squares = (1 - (sights @ sights.t()).square()).clamp_min(0)
+    gaps = (positions[:, None] - positions).abs()
+    near = ((gaps > 0) & (gaps < NEAR + 0.5)).double()
+    return (squares * near).sum(1) / near.sum(1).clamp_min(1)
+
+
+def pull_shares(supervision: Supervision, limit: float) -> list[float]:
+    """Return the share of the pull to the prior's pose that is left to each frame: ``limit`` over what the frames
+    beside it tell (`turn`), at most 1; 1 everywhere where the limit is 0."""
+    if not limit:
+        return [1.0] * supervision.frames
+    cameras = [supervision.target(Key(1, 1, frame)).camera for frame in range(supervision.frames)]
+    told = turn(torch.stack([camera.center.cpu().double() for camera in cameras]), supervision.positions)
+    return (limit / told.clamp_min(limit)).tolist()
 
 
 def training_views(supervision: Supervision, mirrored: float) -> Iterator[tuple[Key, float]]:

@@ -14,7 +14,7 @@ from rewild4d.ours.canonical import Posed
 from rewild4d.ours.checkpoint import fit_digest, load_checkpoint
 from rewild4d.ours.coloring import initial_colors
 from rewild4d.ours.config import Config
-from rewild4d.ours.evidence import Sighting
+from rewild4d.ours.evidence import Sighting, pull_shares
 from rewild4d.ours.gradients import all_finite, clip_gradients, norm_of, require_finite, scale_gradients
 from rewild4d.ours.graphs import CudaRecorder, StepGraphs, can_record
 from rewild4d.ours.inputs import StepInput
@@ -51,6 +51,8 @@ class Training(GaussianTraining):
         model.field.logits.requires_grad_(config.skinning.learn)
         super().__init__(model, groups, config, supervision, generator)
         self.marks: Marks | None = None
+        # Of the pull to the prior's poses, a frame each.
+        self.shares = pull_shares(supervision, config.prior.pull_turn)
         self.graphs = StepGraphs(self, CudaRecorder(model.pivots.device)) if can_record(model.pivots.device) else None
 
     def step(self, index: int) -> dict[str, float]:
@@ -84,7 +86,7 @@ class Training(GaussianTraining):
         keys, own, gaps = neighbour_keys([key], supervision.positions, geometry)
         codes, flipped = self.model.codes(self._times(keys, progress), keys)
         blend = fade(progress, config.prior.blend_until) if config.prior.blend else 0.0
-        pull = config.prior.pull * fade(progress, config.prior.pull_until)
+        pull = config.prior.pull * fade(progress, config.prior.pull_until) * self.shares[key.frame]
         deform, background = config.deform, torch.ones(3)
         offset = float(torch.rand((), generator=self.generator)) if deform.sampled else 0.0
         if config.loss.random_background:

@@ -9,7 +9,7 @@ from toys import TINY
 
 from rewild4d.ours.canonical import Gaussians, Posed, attributes
 from rewild4d.ours.config import Canonical
-from rewild4d.ours.evidence import information, visible_share
+from rewild4d.ours.evidence import information, pull_shares, turn, visible_share
 from rewild4d.ours.model import build_model, sightings
 from rewild4d.ours.symmetry import Key, Supervision
 from rewild4d.types import Camera, Clip, Prior
@@ -86,3 +86,30 @@ def test_one_line_of_sight_tells_nothing_along_it(toy: tuple[Clip, Prior]) -> No
     along = torch.einsum("na,nab,nb->n", rest, found, rest)
     torch.testing.assert_close(along, torch.zeros(len(own)), atol=1e-5, rtol=0)
     assert float(found.detach().diagonal(dim1=1, dim2=2).sum(-1).max()) == pytest.approx(2.0, abs=1e-4)
+
+
+def around(degrees: float, count: int) -> torch.Tensor:
+    """Camera centres that turn about the origin by so many degrees a frame."""
+    angles = torch.deg2rad(degrees * torch.arange(count, dtype=torch.float64))
+    return 7 * torch.stack((angles.cos(), angles.sin(), torch.zeros(count)), dim=-1)
+
+
+def test_frames_beside_one_tell_its_depth_as_far_as_the_camera_turns() -> None:
+    rows = torch.arange(5, dtype=torch.float64)
+    # sin^2 of 30 and 60 degrees: on both sides in the middle, on one side at an end.
+    told = turn(around(30, 5), rows)
+    assert told.tolist() == pytest.approx([(1 / 4 + 3 / 4) / 2, (2 / 4 + 3 / 4) / 3, 1 / 2, (2 / 4 + 3 / 4) / 3, 1 / 2])
+    assert turn(around(0, 5), rows).tolist() == [0] * 5
+    assert turn(around(180, 5), rows).tolist() == pytest.approx([0] * 5), "from behind the same depth is hidden"
+    # A frame that is missing: only that at the same distance counts, and none further away.
+    assert turn(around(30, 2), torch.tensor([0.0, 2.0], dtype=torch.float64)).tolist() == pytest.approx([1 / 4] * 2)
+    assert turn(around(30, 2), torch.tensor([0.0, 3.0], dtype=torch.float64)).tolist() == [0, 0]
+
+
+def test_the_pull_falls_as_far_as_other_frames_tell(toy: tuple[Clip, Prior]) -> None:
+    supervision = Supervision(*toy, TINY.image_size, torch.device("cpu"))
+    cameras = [supervision.target(Key(1, 1, frame)).camera.center.double() for frame in range(supervision.frames)]
+    told = turn(torch.stack(cameras), supervision.positions)
+    assert pull_shares(supervision, 0.0) == [1.0] * supervision.frames
+    limit = float(told.mean()) / 2
+    assert pull_shares(supervision, limit) == pytest.approx([min(1.0, limit / float(each)) for each in told])
