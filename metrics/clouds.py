@@ -101,10 +101,14 @@ def even_rows(points: Points) -> NDArray[np.intp]:
         size = median_radius(points[rows])
         if not size > 0:
             return np.arange(len(points))
-        cells = np.floor(np.clip(points / (size / EVEN), -(2**62), 2**62)).astype(np.int64)
-        _, rows = np.unique(cells, axis=0, return_index=True)
-        rows.sort()
+        rows = cell_rows(points, size / EVEN)
     return rows
+
+
+def cell_rows(points: Points, side: float) -> NDArray[np.intp]:
+    """Choose the point that is listed first in each occupied cell of a grid; rows in ascending order, [n, 3] -> [m]."""
+    cells = np.floor(np.clip(points / side, -(2**62), 2**62)).astype(np.int64)
+    return np.sort(np.unique(cells, axis=0, return_index=True)[1])
 
 
 def median_radius(points: Points) -> float:

@@ -107,11 +107,11 @@ def _tables() -> tuple[np.ndarray, ...]:
 
 def _matching(level: int) -> tuple[Tensor, Tensor]:
     """Directions [D, 3] and the transposed pseudoinverse of the values of a degree's functions there, float64."""
-    directions = _spiral(2 * (2 * level + 1))
+    directions = spiral(2 * (2 * level + 1))
     return directions, torch.linalg.pinv(_band(directions, level)).T.contiguous()
 
 
-def _spiral(count: int) -> Tensor:
+def spiral(count: int) -> Tensor:
     """Return the unit directions spread over the sphere, [count, 3]."""
     order = torch.arange(count, dtype=torch.float64)
     height, angle = 1 - (2 * order + 1) / count, order * (math.pi * (3 - 5**0.5))

@@ -2,11 +2,12 @@
 
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from rewild4d.harmonics import spiral
 from rewild4d.io.sampling import OPACITY
+from rewild4d.metrics.clouds import cell_rows, subsample
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import look_at
 from rewild4d.types import Camera, Splats
@@ -51,25 +52,17 @@ def sample_drawn(splats: Splats, count: int, seed: int) -> Tensor:
     # A single Gaussian has no extent but its own.
     radius = float((solid - middle).norm(dim=-1).amax()) + 2 * float(splats.scales.amax())
     points = torch.cat([_seen(splats, camera, radius) for camera in _around(middle, radius)])
-    cells = np.floor(((points - middle) / (CELL * radius)).numpy()).astype(np.int64)
-    first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
-    if len(first) > count:
-        first = np.sort(np.random.default_rng(seed).permutation(first)[:count])
-    return points[torch.from_numpy(first)]
+    rows = cell_rows((points - middle).numpy(), CELL * radius)
+    return subsample(points[torch.from_numpy(rows)], count, seed)
 
 
 def _around(middle: Tensor, radius: float) -> list[Camera]:
     """Return cameras on a sphere about ``middle`` [3], on a spiral that spaces them evenly."""
     focal = SIDE / 2 * math.sqrt(DISTANCE**2 - 1)  # the ball of this radius fills the image
     intrinsics = torch.tensor([[focal, 0, SIDE / 2], [0, focal, SIDE / 2], [0, 0, 1]], dtype=torch.float64)
-    cameras = []
-    for index in range(VIEWS):
-        height = 1 - 2 * (index + 0.5) / VIEWS
-        turn, level = math.pi * (1 + math.sqrt(5)) * index, math.sqrt(1 - height**2)
-        direction = middle.new_tensor([level * math.cos(turn), level * math.sin(turn), height])
-        up = middle.new_tensor([0.0, 0.0, 1.0])  # no camera of the spiral stands on this axis
-        cameras.append(Camera(look_at(middle + DISTANCE * radius * direction, middle, up), intrinsics, SIDE, SIDE))
-    return cameras
+    up = middle.new_tensor([0.0, 0.0, 1.0])  # no direction of the spiral lies on this axis
+    eyes = middle + DISTANCE * radius * spiral(VIEWS)
+    return [Camera(look_at(eye, middle, up), intrinsics, SIDE, SIDE) for eye in eyes]
 
 
 def _seen(splats: Splats, camera: Camera, radius: float) -> Tensor:
