@@ -42,7 +42,7 @@ def records_frame(folder: Path) -> "pd.DataFrame":
 
         - protocol, dataset, case, method, preset: names.
         - variant: the method as tables label it: with the settings and the prior that tell it from its other runs.
-        - prior: what the run asked for ("template", "coarse:1", "rig", a file).
+        - prior: what the run asked for ("template", "learned:weights.safetensors", "coarse:1", "rig", a file).
         - kind: "method", "floor" (a lower bound) or "unranked" (it had what the others had not; ``marks`` says what).
         - seed (int64), run_id.
         - latest (bool): whether tables count the run: of equal runs the newest, on the newest data.

@@ -238,7 +238,7 @@ class Prior:
     """A posed template: a start, never a constraint. Everything is in the object frame but `object_to_world`.
 
     Attributes:
-        name: how it was made ("template", "coarse-<noise>", "rig", a file's name).
+        name: how it was made ("template", "learned", "coarse-<noise>", "rig", a file's name).
         provenance: one sentence for the record (what it saw, noise, version).
         vertices: rest shape, float32, [n, 3].
         faces: int64, [f, 3].

@@ -12,12 +12,14 @@ from rewild4d.errors import UserError
 from rewild4d.files import digest
 from rewild4d.machine import code_version
 from rewild4d.priors.coarse import coarse_prior
-from rewild4d.priors.config import FOOTAGE, PriorConfig, Use
+from rewild4d.priors.config import FOOTAGE, PriorConfig, Use, with_points
 from rewild4d.priors.fit import fit_template
 from rewild4d.priors.footage import Evidence, fit_footage
 from rewild4d.priors.io import load_prior, save_prior, seal
 from rewild4d.priors.judge import doubts, joint_scores, measured
 from rewild4d.priors.landmarks import Marks, load_mapping, marks
+from rewild4d.priors.learned.network import PointNetwork
+from rewild4d.priors.learned.weights import load_weights
 from rewild4d.priors.placing import has_cameras, in_world, placed
 from rewild4d.priors.rig import rig_prior
 from rewild4d.priors.steady import without_hops
@@ -38,9 +40,10 @@ class PriorChoice:
     """The prior that a run asks for.
 
     Attributes:
-        name: "template" (fitted to the clip alone, with its cameras where it has any), "coarse" or "coarse:<noise>"
-            (from the truth, plus noise; for studies of prior quality only), "rig" (the data set's own shape and
-            skeleton: a bound) or the path of an npz file.
+        name: "template" (fitted to the clip's masks alone, with its cameras where it has any), "learned:<weights>"
+            (fitted to masks and to points of the body that a network finds), "coarse" or
+            "coarse:<noise>" (from the truth, plus noise; for studies of prior quality only), "rig" (the data set's own
+            shape and skeleton: a bound) or the path of an npz file.
         config: settings of the template fit under known cameras.
         mapping: names the template's point of each keypoint (`landmarks.load_mapping`); None ignores keypoints.
         use: frames whose keypoints a fit under unknown cameras sees.
@@ -71,8 +74,38 @@ class PriorChoice:
         Raises:
             UserError: a noise that is no number, or a file that is missing or damaged.
         """
-        if self.name != "template" and not self.is_from_truth:
+        if self.is_learned:
+            self.network()
+        elif not self.is_fitted and not self.is_from_truth:
             load_prior(Path(self.name))
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether a network's points take part in the fit."""
+        return self.name.partition(":")[0] == "learned"
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether the template is fitted to the clip, which alone decides the prior."""
+        return self.name == "template" or self.is_learned
+
+    @property
+    def _weights_file(self) -> Path:
+        path = self.name.partition(":")[2]
+        if not path:
+            raise UserError(
+                "--prior learned: expected learned:<weights>, since no weights come with the package yet; "
+                "`prior train` makes some."
+            )
+        return Path(path)
+
+    def network(self) -> PointNetwork | None:
+        """Return the network of a learned prior; None for others.
+
+        Raises:
+            UserError: its weights are missing or damaged.
+        """
+        return load_weights(self._weights_file) if self.is_learned else None
 
     @property
     def is_from_truth(self) -> bool:
@@ -88,8 +121,10 @@ class PriorChoice:
         if self.name == "rig" and truth.rig is None:
             raise UserError(f"--prior rig: expected a data set with bones and a volume, but {clip.name} has none.")
         parts: list[str | bytes] = [clip.digest, str(code_version())]
-        if self.name == "template":
+        if self.is_fitted:
             parts += ["template", msgspec.json.encode(self.settings(clip)), repr(self._pairs), self.use]
+            if self.is_learned:
+                parts += ["learned", self._weights_file.read_bytes()]
         elif self.is_from_truth:
             named = "rig" if self.noise is None else f"coarse {self.noise}"
             parts += [named, truth.digest, msgspec.json.encode(self.config)]
@@ -103,7 +138,8 @@ class PriorChoice:
 
     def settings_under(self, known_cameras: bool) -> PriorConfig:
         """Return settings of the fit where cameras are known or not."""
-        return FOOTAGE if self.name == "template" and not known_cameras else self.config
+        config = FOOTAGE if self.is_fitted and not known_cameras else self.config
+        return with_points(config) if self.is_learned else config
 
     def keypoints(self, clip: Clip) -> tuple[Marks | None, Marks | None]:
         """Return the clip's keypoints for the fit and those to score it by; None where there are none."""
@@ -132,7 +168,7 @@ def make_prior(choice: PriorChoice, clip: Clip, truth: Truth, path: Path, log: L
         UserError: a file that cannot be used or is for another clip, or masks that show nothing.
     """
     footage = not has_cameras(clip)
-    if choice.name != "template" and not choice.is_from_truth:
+    if not choice.is_fitted and not choice.is_from_truth:
         prior = load_prior(Path(choice.name))
         prior = placed(prior, clip) if footage else in_world(prior, clip, choice.name)
         figures = measured(prior, clip.frames)
@@ -153,12 +189,13 @@ def make_prior(choice: PriorChoice, clip: Clip, truth: Truth, path: Path, log: L
 def _fitted(choice: PriorChoice, clip: Clip, truth: Truth, log: Log) -> Prior:
     if choice.noise is not None:
         return coarse_prior(clip, truth.held_out, noise=choice.noise, seed=PRIOR_SEED, config=choice.config, log=log)
+    network, config = choice.network(), choice.settings(clip)
     if choice.name == "rig" or has_cameras(clip):
-        fitted = fit_template(clip, config=choice.config, seed=PRIOR_SEED, log=log)
+        fitted = fit_template(clip, config=config, seed=PRIOR_SEED, log=log, network=network)
         return rig_prior(clip, truth.rig(), fitted) if choice.name == "rig" and truth.rig else fitted
     given, scored = choice.keypoints(clip)
     said = Evidence(given, clip.travel)
-    return _scored(fit_footage(clip, config=FOOTAGE, seed=PRIOR_SEED, log=log, said=said), clip, scored)
+    return _scored(fit_footage(clip, config=config, seed=PRIOR_SEED, log=log, said=said, network=network), clip, scored)
 
 
 def _scored(prior: Prior, clip: Clip, found: Marks | None) -> Prior:

@@ -50,6 +50,9 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         travel_weight: heading against the direction of travel, when hypotheses are compared.
         carriage_weight: heads folded into the body and raised tails, under unknown cameras.
         keypoint_weight: robust distance of joints to keypoints.
+        points_weight: robust distance of joints to the points that a network finds, in its expected errors, where
+            there is one.
+        root_period: frames for each term of the root's motion.
     """
 
     stages: tuple[Stage, ...]
@@ -65,6 +68,8 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     travel_weight: float = 0.08
     carriage_weight: float = 1.0
     keypoint_weight: float = 0.1
+    points_weight: float = 0.0
+    root_period: int = 4
 
 
 STANDARD = PriorConfig(
@@ -93,4 +98,13 @@ FOOTAGE = PriorConfig(
     shape_weight=0.035,
     view_weight=0.06,
 )
+
+
+def with_points(config: PriorConfig) -> PriorConfig:
+    """Return the settings of a fit that has a network's points too: they speak of motion that masks leave open."""
+    return msgspec.structs.replace(
+        config, points_weight=0.15, angle_weight=0.03, root_weight=0.05, root_period=2, gait_weight=0.0
+    )
+
+
 PRESETS = {"quick": QUICK, "standard": STANDARD}

@@ -15,6 +15,9 @@ from rewild4d.priors.config import PriorConfig
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.io import seal
 from rewild4d.priors.kinematics import pose
+from rewild4d.priors.learned.evidence import PointEvidence, indices
+from rewild4d.priors.learned.network import PointNetwork
+from rewild4d.priors.learned.reading import read
 from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.race import Race
 from rewild4d.priors.search import facings, mask_rays, single_view, trajectory, up_directions, working_frame
@@ -41,8 +44,10 @@ class Animal:
     figures: dict[str, float]
 
 
-def fit_template(clip: Clip, *, config: PriorConfig, seed: int, log: Log) -> Prior:
-    """Fit the template to a clip's masks under its cameras; the seed is that of the frames drawn for each step.
+def fit_template(clip: Clip, *, config: PriorConfig, seed: int, log: Log, network: PointNetwork | None = None) -> Prior:
+    """Fit the template to a clip's masks under its cameras, and to the points that a network finds if there is one.
+
+    The seed is that of the frames drawn for each step.
 
     Returns:
         A prior with one pose per frame; `quality` has mask_iou, cost, facing_margin, starts (their number) and
@@ -52,15 +57,20 @@ def fit_template(clip: Clip, *, config: PriorConfig, seed: int, log: Log) -> Pri
         UserError: a frame has no camera, or no mask shows anything.
     """
     count = len(clip.frames)
-    animal = fit_animal(clip.frames, range(count), count, clip.name, config, seed, log)
-    provenance = f"Template fitted to the {count} masks of the clip under known cameras, seed {seed}."
-    return make_prior(animal, clip, "template", provenance)
+    animal = fit_animal(clip.frames, range(count), count, clip.name, config, seed, log, network)
+    points = " and to points of the body that a network finds in them" if network else ""
+    provenance = f"Template fitted to the {count} masks of the clip{points} under known cameras, seed {seed}."
+    return make_prior(animal, clip, "learned" if network else "template", provenance)
 
 
 def fit_animal(
-    frames: Sequence[Frame], timesteps: Sequence[int], count: int, name: str, config: PriorConfig, seed: int, log: Log
-) -> Animal:
-    """Fit the template to frames of ``count`` times, any number of each; ``timesteps`` are indices of their times."""
+    frames: Sequence[Frame], timesteps: Sequence[int], count: int, name: str, config: PriorConfig, seed: int, log: Log,
+    network: PointNetwork | None = None,
+) -> Animal:  # fmt: skip
+    """Fit the template to frames of ``count`` times; ``timesteps`` are indices of their times.
+
+    There may be any number of each time; for a ``network`` one, in their order.
+    """
     rays = mask_rays(frames, timesteps, name)
     path = trajectory(rays, count)
     ups = up_directions(rays, config.elevations)
@@ -73,7 +83,9 @@ def fit_animal(
         race.view = single_view(rays, working)
         race.done = index * config.stages[0].steps
         local = torch.linalg.solve(working[:3, :3], (path - working[:3, 3]).T).T
-        race.begin(Hypotheses.start(facings(config.yaw_starts), local.float()))
+        if network is not None:
+            race.said = PointEvidence.of(read(frames, timesteps, up, name, network), working)
+        race.begin(Hypotheses.start(facings(config.yaw_starts), local.float(), config.root_period))
         race.run(config.stages[0])
         best.append(race)
     starts = torch.cat([race.start_costs for race in best]).tolist()
@@ -90,14 +102,19 @@ class KnownCameras(Race):
 
     Attributes:
         view: the one direction in which all cameras look, in the working frame, [3]; None where there are several.
+        said: points that the network found; None without it.
     """
 
     view: Tensor | None = None
+    said: PointEvidence | None = None
 
     def evidence(self) -> Tensor | float:
-        if self.view is None:
-            return 0.0
-        return self.config.view_weight * (self.guesses.heading() @ self.view).square()
+        cost: Tensor | float = 0.0
+        if self.view is not None:
+            cost = self.config.view_weight * (self.guesses.heading() @ self.view).square()
+        if self.said is not None:
+            cost = cost + self.config.points_weight * self.said.distance(self.guesses.points(*indices()))
+        return cost
 
     def winner(self) -> Animal:
         """Return the best guess in the world, with the rest mesh's diagonal scaled to the object frame's."""

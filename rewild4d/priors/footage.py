@@ -17,6 +17,9 @@ from rewild4d.priors.io import seal
 from rewild4d.priors.judge import measured
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.landmarks import Marks
+from rewild4d.priors.learned.evidence import PointEvidence, indices
+from rewild4d.priors.learned.network import PointNetwork
+from rewild4d.priors.learned.reading import read
 from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.race import Race
 from rewild4d.priors.search import facings
@@ -51,6 +54,8 @@ class Evidence:
 
 
 NOTHING = Evidence()
+UP = torch.tensor((0.0, 1.0, 0.0), dtype=torch.float64)
+"""Of the frame in which Fauna's camera stands."""
 ASCENT = 0.3
 """Motion up the image per motion away over the ground (sine of the camera's elevation, taken high: it is noisy)."""
 NEAR = 0.04
@@ -62,6 +67,7 @@ class FixedCamera(Race):
 
     Attributes:
         said: marks and travel.
+        points: that a network found; None without one.
         boxes: windows of the frames, [T, 3].
         given: keep scale and proportions as they are.
     """
@@ -69,6 +75,7 @@ class FixedCamera(Race):
     said: Evidence
     boxes: Tensor
     guesses: Views
+    points: PointEvidence | None = None
     given: bool = False
 
     def free(self, stage: Stage) -> list[str]:
@@ -80,6 +87,8 @@ class FixedCamera(Race):
         cost = cost + self.config.carriage_weight * self.guesses.carriage()
         if self.said.marks is not None and len(self.said.marks):
             cost = cost + self.config.keypoint_weight * self._off_marks(self.said.marks)
+        if self.points is not None:
+            cost = cost + self.config.points_weight * self.points.distance(self.guesses.points(*indices()))
         return cost
 
     def _off_marks(self, found: Marks) -> Tensor:
@@ -122,9 +131,10 @@ class FixedCamera(Race):
 
 
 def fit_footage(
-    clip: Clip, *, config: PriorConfig, seed: int, log: Log, said: Evidence = NOTHING, name: str = "template"
-) -> Prior:
-    """Fit the template to a clip's masks under unknown cameras.
+    clip: Clip, *, config: PriorConfig, seed: int, log: Log, said: Evidence = NOTHING,
+    network: PointNetwork | None = None,
+) -> Prior:  # fmt: skip
+    """Fit the template to a clip's masks under unknown cameras, and to the points that a network finds if there is one.
 
     The seed is that of the frames drawn for each step of a long clip.
 
@@ -136,16 +146,17 @@ def fit_footage(
         UserError: no mask shows anything.
     """
     require_mask(clip.frames, clip.name)
-    race = _run(clip.name, clip.frames, said, config, seed, log, None)
+    race = _run(clip.name, clip.frames, said, config, seed, log, None, network)
     flipped = tuple(replace(f, rgb=f.rgb.flip(-1), mask=f.mask.flip(-1)) for f in clip.frames)
     mirrored = said.mirrored(clip.frames[0].mask.shape[2])
-    race_flip = _run(clip.name, flipped, mirrored, config, seed, log, race.guesses)
-    return _prior(clip, race, race_flip, name, seed)
+    race_flip = _run(clip.name, flipped, mirrored, config, seed, log, race.guesses, network)
+    return _prior(clip, race, race_flip, "learned" if network else "template", seed)
 
 
 def _run(
-    case: str, frames: tuple[Frame, ...], said: Evidence, config: PriorConfig, seed: int, log: Log, known: Views | None
-) -> FixedCamera:
+    case: str, frames: tuple[Frame, ...], said: Evidence, config: PriorConfig, seed: int, log: Log,
+    known: Views | None, network: PointNetwork | None,
+) -> FixedCamera:  # fmt: skip
     """Run all rounds, from all starts to one guess; scale and proportions are those of ``known``, if given."""
     total = 2 * sum(stage.steps for stage in config.stages)
     boxes = windows(frames)
@@ -156,9 +167,12 @@ def _run(
     working, generator = torch.eye(4, dtype=torch.float64), torch.Generator().manual_seed(seed)
     race = FixedCamera(seen, range(len(frames)), case, working, config, generator, log, total)
     race.said, race.boxes = said, boxes.float()
+    if network is not None:
+        found = read(seen, range(len(seen)), UP, case, network, known=False)
+        race.points = PointEvidence.of(found, working)
     # known proportions need fewer starts
     count = config.yaw_starts if known is None else max(4, config.yaw_starts // 2)
-    starts = Views.start(facings(count), torch.zeros(len(frames), 3))
+    starts = Views.start(facings(count), torch.zeros(len(frames), 3), config.root_period)
     race.begin(starts)
     if known is not None:
         race.given, race.done = True, total // 2

@@ -75,10 +75,13 @@ class Hypotheses:
     angles: Tensor
 
     @classmethod
-    def start(cls, facing: Tensor, path: Tensor) -> Self:
-        """Return average animals at rest on the path, from facings [B, 3, 3] and a path [T, 3]."""
+    def start(cls, facing: Tensor, path: Tensor, root_period: int = 4) -> Self:
+        """Return average animals at rest on the path, from facings [B, 3, 3] and a path [T, 3].
+
+        The root has a term of motion for each ``root_period`` frames.
+        """
         batch, count = len(facing), len(path)
-        root, joints = 1 + (count - 1) // 4, 1 + (count - 1) // 2
+        root, joints = 1 + (count - 1) // root_period, 1 + (count - 1) // 2
         return cls(
             facing,
             path,
@@ -142,6 +145,15 @@ class Hypotheses:
         transforms = linear[:, :, None] @ pose(angles, template.bones[:, None, :, 0], PARENTS)
         blended = (weights @ transforms[..., :3, :].flatten(-2)).unflatten(-1, (3, 4))
         return torch.einsum("bvnac,bnc->bvna", blended[..., :3], points) + blended[..., 3]
+
+    def points(self, bones: Tensor, along: Tensor) -> Tensor:
+        """Return points of bones, at shares of their lengths ([L] each), at every time, [B, T, L, 3]."""
+        rest = quadruped(Proportions(self.shape, self.relief), unit=False).bones
+        start, end = rest[:, bones].unbind(-2)
+        transforms = pose(self.joint_angles(), rest[:, None, :, 0], PARENTS)[:, :, bones]
+        places = (start + along[:, None] * (end - start))[:, None]
+        posed, roots = moved(places, transforms) * self.scales()[:, None, None, None], self.roots()
+        return posed @ roots[..., :3, :3].transpose(-1, -2) + roots[..., None, :3, 3]
 
     def backward_gait(self) -> Tensor:
         """Return how far feet on the ground move towards the head (up to 1) or the tail (down to -1), [B].

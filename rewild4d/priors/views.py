@@ -78,9 +78,9 @@ class Views(Hypotheses):
     """
 
     @classmethod
-    def start(cls, facing: Tensor, path: Tensor) -> Self:
+    def start(cls, facing: Tensor, path: Tensor, root_period: int = 4) -> Self:
         """Return average animals at rest at the window's centre, from facings [B, 3, 3] and a path [T, 3]."""
-        still = super().start(facing, path)
+        still = super().start(facing, path, root_period)
         rotation, shift = torch.zeros(*still.rotation.shape[:2], 2), torch.zeros(len(facing), len(path), 3)
         return replace(still, rotation=rotation, shift=shift)
 

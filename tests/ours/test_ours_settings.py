@@ -36,6 +36,7 @@ def test_what_is_beyond_the_paper_differs_from_standard_in_these_alone() -> None
         standard,
         geometry=replace(standard.geometry, limb_plane=100.0, sideways=1000.0, temporal=2.0, still=0.0),
         loss=replace(standard.loss, isolated=False),
+        prior=replace(standard.prior, pull_turn=0.07),
         rates=replace(standard.rates, deform=(2e-3, 1e-5)),
         density=replace(standard.density, cap=14_000, end=0.9),
     )

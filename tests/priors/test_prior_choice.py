@@ -104,6 +104,8 @@ def test_keypoints_say_nothing_of_another_skeleton(prior: Prior, tmp_path: Path,
     [
         ("coarse:x", r"--prior coarse:x: expected coarse:<number>, got 'x'\."),
         ("coarse:-1", r"--prior coarse:-1: expected a finite noise of 0 or more, got '-1'\."),
+        ("learned", r"--prior learned: expected learned:<weights>, since no weights come with the package yet; "),
+        ("learned:none", r"none: expected weights of the learned prior \(`prior train` writes them\), got no"),
         ("nowhere.npz", r"nowhere\.npz: expected a prior file, but there is no such file\."),
     ],
 )

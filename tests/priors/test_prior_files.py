@@ -16,6 +16,7 @@ from rewild4d.cli import main
 from rewild4d.commands import prior as command
 from rewild4d.datasets.video.travel import TravelMeter
 from rewild4d.errors import UserError
+from rewild4d.priors import choose
 from rewild4d.priors.config import FOOTAGE
 from rewild4d.priors.io import load_prior, save_prior, seal
 from rewild4d.priors.steady import EPS, clusters, steady, without_hops
@@ -114,7 +115,7 @@ def write_frames(folder: Path, count: int) -> None:
 
 def test_the_command_writes_a_prior_and_its_pictures(tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
     stages = tuple(msgspec.structs.replace(stage, steps=1, frames=3) for stage in FOOTAGE.stages)
-    monkeypatch.setattr(command, "FOOTAGE", msgspec.structs.replace(FOOTAGE, stages=stages, yaw_starts=4))
+    monkeypatch.setattr(choose, "FOOTAGE", msgspec.structs.replace(FOOTAGE, stages=stages, yaw_starts=4))
     write_frames(tmp_path, 11)
     (tmp_path / "masks" / "3.png").unlink()
     arguments = [

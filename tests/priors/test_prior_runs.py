@@ -261,7 +261,7 @@ def test_a_run_warns_of_a_template_that_does_not_fit(tmp_path: Path, capsys: pyt
 def test_the_command_writes_a_file_that_a_run_takes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("rewild4d.commands.prior.FOOTAGE", TINY)
+    monkeypatch.setattr("rewild4d.priors.choose.FOOTAGE", TINY)
     folder = panned(tmp_path / "clip", 14)
     moving.save(folder / "masks" / "00000.png", moving.mask(0) * 0)  # the clip starts at the second frame
     words = ["--frames", folder / "frames", "--masks", folder / "masks", "--out", tmp_path / "p.npz", "--fps", 10]

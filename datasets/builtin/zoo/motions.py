@@ -61,7 +61,7 @@ def _tail(time: float, amount: float = 9.0, lift: float = 0.0) -> np.ndarray:
     return _chain(*((lift, amount * _sine(time, -0.12 * i), 0.0) for i in range(4)))
 
 
-def _stepping(touchdown: Sequence[float], duty: float, stride: float, lift: float, fold: float) -> Motion:
+def stepping(touchdown: Sequence[float], duty: float, stride: float, lift: float, fold: float) -> Motion:
     """Return feet of a gait alone."""
     steps = Gait(tuple(touchdown), duty, stride, lift, fold, (0.0, 0.0), ())  # type: ignore[arg-type]
 
@@ -78,7 +78,7 @@ def _stepping(touchdown: Sequence[float], duty: float, stride: float, lift: floa
 
 def walk(time: float) -> Posture:
     """One cycle of a lateral-sequence walk."""
-    feet = _stepping((0.0, 0.25, 0.5, 0.75), 0.63, 0.46, 0.12, 45.0)(time).feet
+    feet = stepping((0.0, 0.25, 0.5, 0.75), 0.63, 0.46, 0.12, 45.0)(time).feet
     spine = _chain(*((0.0, 2.0 * _sine(time, -0.15 * i), 0.0) for i in range(3)))
     neck = np.array((2.5 * _sine(2 * time, 0.3), 1.5 * _sine(time), 0.0))
     root = np.array((0.012 * _sine(2 * time, 0.1) - 0.025, 0.0, 0.0, 0.0, 2.0 * _sine(time, 0.1)))
@@ -87,14 +87,14 @@ def walk(time: float) -> Posture:
 
 def trot(time: float) -> Posture:
     """One cycle of a trot: diagonal legs together."""
-    feet = _stepping((0.0, 0.5, 0.5, 0.0), 0.45, 0.5, 0.18, 55.0)(time).feet
+    feet = stepping((0.0, 0.5, 0.5, 0.0), 0.45, 0.5, 0.18, 55.0)(time).feet
     root = np.array((0.03 * _sine(2 * time, 0.1) - 0.02, 0.0, 0.0, 0.0, 1.0 * _sine(time)))
     return Posture(root, {"neck": np.array((2.0 * _sine(2 * time), 0, 0)), "tail": _tail(time, 7.0, 3.0)}, feet)
 
 
 def gallop(time: float) -> Posture:
     """One cycle of a gallop with a flexing spine."""
-    feet = _stepping((0.0, 0.42, 0.10, 0.54), 0.32, 0.52, 0.24, 60.0)(time).feet
+    feet = stepping((0.0, 0.42, 0.10, 0.54), 0.32, 0.52, 0.24, 60.0)(time).feet
     root = np.array((0.045 * _sine(time, 0.3) - 0.02, 0.0, 5.0 * _sine(time, 0.05), 0.0, 0.0))
     spine = _chain((0, 0, 0), (3 * _sine(time, 0.55), 0, 0), (3 * _sine(time, 0.55), 0, 0))
     neck = np.array((5.0 * _sine(time, 0.6) + 5.0, 0.0, 0.0))
@@ -178,7 +178,7 @@ def jump(time: float) -> Posture:
 
 def stride(time: float) -> Posture:
     """One cycle of a walk on two legs."""
-    feet = _stepping((0.0, 0.0, 0.5, 0.5), 0.58, 0.5, 0.22, 55.0)(time).feet
+    feet = stepping((0.0, 0.0, 0.5, 0.5), 0.58, 0.5, 0.22, 55.0)(time).feet
     root = np.array((0.02 * _sine(2 * time, 0.1) - 0.03, 0.0, 2.0 * _sine(2 * time), 0.0, 3.0 * _sine(time, 0.1)))
     neck = np.array((7.0 * _sine(2 * time, 0.3), 0.0, 0.0))
     return Posture(

@@ -1,0 +1,198 @@
+"""Examples to train on: sequences of small masked pictures of random animals, and where points of their bodies are.
+
+A picture is that of a camera that looks along the middle of its square crop, so that neither the focal length nor the
+crop's place in the frame matter: only its opening does. Points are in that camera's axes (x right, y down, z ahead) in
+units of half the crop's width at the depth of the animal's root.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter
+from torch import Tensor
+
+from rewild4d.datasets.builtin.zoo.varied import VariedAnimal, draw_animal, draw_clip
+from rewild4d.datasets.rigs.animal import Surface
+from rewild4d.priors.learned.drawing import draw
+from rewild4d.priors.learned.points import MIRRORED, NAMES, root_of
+
+SIZE = 96
+"""Side of the pictures, pixels."""
+MARGIN = 0.1
+"""Of the crops around the mask's box, as a share of its side."""
+LENGTH = 16
+"""Frames of a sequence."""
+LEVEL = np.diag((1.0, -1.0, -1.0))
+"""Rotation that stands for that of an unknown camera, world (y up) -> camera, [3, 3]."""
+CLIPS = 8
+"""Sequences of each animal."""
+
+
+@dataclass
+class Examples:
+    """A batch of sequences.
+
+    Attributes:
+        pictures: mask, and brightness inside it (zero mean, spread one half; all zero where unknown), [b, t, 2, s, s].
+        rotations: world (y up, any heading) -> camera axes of each picture, [b, t, 3, 3].
+        openings: half the crop's width at unit depth, [b, t].
+        known: whether cameras are known; where not, rotations are those of one level camera, bool, [b].
+        points: of the body, [b, t, L, 3].
+    """
+
+    pictures: Tensor
+    rotations: Tensor
+    openings: Tensor
+    known: Tensor
+    points: Tensor
+
+    def mirrored(self) -> "Examples":
+        """Return the sequences as a mirror shows them: left is right."""
+        flip = self.points.new_tensor((-1.0, 1.0, 1.0))
+        swap = [NAMES.index(MIRRORED.get(name, name)) for name in NAMES]
+        return Examples(
+            self.pictures.flip(-1), flip[:, None] * self.rotations * flip, self.openings, self.known,
+            self.points[..., swap, :] * flip,
+        )  # fmt: skip
+
+    def chosen(self, rows: Tensor) -> "Examples":
+        """Return some of the sequences, int64, [m]."""
+        return Examples(*(value[rows] for value in vars(self).values()))
+
+
+def joined(parts: list[Examples]) -> Examples:
+    """Stack batches."""
+    return Examples(*(torch.cat([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+
+
+def draw_sequences(rng: np.random.Generator, count: int = CLIPS, length: int = LENGTH) -> Examples:
+    """Draw ``count`` sequences of one random animal."""
+    animal = draw_animal(rng)
+    return joined([_sequence(animal, length, rng) for _ in range(count)])
+
+
+def _sequence(animal: VariedAnimal, length: int, rng: np.random.Generator) -> Examples:
+    transforms = draw_clip(animal, length, rng)
+    vertices = [animal.surface.posed(moved) for moved in transforms]
+    order = [animal.names.index(name) for name in NAMES]
+    homogeneous = np.concatenate((animal.points, np.ones((len(animal.points), 1))), axis=1)[order]
+    points = np.einsum("tlab,lb->tla", transforms[:, animal.point_bones[order], :3], homogeneous)
+    shades = _shades(animal.surface, rng)
+    faces = animal.surface.faces.astype(np.int32)
+    radius = float(np.linalg.norm(vertices[0] - vertices[0].mean(axis=0), axis=1).max())
+    place = _Place(radius, length, rng)
+    rows = [place.seen(t, vertices[t], points[t], faces, shades, rng) for t in range(length)]
+    pictures, rotations, openings, marks = (np.stack(column) for column in zip(*rows, strict=True))
+    if rng.random() < 0.3:
+        pictures[:, 1] = 0
+    known = rng.random() < 0.7
+    if not known:
+        rotations[:] = LEVEL
+    shown, turned, opened, found = (
+        torch.from_numpy(value.astype(np.float32))[None] for value in (pictures, rotations, openings, marks)
+    )
+    return Examples(shown, turned, opened, torch.tensor([known]), found)
+
+
+def _shades(surface: Surface, rng: np.random.Generator) -> np.ndarray:
+    """Return the brightness of every vertex of a surface at rest, under a light of random direction, [n]."""
+    grey = surface.colors @ rng.dirichlet((2, 2, 2))
+    light = rng.normal(0, 1, 3) + (0, 1, 0)
+    cross = np.cross(
+        surface.vertices[surface.faces[:, 1]] - surface.vertices[surface.faces[:, 0]],
+        surface.vertices[surface.faces[:, 2]] - surface.vertices[surface.faces[:, 0]],
+    )
+    normals = np.zeros_like(surface.vertices)
+    for corner in range(3):
+        np.add.at(normals, surface.faces[:, corner], cross)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
+    facing = normals @ light / np.linalg.norm(light)
+    return np.asarray(grey * (1 + rng.uniform(0.1, 0.5) * facing), np.float32)
+
+
+class _Place:
+    """Cameras around one animal: still, slowly moving, circling or jumping."""
+
+    def __init__(self, radius: float, length: int, rng: np.random.Generator) -> None:
+        kind = rng.random()
+        step = 0.0 if kind < 0.35 else float(rng.normal(0, 3)) if kind < 0.5 else float(rng.choice((-1, 1)))
+        step *= float(rng.uniform(5, 40)) if kind >= 0.5 else 1.0
+        self.yaws = np.radians(rng.uniform(0, 360) + step * np.arange(length))
+        if kind > 0.9:
+            self.yaws = rng.uniform(0, 2 * np.pi, length)
+        tilt, drift = rng.uniform(-8, 40) if rng.random() < 0.9 else rng.uniform(-25, 75), rng.normal(0, 0.4)
+        self.tilts = np.radians(tilt + drift * np.arange(length))
+        self.rolls = np.radians(rng.normal(0, 2.0) + rng.normal(0, 0.3, length))
+        self.distance = radius * float(np.exp(rng.uniform(np.log(2.2), np.log(12.0))))
+        self.heading = rng.uniform(0, 2 * np.pi)
+        self.dirt = rng.random()
+
+    def camera(self, t: int) -> np.ndarray:
+        """Return the rotation body frame -> camera axes at a frame, [3, 3]."""
+        yaw, tilt, roll = self.yaws[t], self.tilts[t], self.rolls[t]
+        ahead = -np.array((np.sin(yaw) * np.cos(tilt), np.sin(tilt), np.cos(yaw) * np.cos(tilt)))
+        right = np.cross(ahead, (0.0, 1.0, 0.0))
+        right /= np.linalg.norm(right)
+        axes = np.stack((right, np.cross(ahead, right), ahead))
+        spin = np.array(((np.cos(roll), -np.sin(roll), 0), (np.sin(roll), np.cos(roll), 0), (0, 0, 1)))
+        return np.asarray(spin @ axes)
+
+    def seen(
+        self, t: int, vertices: np.ndarray, points: np.ndarray, faces: np.ndarray, shades: np.ndarray,
+        rng: np.random.Generator,
+    ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:  # fmt: skip
+        """Return picture, rotation, opening and points of one frame."""
+        axes, middle = self.camera(t), vertices.mean(axis=0)
+        local = (vertices - middle) @ axes.T + (0.0, 0.0, self.distance)
+        low, high = (local[:, :2] / local[:, 2:]).min(axis=0), (local[:, :2] / local[:, 2:]).max(axis=0)
+        half = 0.5 * float((high - low).max()) * (1 + 2 * MARGIN) * float(np.exp(rng.normal(0, 0.03)))
+        center = (low + high) / 2 + half * rng.normal(0, 0.03, 2)
+        turn = looking_at(center)
+        seen, marks = local @ turn.T, ((points - middle) @ axes.T + (0.0, 0.0, self.distance)) @ turn.T
+        opening = half / (1 + center @ center)
+        flat = np.concatenate((0.5 + 0.5 * seen[:, :2] / seen[:, 2:] / opening, seen[:, 2:]), axis=1)
+        picture = soiled(draw(flat.astype(np.float32), faces, shades, SIZE), self.dirt, rng)
+        turned = np.array(((np.cos(self.heading), 0, np.sin(self.heading)), (0, 1, 0),
+                           (-np.sin(self.heading), 0, np.cos(self.heading))))  # fmt: skip
+        depth = root_of(marks)[2]
+        scaled = (marks - (0.0, 0.0, depth)) / (opening * depth)
+        return normalised(picture), turn @ axes @ turned.T, float(opening), scaled
+
+
+def looking_at(center: np.ndarray) -> np.ndarray:
+    """Return the smallest rotation that turns the ray through (x, y, 1) to the z axis, [2] -> [3, 3]."""
+    ray = np.append(center, 1.0) / np.sqrt(1 + center @ center)
+    cross = np.array((ray[1], -ray[0], 0.0))
+    skew = np.array(((0, 0, cross[1]), (0, 0, -cross[0]), (-cross[1], cross[0], 0)))
+    return np.asarray(np.eye(3) + skew + skew @ skew / (1 + ray[2]))
+
+
+def soiled(picture: np.ndarray, dirt: float, rng: np.random.Generator) -> np.ndarray:
+    """Return a picture [2, s, s] whose mask has faults: a strip cut off, a bitten or ragged outline."""
+    if dirt < 0.6:
+        return picture
+    mask = picture[0]
+    ragged = gaussian_filter(rng.normal(0, 1, mask.shape), rng.uniform(1.0, 3.0))
+    amount = rng.uniform(0.0, 0.3) * ragged / (ragged.std() + 1e-9)
+    soft = gaussian_filter(mask, 0.7)
+    border = 4 * gaussian_filter(mask, 1.5) * (1 - gaussian_filter(mask, 1.5))
+    kept = np.clip(4 * (soft - 0.5 + amount * border * (dirt > 0.75)) + 0.5, 0, 1)
+    if dirt > 0.93 and rng.random() < 0.7:
+        edge = int(rng.integers(2, SIZE // 5))
+        turns = int(rng.integers(4))
+        kept = np.rot90(kept, turns).copy()
+        kept[:edge] = 0
+        kept = np.rot90(kept, -turns)
+    bright = picture[1] / np.maximum(mask, 1e-3)
+    return np.stack((kept, bright * kept * (mask > 0))).astype(np.float32)
+
+
+def normalised(picture: np.ndarray) -> np.ndarray:
+    """Return mask, and its brightness with zero mean and a spread of one half, [2, s, s]."""
+    mask, bright = picture
+    total = mask.sum() + 1e-6
+    mean = bright.sum() / total
+    away = bright - mean * mask
+    spread = np.sqrt((away * away).sum() / total)
+    return np.stack((mask, 0.5 * away / (spread + 0.03)))

@@ -1,0 +1,18 @@
+"""Points of the body that the network finds, and the template's bones that carry them."""
+
+import numpy as np
+
+from rewild4d.priors.landmarks import LANDMARKS
+
+NAMES = tuple(name for name in LANDMARKS if name not in ("jaw", "eye"))
+"""Points of `LANDMARKS`."""
+MIRRORED = {
+    name: name.replace("_left_", "_?_").replace("_right_", "_left_").replace("_?_", "_right_") for name in NAMES
+}
+"""The point of the other side by name; its own for points on the spine."""
+ROOT = tuple(NAMES.index(name) for name in ("withers", "hips"))
+
+
+def root_of(points: np.ndarray) -> np.ndarray:
+    """Return the middle of withers and hips, [..., L, 3] -> [..., 3]."""
+    return np.asarray(points[..., ROOT, :].mean(axis=-2))
