@@ -15,7 +15,7 @@ from torch import Tensor
 from rewild4d.datasets.builtin.zoo.varied import VariedAnimal, draw_animal, draw_clip
 from rewild4d.datasets.rigs.animal import Surface
 from rewild4d.priors.learned.drawing import draw
-from rewild4d.priors.learned.points import MIRRORED, NAMES, root_of
+from rewild4d.priors.learned.points import NAMES, OTHER_SIDE, root_of
 
 SIZE = 96
 """Side of the pictures, pixels."""
@@ -50,10 +50,9 @@ class Examples:
     def mirrored(self) -> "Examples":
         """Return the sequences as a mirror shows them: left is right."""
         flip = self.points.new_tensor((-1.0, 1.0, 1.0))
-        swap = [NAMES.index(MIRRORED.get(name, name)) for name in NAMES]
         return Examples(
             self.pictures.flip(-1), flip[:, None] * self.rotations * flip, self.openings, self.known,
-            self.points[..., swap, :] * flip,
+            self.points[..., OTHER_SIDE, :] * flip,
         )  # fmt: skip
 
     def chosen(self, rows: Tensor) -> "Examples":

@@ -10,6 +10,8 @@ MIRRORED = {
     name: name.replace("_left_", "_?_").replace("_right_", "_left_").replace("_?_", "_right_") for name in NAMES
 }
 """The point of the other side by name; its own for points on the spine."""
+OTHER_SIDE = [NAMES.index(name) for name in MIRRORED.values()]
+"""Row of the point of the other side of each of `NAMES`."""
 ROOT = tuple(NAMES.index(name) for name in ("withers", "hips"))
 
 

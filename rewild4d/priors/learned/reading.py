@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import cv2
 import numpy as np
@@ -13,7 +12,7 @@ from torch import Tensor
 from rewild4d.errors import UserError
 from rewild4d.priors.learned.examples import LENGTH, LEVEL, MARGIN, SIZE, Examples, looking_at, normalised
 from rewild4d.priors.learned.network import PointNetwork
-from rewild4d.priors.learned.points import NAMES
+from rewild4d.priors.learned.points import NAMES, OTHER_SIDE
 from rewild4d.priors.learned.training import found
 from rewild4d.priors.silhouettes import known_camera, mask_box, square_around
 from rewild4d.types import Frame
@@ -87,18 +86,11 @@ def _found(network: PointNetwork, shown: Examples) -> tuple[Tensor, Tensor]:
         part = Examples(*(value if value.ndim == 1 else value[:, rows] for value in vars(shown).values()))
         direct, flipped = found(network, part), found(network, part.mirrored())
         back = Examples(part.pictures, part.rotations, part.openings, part.known, flipped.points).mirrored()
-        swapped = flipped.spreads[..., _mirrored_rows(), :]
+        swapped = flipped.spreads[..., OTHER_SIDE, :]
         points[rows] += 0.5 * (direct.points[0] + back.points[0])
         spreads[rows] += 0.5 * (direct.spreads[0] + swapped[0])
         seen[rows] += 1
     return points / seen, spreads / seen
-
-
-@cache
-def _mirrored_rows() -> list[int]:
-    from rewild4d.priors.learned.points import MIRRORED
-
-    return [NAMES.index(MIRRORED[name]) for name in NAMES]
 
 
 def _upright(up: np.ndarray, ahead: np.ndarray) -> np.ndarray:

@@ -28,6 +28,8 @@ COOLING = 0.3
 """Last share of the steps, over which it falls to a hundredth."""
 AVERAGE = 0.998
 """Decay of the running mean of the weights, which is what is kept."""
+STREAM = 3881
+"""Start of every seed here, so that no animal is one of the zoo's seeds."""
 CHECKED = 12
 """Animals that measure the error; drawn from numbers that no round uses."""
 
@@ -60,7 +62,7 @@ class _Animals(Dataset[Examples]):
 
     def __getitem__(self, row: int) -> Examples:
         torch.set_num_threads(1)
-        return draw_sequences(np.random.default_rng((self.seed, self.numbers[row])))
+        return draw_sequences(np.random.default_rng((STREAM, self.seed, 1, self.numbers[row])))
 
 
 @dataclass
@@ -100,9 +102,9 @@ def train(folder: Path, config: TrainingConfig, *, workers: int, every: int, rep
     """
     torch.manual_seed(config.seed)
     progress = _resumed(folder, config)
-    checked = joined([draw_sequences(np.random.default_rng((config.seed, 0, k))) for k in range(CHECKED)])
+    checked = joined([draw_sequences(np.random.default_rng((STREAM, config.seed, 0, k))) for k in range(CHECKED)])
     first = progress.round * ANIMALS
-    animals = _Animals(config.seed + 1, range(first, config.rounds * ANIMALS))
+    animals = _Animals(config.seed, range(first, config.rounds * ANIMALS))
     loader = DataLoader(animals, batch_size=ANIMALS, collate_fn=joined, num_workers=workers,
                         prefetch_factor=4 if workers else None)  # fmt: skip
     began = time.monotonic() - (progress.curve[-1]["seconds"] if progress.curve else 0.0)
@@ -166,7 +168,8 @@ def measured(network: PointNetwork, examples: Examples) -> dict[str, float]:
     away = (torch.cat(parts) - examples.points).abs()
     row: dict[str, float] = {}
     for name, rows in (("known", examples.known), ("unknown", ~examples.known)):
-        row |= {f"{name}_across": _mean(away[rows][..., :2]), f"{name}_along": _mean(away[rows][..., 2])}
+        if rows.any():
+            row |= {f"{name}_across": _mean(away[rows][..., :2]), f"{name}_along": _mean(away[rows][..., 2])}
     network.train()
     return row
 
