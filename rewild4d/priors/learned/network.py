@@ -17,7 +17,7 @@ VECTORS = 48
 """Features that are directions in space: three numbers each, turned with the camera."""
 HEADS, BLOCKS, REACH = 4, 3, 32
 """Attention heads and blocks; frames apart beyond which the learned bias is that of the last."""
-ALONE = 0.3
+ALONE = 3.0
 """Weight of the error of what each picture says alone."""
 
 
@@ -54,7 +54,7 @@ class _Residual(nn.Module):
 
 
 class _Eye(nn.Module):
-    """A picture [n, 2, 96, 96] and what is known of its camera [n, 5] -> features [n, F], heat and depth maps."""
+    """A picture [n, 2, 96, 96] and what is known of its camera [n, 5] -> features [n, F], heat maps and depths."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -71,7 +71,7 @@ class _Eye(nn.Module):
         self.smooth = nn.ModuleList(
             (nn.Sequential(*_block(middle, middle, 3, 1)), nn.Sequential(*_block(fine, 2 * fine, 3, 1)))
         )
-        self.maps = nn.Conv2d(2 * fine, 2 * len(NAMES), 1)
+        self.heat, self.depth = nn.Conv2d(2 * fine, len(NAMES), 1), nn.Linear(FEATURES, len(NAMES))
 
     def forward(self, pictures: Tensor, camera: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         x, kept = pictures.contiguous(memory_format=torch.channels_last), []
@@ -81,16 +81,18 @@ class _Eye(nn.Module):
         features = self.last(torch.cat((x.flatten(1).float(), camera), dim=1))
         x = self.smooth[0](kept[1] + interpolate(self.lateral[0](kept[2]), scale_factor=2.0))
         x = kept[0] + interpolate(self.lateral[1](x), scale_factor=2.0) + self.whole(features)[..., None, None]
-        heat, depth = self.maps(self.smooth[1](x)).float().flatten(2).chunk(2, dim=1)
-        return features, heat, depth
+        return features, self.heat(self.smooth[1](x)).float().flatten(2), self.depth(features)
 
 
-def _read_maps(heat: Tensor, depth: Tensor, openings: Tensor) -> tuple[Tensor, Tensor]:
-    """Return points [n, L, 3] and the width of their heat [n, L] from maps [n, L, MAP * MAP] and openings [n]."""
-    share = heat.softmax(-1)
+def _read_maps(heat: Tensor, along: Tensor, openings: Tensor) -> tuple[Tensor, Tensor]:
+    """Return points [n, L, 3] and the width of their heat [n, L].
+
+    From heat maps [n, L, MAP * MAP], depths [n, L] and openings [n].
+    """
+    share, along = heat.softmax(-1), along.float()
     line = (torch.arange(MAP, device=heat.device) + 0.5) * (2 / MAP) - 1
     grid = torch.stack((line.expand(MAP, MAP), line[:, None].expand(MAP, MAP)), -1).reshape(-1, 2)
-    place, along = share @ grid, (share * depth).sum(-1)
+    place = share @ grid
     width = (share @ grid.square() - place.square()).sum(-1).clamp_min(1e-6).sqrt()
     # the picture shows x over 1 + z times the opening
     across = place * (1 + along * openings[:, None]).clamp_min(0.3)[..., None]
@@ -168,4 +170,4 @@ def loss(found: Found, points: Tensor) -> Tensor:
     away = (found.points - points).abs()
     error = torch.stack((away[..., :2].mean(-1), away[..., 2]), dim=-1)
     alone = (found.alone - points).abs().mean()
-    return (error / found.spreads + found.spreads.log()).mean() + ALONE * alone / 0.05
+    return (error / found.spreads + found.spreads.log()).mean() + ALONE * alone
