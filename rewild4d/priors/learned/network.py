@@ -8,7 +8,7 @@ from torch.nn.functional import gelu, interpolate, relu, scaled_dot_product_atte
 
 from rewild4d.priors.learned.points import NAMES
 
-STAGES = ((48, 1), (96, 1), (192, 2), (256, 1))
+STAGES = ((32, 1), (64, 1), (128, 2), (256, 1))
 """Width and residual blocks of each stage of the encoder; each but the first halves the picture."""
 MAP = 24
 """Side of the heat maps: a quarter of the picture's."""

@@ -19,7 +19,7 @@ from rewild4d.priors.learned.examples import Examples, draw_sequences, joined
 from rewild4d.priors.learned.network import Found, PointNetwork, loss
 
 ANIMALS = 8
-"""Animals of a round: each has `CLIPS` sequences, of which half are seen in a mirror."""
+"""Animals of a round: each has `CLIPS` sequences, which are seen plain and in a mirror."""
 BATCH = 16
 """Sequences of a step."""
 WARMUP = 200
@@ -44,7 +44,7 @@ class TrainingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         seed: of all animals and of the weights.
     """
 
-    rounds: int = 5000
+    rounds: int = 4000
     learning_rate: float = 1e-3
     weight_decay: float = 0.02
     seed: int = 0
@@ -122,10 +122,9 @@ def train(folder: Path, config: TrainingConfig, *, workers: int, every: int, rep
 
 
 def _round(progress: Progress, animals: Examples, config: TrainingConfig) -> float:
-    """Take a step for each batch of the round's sequences, half of them mirrored; return the mean loss."""
+    """Take a step for each batch of the round's sequences, plain and mirrored; return the mean loss."""
     generator = torch.Generator().manual_seed(1000 * config.seed + progress.round)
-    half = torch.randperm(len(animals.known), generator=generator).chunk(2)
-    both = joined([animals.chosen(half[0]), animals.chosen(half[1]).mirrored()])
+    both = joined([animals, animals.mirrored()])
     order = torch.randperm(len(both.known), generator=generator)
     steps = len(order) // BATCH
     losses = []
