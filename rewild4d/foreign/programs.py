@@ -64,8 +64,8 @@ def run_foreign(
     with _opened(log) as file, _watchdog() as watch:
         kept = BoundedLog(file)
         process = _start(words, stdout, flag, environment)
+        watch(process.pid)  # before all else: a signal may come at any time
         with _pumped(process.stderr if stdout else process.stdout, kept), _ended(process):
-            watch(process.pid)
             try:
                 status = process.wait(timeout)
             except subprocess.TimeoutExpired as error:
@@ -176,8 +176,8 @@ def _pumped(pipe: IO[bytes] | None, kept: BoundedLog) -> Iterator[None]:
 
 @contextmanager
 def _watchdog() -> Iterator[Callable[[int], None]]:
-    """Give a function that takes the number of a program, and have it killed where this process is killed, which no
-    `finally` outlives. Windows has no groups of processes."""
+    """Give a function that takes the number of a program, and have it killed at the block's end or when this process is
+    killed, which no `finally` outlives. Windows has no groups of processes."""
     if not hasattr(os, "killpg"):
         yield lambda _: None
         return
@@ -194,9 +194,8 @@ def _watchdog() -> Iterator[Callable[[int], None]]:
     try:
         yield watch
     finally:
-        shell.kill()
+        pipe.close()  # at its end the shell kills what is left of a program that it was told
         shell.wait()
-        pipe.close()
 
 
 @contextmanager

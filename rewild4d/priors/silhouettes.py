@@ -77,7 +77,7 @@ def crop_targets(frames: Sequence[Frame], timesteps: Sequence[int], world: Tenso
         box = mask_box(frame.mask[0] > 0.5)
         if box is None:
             continue
-        left, top, side = square_around(*box)
+        left, top, side = _square(*box)
         camera = camera_in_object(known_camera(frame, name), world)
         cameras.append(camera.shifted(left, top, side, side).resized(size, size))
         inside = torch.ones_like(frame.mask[0])
@@ -101,9 +101,9 @@ def mask_box(shown: Tensor) -> tuple[int, int, int, int] | None:
     return int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1
 
 
-def square_around(left: int, top: int, right: int, bottom: int, margin: float = CROP_MARGIN) -> tuple[int, int, int]:
+def _square(left: int, top: int, right: int, bottom: int) -> tuple[int, int, int]:
     """Return the left, top and side of the crop around a box; it may extend beyond the image."""
-    side = round(max(right - left, bottom - top) * (1 + 2 * margin)) + 2
+    side = round(max(right - left, bottom - top) * (1 + 2 * CROP_MARGIN)) + 2
     return (left + right - side) // 2, (top + bottom - side) // 2, side
 
 

@@ -14,7 +14,7 @@ from rewild4d.priors.learned.examples import LENGTH, LEVEL, MARGIN, SIZE, Exampl
 from rewild4d.priors.learned.network import PointNetwork
 from rewild4d.priors.learned.points import NAMES, OTHER_SIDE
 from rewild4d.priors.learned.training import found
-from rewild4d.priors.silhouettes import known_camera, mask_box, square_around
+from rewild4d.priors.silhouettes import known_camera, mask_box
 from rewild4d.types import Frame
 
 FINEST = 4
@@ -106,9 +106,10 @@ def _view(frame: Frame, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
     """Return the network's picture of a frame, the rotation from the world, the camera's centre, and the opening."""
     camera, box = known_camera(frame, name), mask_box(frame.mask[0] > 0.5)
     assert box is not None
-    left, top, side = square_around(*box, MARGIN)
+    left, top, right, bottom = box
+    side = max(right - left, bottom - top) * (1 + 2 * MARGIN)
     intrinsics, extrinsics = camera.intrinsics.double().numpy(), camera.world_to_camera.double().numpy()
-    middle = np.linalg.solve(intrinsics, (left + side / 2, top + side / 2, 1.0))
+    middle = np.linalg.solve(intrinsics, ((left + right) / 2, (top + bottom) / 2, 1.0))
     turn = looking_at(middle[:2])
     opening = 0.5 * side / math.sqrt(intrinsics[0, 0] * intrinsics[1, 1]) / (1 + float(middle[:2] @ middle[:2]))
     samples = min(FINEST, max(1, math.ceil(side / SIZE)))
