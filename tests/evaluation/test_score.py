@@ -268,17 +268,6 @@ def test_clouds_are_aligned_and_measured(score: Call, tmp_path: Path, capsys: py
     )
 
 
-def test_points_that_are_listed_again_change_no_score_of_clouds(score: Call, tmp_path: Path) -> None:
-    """The front half of the truth, nine times more: the scale was 1.6 before alignments left density aside."""
-    points = torch.rand(900, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    points = points * torch.tensor((1.0, 0.4, 2.0)).double() + (points[:, :1] * points[:, 2:]) ** 2
-    again = torch.cat((points, points[points[:, 2] > points[:, 2].median()].repeat(9, 1)))
-    truth = ascii_ply(tmp_path / "t.ply", points)
-    found = score("--pred", ascii_ply(tmp_path / "p.ply", again), "--truth", truth, "--up", "y")
-    assert found["scores"]["fscore_1"]["value"] == 1.0
-    assert "aligned by scale 1 (" in found["notes"][0]
-
-
 def test_the_real_networks_without_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name in ("REWILD4D_WEIGHTS", "REWILD4D_CACHE", "TORCH_HOME"):
         monkeypatch.setenv(name, str(tmp_path / name))
