@@ -17,7 +17,7 @@ VECTORS = 48
 """Features that are directions in space: three numbers each, turned with the camera."""
 HEADS, BLOCKS, REACH = 4, 3, 32
 """Attention heads and blocks; frames apart beyond which the learned bias is that of the last."""
-ALONE = 3.0
+ALONE = 1.0
 """Weight of the error of what each picture says alone."""
 
 
@@ -36,9 +36,8 @@ class Found:
     alone: Tensor
 
 
-def _block(before: int, width: int, size: int, stride: int) -> list[nn.Module]:
-    padding = (size - stride + 1) // 2 if size > stride else 0
-    return [nn.Conv2d(before, width, size, stride, padding, bias=False), nn.GroupNorm(8, width), nn.ReLU()]
+def _block(before: int, width: int, stride: int) -> list[nn.Module]:
+    return [nn.Conv2d(before, width, 3, stride, 1, bias=False), nn.GroupNorm(8, width), nn.ReLU()]
 
 
 class _Residual(nn.Module):
@@ -60,7 +59,9 @@ class _Eye(nn.Module):
         super().__init__()
         stages, before = [], 2
         for index, (width, blocks) in enumerate(STAGES):
-            entry = _block(before, width, 4, 4) if index == 0 else _block(before, width, 3, 2)
+            entry = _block(before, width, 2)
+            if index == 0:
+                entry = [*_block(before, width // 2, 2), *_block(width // 2, width, 2)]
             stages.append(nn.Sequential(*entry, *(_Residual(width) for _ in range(blocks))))
             before = width
         self.stages = nn.ModuleList(stages)
@@ -69,7 +70,7 @@ class _Eye(nn.Module):
         self.lateral = nn.ModuleList((nn.Conv2d(coarse, middle, 1), nn.Conv2d(middle, fine, 1)))
         self.whole = nn.Linear(FEATURES, fine)
         self.smooth = nn.ModuleList(
-            (nn.Sequential(*_block(middle, middle, 3, 1)), nn.Sequential(*_block(fine, 2 * fine, 3, 1)))
+            (nn.Sequential(*_block(middle, middle, 1)), nn.Sequential(*_block(fine, 2 * fine, 1)))
         )
         self.heat, self.depth = nn.Conv2d(2 * fine, len(NAMES), 1), nn.Linear(FEATURES, len(NAMES))
 
@@ -155,7 +156,7 @@ class PointNetwork(nn.Module):
         mixed = _turned(self.exit(x), rotations)
         read = self.reading(torch.cat((each, mixed, alone.detach().flatten(-2), width), dim=-1))
         read = read.unflatten(-1, (len(NAMES), 5))
-        return Found(alone.detach() + read[..., :3], torch.exp(read[..., 3:].clamp(-6, 3) - 2), alone)
+        return Found(alone + read[..., :3], torch.exp(read[..., 3:].clamp(-6, 3) - 2), alone)
 
 
 def _turned(features: Tensor, rotations: Tensor) -> Tensor:
