@@ -93,14 +93,12 @@ class TrainOptions:
         rounds: of eight animals each; the learning rate falls over all of them.
         seed: of the animals and of the first weights.
         workers: processes that draw animals beside the one that trains; 0 draws in the same.
-        every: rounds between measurements, each of which writes the checkpoint.
     """
 
     out: Path
     rounds: int = 4000
     seed: int = 0
     workers: int = 1
-    every: int = 20
 
 
 def main(arguments: list[str]) -> int:
@@ -124,16 +122,15 @@ def _import(arguments: list[str]) -> int:
 
 def _train(arguments: list[str]) -> int:
     options = parse_flags(TrainOptions, arguments, prog="rewild4d-bench prior train", description=TRAIN)
-    for name in ("rounds", "every"):
-        if getattr(options, name) < 1:
-            raise UserError(f"--{name}: expected 1 or more, got {getattr(options, name)}.")
+    if options.rounds < 1:
+        raise UserError(f"--rounds: expected 1 or more, got {options.rounds}.")
     if options.workers < 0:
         raise UserError(f"--workers: expected 0 or more, got {options.workers}.")
     require_writable_file(options.out / "weights.safetensors")
     from rewild4d.priors.learned.training import TrainingConfig, train
 
     config = TrainingConfig(rounds=options.rounds, seed=options.seed)
-    print(train(options.out, config, workers=options.workers, every=options.every, report=print))
+    print(train(options.out, config, workers=options.workers, report=print))
     return 0
 
 

@@ -103,7 +103,7 @@ FOOTAGE = PriorConfig(
 def with_points(config: PriorConfig) -> PriorConfig:
     """Return the settings of a fit that has a network's points too: they speak of motion that masks leave open."""
     return msgspec.structs.replace(
-        config, points_weight=0.15, angle_weight=0.03, root_weight=0.05, root_period=2, gait_weight=0.0
+        config, points_weight=0.05, angle_weight=0.03, root_weight=0.05, root_period=2, gait_weight=0.0
     )
 
 

@@ -23,7 +23,7 @@ COARSER = 1.6
 SPREAD = 0.16
 """Spread of the proportions about their kinds'; see `bodies.jittered`."""
 FOUR_FOOTED = tuple(name for name, kind in KINDS.items() if kind.proportions.stance == "four")
-EXTRAS = tuple({extra for name in FOUR_FOOTED for extra in KINDS[name].proportions.extras} - {"trunk", "tusks"})
+EXTRAS = sorted({extra for name in FOUR_FOOTED for extra in KINDS[name].proportions.extras} - {"trunk", "tusks"})
 FOOTFALLS = ((0.0, 0.25, 0.5, 0.75), (0.0, 0.5, 0.5, 0.0), (0.0, 0.0, 0.5, 0.5), (0.0, 0.42, 0.1, 0.54),
              (0.0, 0.5, 0.0, 0.5))  # fmt: skip
 """Touchdown of the feet in a walk, trot, pace, gallop and bound."""

@@ -1,68 +1,20 @@
-"""Examples to train on: sequences of small masked pictures of random animals, and where points of their bodies are.
-
-A picture is that of a camera that looks along the middle of its square crop, so that neither the focal length nor the
-crop's place in the frame matter: only its opening does. Points are in that camera's axes (x right, y down, z ahead) in
-units of half the crop's width at the depth of the animal's root.
-"""
-
-from dataclasses import dataclass
+"""Draw examples to train on: sequences of random animals under random cameras, and where their points are."""
 
 import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter
-from torch import Tensor
 
+from rewild4d.datasets import surface_nets
+from rewild4d.datasets.builtin.gait import rotation
 from rewild4d.datasets.builtin.zoo.varied import VariedAnimal, draw_animal, draw_clip
 from rewild4d.datasets.rigs.animal import Surface
 from rewild4d.priors.learned.drawing import draw
-from rewild4d.priors.learned.points import NAMES, OTHER_SIDE, root_of
+from rewild4d.priors.learned.pictures import LENGTH, LEVEL, MARGIN, SIZE, Examples, joined, looking_at, normalised
+from rewild4d.priors.learned.points import NAMES, root_of
+from rewild4d.transforms import look_at
 
-SIZE = 96
-"""Side of the pictures, pixels."""
-MARGIN = 0.1
-"""Of the crops around the mask's box, as a share of its side."""
-LENGTH = 16
-"""Frames of a sequence."""
-LEVEL = np.diag((1.0, -1.0, -1.0))
-"""Rotation that stands for that of an unknown camera, world (y up) -> camera, [3, 3]."""
 CLIPS = 8
 """Sequences of each animal."""
-
-
-@dataclass
-class Examples:
-    """A batch of sequences.
-
-    Attributes:
-        pictures: mask, and brightness inside it (zero mean, spread one half; all zero where unknown), [b, t, 2, s, s].
-        rotations: world (y up, any heading) -> camera axes of each picture, [b, t, 3, 3].
-        openings: half the crop's width at unit depth, [b, t].
-        known: whether cameras are known; where not, rotations are those of one level camera, bool, [b].
-        points: of the body, [b, t, L, 3].
-    """
-
-    pictures: Tensor
-    rotations: Tensor
-    openings: Tensor
-    known: Tensor
-    points: Tensor
-
-    def mirrored(self) -> "Examples":
-        """Return the sequences as a mirror shows them: left is right."""
-        flip = self.points.new_tensor((-1.0, 1.0, 1.0))
-        return Examples(
-            self.pictures.flip(-1), flip[:, None] * self.rotations * flip, self.openings, self.known,
-            self.points[..., OTHER_SIDE, :] * flip,
-        )  # fmt: skip
-
-    def chosen(self, rows: Tensor) -> "Examples":
-        """Return some of the sequences, int64, [m]."""
-        return Examples(*(value[rows] for value in vars(self).values()))
-
-
-def joined(parts: list[Examples]) -> Examples:
-    """Stack batches."""
-    return Examples(*(torch.cat([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
 
 def draw_sequences(rng: np.random.Generator, count: int = CLIPS, length: int = LENGTH) -> Examples:
@@ -98,15 +50,7 @@ def _shades(surface: Surface, rng: np.random.Generator) -> np.ndarray:
     """Return the brightness of every vertex of a surface at rest, under a light of random direction, [n]."""
     grey = surface.colors @ rng.dirichlet((2, 2, 2))
     light = rng.normal(0, 1, 3) + (0, 1, 0)
-    cross = np.cross(
-        surface.vertices[surface.faces[:, 1]] - surface.vertices[surface.faces[:, 0]],
-        surface.vertices[surface.faces[:, 2]] - surface.vertices[surface.faces[:, 0]],
-    )
-    normals = np.zeros_like(surface.vertices)
-    for corner in range(3):
-        np.add.at(normals, surface.faces[:, corner], cross)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
-    facing = normals @ light / np.linalg.norm(light)
+    facing = surface_nets.normals(surface.vertices, surface.faces) @ light / np.linalg.norm(light)
     return np.asarray(grey * (1 + rng.uniform(0.1, 0.5) * facing), np.float32)
 
 
@@ -122,20 +66,17 @@ class _Place:
             self.yaws = rng.uniform(0, 2 * np.pi, length)
         tilt, drift = rng.uniform(-8, 40) if rng.random() < 0.9 else rng.uniform(-25, 75), rng.normal(0, 0.4)
         self.tilts = np.radians(tilt + drift * np.arange(length))
-        self.rolls = np.radians(rng.normal(0, 2.0) + rng.normal(0, 0.3, length))
+        self.rolls = rng.normal(0, 2.0) + rng.normal(0, 0.3, length)
         self.distance = radius * float(np.exp(rng.uniform(np.log(2.2), np.log(12.0))))
-        self.heading = rng.uniform(0, 2 * np.pi)
+        self.heading = rng.uniform(0, 360)
         self.dirt = rng.random()
 
     def camera(self, t: int) -> np.ndarray:
         """Return the rotation body frame -> camera axes at a frame, [3, 3]."""
-        yaw, tilt, roll = self.yaws[t], self.tilts[t], self.rolls[t]
-        ahead = -np.array((np.sin(yaw) * np.cos(tilt), np.sin(tilt), np.cos(yaw) * np.cos(tilt)))
-        right = np.cross(ahead, (0.0, 1.0, 0.0))
-        right /= np.linalg.norm(right)
-        axes = np.stack((right, np.cross(ahead, right), ahead))
-        spin = np.array(((np.cos(roll), -np.sin(roll), 0), (np.sin(roll), np.cos(roll), 0), (0, 0, 1)))
-        return np.asarray(spin @ axes)
+        yaw, tilt = self.yaws[t], self.tilts[t]
+        eye = torch.tensor((np.sin(yaw) * np.cos(tilt), np.sin(tilt), np.cos(yaw) * np.cos(tilt)))
+        axes = look_at(eye, torch.zeros(3).double(), torch.tensor((0.0, 1.0, 0.0)).double())[:3, :3].numpy()
+        return np.asarray(rotation(0.0, 0.0, self.rolls[t]) @ axes)
 
     def seen(
         self, t: int, vertices: np.ndarray, points: np.ndarray, faces: np.ndarray, shades: np.ndarray,
@@ -152,19 +93,10 @@ class _Place:
         opening = half / (1 + center @ center)
         flat = np.concatenate((0.5 + 0.5 * seen[:, :2] / seen[:, 2:] / opening, seen[:, 2:]), axis=1)
         picture = soiled(draw(flat.astype(np.float32), faces, shades, SIZE), self.dirt, rng)
-        turned = np.array(((np.cos(self.heading), 0, np.sin(self.heading)), (0, 1, 0),
-                           (-np.sin(self.heading), 0, np.cos(self.heading))))  # fmt: skip
+        turned = rotation(0.0, self.heading, 0.0)
         depth = root_of(marks)[2]
         scaled = (marks - (0.0, 0.0, depth)) / (opening * depth)
         return normalised(picture), turn @ axes @ turned.T, float(opening), scaled
-
-
-def looking_at(center: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation that turns the ray through (x, y, 1) to the z axis, [2] -> [3, 3]."""
-    ray = np.append(center, 1.0) / np.sqrt(1 + center @ center)
-    cross = np.array((ray[1], -ray[0], 0.0))
-    skew = np.array(((0, 0, cross[1]), (0, 0, -cross[0]), (-cross[1], cross[0], 0)))
-    return np.asarray(np.eye(3) + skew + skew @ skew / (1 + ray[2]))
 
 
 def soiled(picture: np.ndarray, dirt: float, rng: np.random.Generator) -> np.ndarray:
@@ -185,13 +117,3 @@ def soiled(picture: np.ndarray, dirt: float, rng: np.random.Generator) -> np.nda
         kept = np.rot90(kept, -turns)
     bright = picture[1] / np.maximum(mask, 1e-3)
     return np.stack((kept, bright * kept * (mask > 0))).astype(np.float32)
-
-
-def normalised(picture: np.ndarray) -> np.ndarray:
-    """Return mask, and its brightness with zero mean and a spread of one half, [2, s, s]."""
-    mask, bright = picture
-    total = mask.sum() + 1e-6
-    mean = bright.sum() / total
-    away = bright - mean * mask
-    spread = np.sqrt((away * away).sum() / total)
-    return np.stack((mask, 0.5 * away / (spread + 0.03)))

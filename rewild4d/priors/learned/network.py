@@ -6,6 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import gelu, interpolate, relu, scaled_dot_product_attention
 
+from rewild4d.kernels.compiling import compiled_for
+from rewild4d.priors.learned.pictures import LENGTH, Examples
 from rewild4d.priors.learned.points import NAMES
 
 STAGES = ((32, 1), (64, 1), (128, 2), (256, 1))
@@ -15,7 +17,7 @@ MAP = 24
 FEATURES = 256
 VECTORS = 48
 """Features that are directions in space: three numbers each, turned with the camera."""
-HEADS, BLOCKS, REACH = 4, 3, 32
+HEADS, BLOCKS, REACH = 4, 3, LENGTH - 1
 """Attention heads and blocks; frames apart beyond which the learned bias is that of the last."""
 ALONE = 1.0
 """Weight of the error of what each picture says alone."""
@@ -122,7 +124,7 @@ class _Attention(nn.Module):
 
 
 class PointNetwork(nn.Module):
-    """Pictures, rotations, openings and whether cameras are known (see `examples.Examples`) -> `Found`.
+    """Pictures, rotations, openings and whether cameras are known (see `pictures.Examples`) -> `Found`.
 
     What each picture says alone, its points and the features that are directions, is turned into the world before
     frames are compared, and back into each camera afterwards: what one frame sees from the side tells another its
@@ -172,3 +174,10 @@ def loss(found: Found, points: Tensor) -> Tensor:
     error = torch.stack((away[..., :2].mean(-1), away[..., 2]), dim=-1)
     alone = (found.alone - points).abs().mean()
     return (error / found.spreads + found.spreads.log()).mean() + ALONE * alone
+
+
+def found(network: PointNetwork, examples: Examples) -> Found:
+    """Run the network on a batch, in bfloat16 where the processor multiplies it."""
+    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=compiled_for("avx512bf16")):
+        result: Found = network(examples.pictures, examples.rotations, examples.openings, examples.known)
+    return Found(result.points.float(), result.spreads.float(), result.alone.float())

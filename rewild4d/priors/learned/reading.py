@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from rewild4d.errors import UserError
-from rewild4d.priors.learned.examples import LENGTH, LEVEL, MARGIN, SIZE, Examples, looking_at, normalised
-from rewild4d.priors.learned.network import PointNetwork
+from rewild4d.priors.learned.network import PointNetwork, found
+from rewild4d.priors.learned.pictures import LENGTH, LEVEL, MARGIN, SIZE, Examples, looking_at, normalised
 from rewild4d.priors.learned.points import NAMES, OTHER_SIDE
-from rewild4d.priors.learned.training import found
 from rewild4d.priors.silhouettes import known_camera, mask_box
 from rewild4d.types import Frame
 

@@ -1,6 +1,7 @@
 """Train the network on rounds of fresh random animals, with a learning curve and a checkpoint from which it goes on."""
 
 import json
+import pickle
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,14 +15,17 @@ from torch.utils.data import DataLoader, Dataset
 
 from rewild4d.errors import UserError
 from rewild4d.files import atomic
-from rewild4d.kernels.compiling import compiled_for
-from rewild4d.priors.learned.examples import Examples, draw_sequences, joined
-from rewild4d.priors.learned.network import Found, PointNetwork, loss
+from rewild4d.priors.learned.examples import draw_sequences
+from rewild4d.priors.learned.network import PointNetwork, found, loss
+from rewild4d.priors.learned.pictures import Examples, joined
+from rewild4d.priors.learned.weights import save_weights
 
 ANIMALS = 8
 """Animals of a round: each has `CLIPS` sequences, which are seen plain and in a mirror."""
 BATCH = 16
 """Sequences of a step."""
+LEARNING_RATE, WEIGHT_DECAY = 1e-3, 0.02
+"""Of AdamW, the first at its highest."""
 WARMUP = 200
 """Steps over which the learning rate rises."""
 COOLING = 0.3
@@ -30,6 +34,8 @@ AVERAGE = 0.998
 """Decay of the running mean of the weights, which is what is kept."""
 STREAM = 3881
 """Start of every seed here, so that no animal is one of the zoo's seeds."""
+EVERY = 20
+"""Rounds between measurements, each of which writes the checkpoint."""
 CHECKED = 12
 """Animals that measure the error; drawn from numbers that no round uses."""
 
@@ -39,14 +45,10 @@ class TrainingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         rounds: of `ANIMALS` animals.
-        learning_rate: of AdamW at its highest.
-        weight_decay: of AdamW.
         seed: of all animals and of the weights.
     """
 
     rounds: int = 4000
-    learning_rate: float = 1e-3
-    weight_decay: float = 0.02
     seed: int = 0
 
 
@@ -66,7 +68,7 @@ class _Animals(Dataset[Examples]):
 
 
 @dataclass
-class Progress:
+class Training:
     """What a training has done.
 
     Attributes:
@@ -84,14 +86,13 @@ class Progress:
     curve: list[dict[str, float]]
 
 
-def train(folder: Path, config: TrainingConfig, *, workers: int, every: int, report: Callable[[str], None]) -> Path:
+def train(folder: Path, config: TrainingConfig, *, workers: int, report: Callable[[str], None]) -> Path:
     """Train, or go on from the folder's checkpoint, until all rounds are done.
 
     Args:
         folder: for checkpoint.pt, curve.json and weights.safetensors.
         config: settings; those of a checkpoint must be the same.
         workers: processes that draw animals.
-        every: rounds between measurements, each of which writes the checkpoint.
         report: called with a line for each measurement.
 
     Returns:
@@ -112,7 +113,7 @@ def train(folder: Path, config: TrainingConfig, *, workers: int, every: int, rep
     for batch in loader:
         losses.append(_round(progress, batch, config))
         progress.round += 1
-        if progress.round % every == 0 or progress.round == config.rounds:
+        if progress.round % EVERY == 0 or progress.round == config.rounds:
             row = {"round": progress.round, "seconds": time.monotonic() - began, "loss": float(np.mean(losses))}
             progress.curve.append(row | measured(progress.mean, checked))
             losses.clear()
@@ -121,7 +122,7 @@ def train(folder: Path, config: TrainingConfig, *, workers: int, every: int, rep
     return folder / "weights.safetensors"
 
 
-def _round(progress: Progress, animals: Examples, config: TrainingConfig) -> float:
+def _round(progress: Training, animals: Examples, config: TrainingConfig) -> float:
     """Take a step for each batch of the round's sequences, plain and mirrored; return the mean loss."""
     generator = torch.Generator().manual_seed(1000 * config.seed + progress.round)
     both = joined([animals, animals.mirrored()])
@@ -131,7 +132,7 @@ def _round(progress: Progress, animals: Examples, config: TrainingConfig) -> flo
     for index, rows in enumerate(order.split(BATCH)):
         step = progress.round * steps + index
         for group in progress.optimizer.param_groups:
-            group["lr"] = config.learning_rate * _warmth(step, config.rounds * steps)
+            group["lr"] = LEARNING_RATE * _warmth(step, config.rounds * steps)
         value = loss(found(progress.network, both.chosen(rows)), both.points[rows])
         progress.optimizer.zero_grad()
         value.backward()  # type: ignore[no-untyped-call]
@@ -152,13 +153,6 @@ def _average(mean: PointNetwork, network: PointNetwork, decay: float) -> None:
     torch._foreach_lerp_(list(mean.parameters()), list(network.parameters()), 1 - decay)
 
 
-def found(network: PointNetwork, examples: Examples) -> Found:
-    """Run the network on a batch, in bfloat16 where the processor multiplies it."""
-    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=compiled_for("avx512bf16")):
-        result: Found = network(examples.pictures, examples.rotations, examples.openings, examples.known)
-    return Found(result.points.float(), result.spreads.float(), result.alone.float())
-
-
 @torch.no_grad()
 def measured(network: PointNetwork, examples: Examples) -> dict[str, float]:
     """Return mean errors across and along the view, in halves of the crop, where cameras are known and not."""
@@ -177,16 +171,19 @@ def _mean(values: Tensor) -> float:
     return float(values.mean())
 
 
-def _resumed(folder: Path, config: TrainingConfig) -> Progress:
+def _resumed(folder: Path, config: TrainingConfig) -> Training:
     network, mean = PointNetwork(), PointNetwork()
     network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     mean.load_state_dict(network.state_dict())
-    optimizer = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
-    progress = Progress(network, mean, optimizer, 0, [])
+    optimizer = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+    progress = Training(network, mean, optimizer, 0, [])
     path = folder / "checkpoint.pt"
     if not path.is_file():
         return progress
-    kept = torch.load(path, weights_only=True)
+    try:
+        kept = torch.load(path, weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise UserError(f"{path}: expected a checkpoint of a training, but it cannot be read; remove it.") from error
     if kept["config"] != msgspec.to_builtins(config):
         raise UserError(f"{path}: expected a training with {msgspec.to_builtins(config)}, got {kept['config']}.")
     network.load_state_dict(kept["network"])
@@ -195,9 +192,7 @@ def _resumed(folder: Path, config: TrainingConfig) -> Progress:
     return replace(progress, round=kept["round"], curve=kept["curve"])
 
 
-def _save(progress: Progress, folder: Path, config: TrainingConfig) -> None:
-    from rewild4d.priors.learned.weights import save_weights
-
+def _save(progress: Training, folder: Path, config: TrainingConfig) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     kept = {
         "config": msgspec.to_builtins(config), "network": progress.network.state_dict(),

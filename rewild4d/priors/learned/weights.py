@@ -31,5 +31,7 @@ def load_weights(path: Path) -> PointNetwork:
         state = load_file(path)
         network.load_state_dict({name: value.float() for name, value in state.items()})
     except (SafetensorError, RuntimeError) as error:
-        raise UserError(f"{path}: expected weights of the learned prior, but: {str(error).splitlines()[0]}") from error
+        raise UserError(
+            f"{path}: expected weights of the learned prior, but: {str(error).splitlines()[0][:200]}"
+        ) from error
     return network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]

@@ -1,5 +1,9 @@
 """What the network is trained on: pictures of random animals and where their points are."""
 
+import os
+import subprocess
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -8,7 +12,7 @@ import torch
 from rewild4d.datasets.builtin.zoo import animals, varied
 from rewild4d.datasets.builtin.zoo.points import body_points
 from rewild4d.priors.landmarks import LANDMARKS
-from rewild4d.priors.learned import examples
+from rewild4d.priors.learned import examples, pictures
 from rewild4d.priors.learned.drawing import draw
 from rewild4d.priors.learned.points import MIRRORED, NAMES, root_of
 
@@ -70,10 +74,23 @@ def test_a_sequence_is_drawn_alike_for_one_seed_and_differs_for_another() -> Non
     assert not torch.equal(first.pictures, other.pictures)
 
 
+def test_an_animal_is_the_same_in_every_process() -> None:
+    """Python's hashes differ from process to process, and with them the order of a set."""
+    code = "import numpy; from rewild4d.datasets.builtin.zoo import varied as v; "
+    code += "print([v._proportions(numpy.random.default_rng(k)) for k in range(20)])"
+    said = {
+        subprocess.run(
+            [sys.executable, "-c", code], env=os.environ | {"PYTHONHASHSEED": seed}, capture_output=True, check=True
+        ).stdout
+        for seed in ("1", "2", "3")
+    }  # fmt: skip
+    assert len(said) == 1
+
+
 def test_points_lie_on_the_animal_where_the_camera_sees_them() -> None:
     made = examples.draw_sequences(np.random.default_rng(5), 4, 4)
     inside = made.points[..., :2] / (1 + made.points[..., 2:] * made.openings[..., None, None])
-    pixels = ((0.5 * inside + 0.5) * examples.SIZE).long().clamp(0, examples.SIZE - 1)
+    pixels = ((0.5 * inside + 0.5) * pictures.SIZE).long().clamp(0, pictures.SIZE - 1)
     masks = torch.nn.functional.max_pool2d(made.pictures[:, :, 0], 7, 1, 3)
     rows = torch.arange(4)[:, None, None], torch.arange(4)[None, :, None]
     assert masks[(*rows, pixels[..., 1], pixels[..., 0])].mean() > 0.9
@@ -93,16 +110,16 @@ def test_a_mirror_exchanges_left_and_right_and_twice_is_nothing() -> None:
 
 def test_the_smallest_rotation_looks_along_the_ray() -> None:
     center = np.array((0.3, -0.2))
-    turn = examples.looking_at(center)
+    turn = pictures.looking_at(center)
     ray = np.append(center, 1) / np.linalg.norm(np.append(center, 1))
     assert turn @ ray == pytest.approx((0, 0, 1)) and turn @ turn.T == pytest.approx(np.eye(3))
     assert np.trace(turn) == pytest.approx(1 + 2 * ray[2])  # 1 + 2 cos of its angle
-    assert examples.looking_at(np.zeros(2)) == pytest.approx(np.eye(3))
+    assert pictures.looking_at(np.zeros(2)) == pytest.approx(np.eye(3))
 
 
 def test_brightness_has_no_mean_and_a_known_spread_inside_the_mask() -> None:
     mask = np.ones((4, 4), np.float32)
     bright = np.repeat(np.array((0.2, 0.8), np.float32), 8).reshape(4, 4)
-    _, found = examples.normalised(np.stack((mask, bright)))
+    _, found = pictures.normalised(np.stack((mask, bright)))
     assert sorted(set(found.ravel().round(4))) == pytest.approx([-0.5 * 0.3 / 0.33, 0.5 * 0.3 / 0.33], abs=1e-3)
-    assert np.isfinite(examples.normalised(np.zeros((2, 4, 4), np.float32))).all()
+    assert np.isfinite(pictures.normalised(np.zeros((2, 4, 4), np.float32))).all()

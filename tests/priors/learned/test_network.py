@@ -58,6 +58,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "ANIMALS", 1)
     monkeypatch.setattr(training, "CHECKED", 2)
     monkeypatch.setattr(training, "BATCH", 2)
+    monkeypatch.setattr(training, "EVERY", 1)
     monkeypatch.setattr(training, "draw_sequences", lambda rng: examples.draw_sequences(rng, 2, 4))
 
 
@@ -69,19 +70,25 @@ class Killed(Exception):
 def test_a_killed_training_goes_on_to_the_same_weights(tmp_path: Path) -> None:
     config = TrainingConfig(rounds=2)
     said: list[str] = []
-    whole = load_weights(train(tmp_path / "whole", config, workers=0, every=1, report=said.append))
+    whole = load_weights(train(tmp_path / "whole", config, workers=0, report=said.append))
 
     def kill(line: str) -> None:
         raise Killed
 
     with pytest.raises(Killed):
-        train(tmp_path / "killed", config, workers=0, every=1, report=kill)
-    resumed = load_weights(train(tmp_path / "killed", config, workers=0, every=1, report=said.append))
+        train(tmp_path / "killed", config, workers=0, report=kill)
+    resumed = load_weights(train(tmp_path / "killed", config, workers=0, report=said.append))
     assert [line.split("  ")[0] for line in said] == ["round 1", "round 2", "round 2"]
     for name, value in whole.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
     with pytest.raises(UserError, match=r"checkpoint\.pt: expected a training with \{'rounds': 3"):
-        train(tmp_path / "killed", TrainingConfig(rounds=3), workers=0, every=1, report=said.append)
+        train(tmp_path / "killed", TrainingConfig(rounds=3), workers=0, report=said.append)
+
+
+def test_a_checkpoint_that_cannot_be_read_is_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "checkpoint.pt").write_bytes(b"cut")
+    with pytest.raises(UserError, match=r"checkpoint\.pt: expected a checkpoint of a training, but it cannot be read"):
+        train(tmp_path, TrainingConfig(rounds=1), workers=0, report=print)
 
 
 @pytest.mark.usefixtures("small")

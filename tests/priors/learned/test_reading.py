@@ -9,7 +9,7 @@ import torch
 from rewild4d.datasets.builtin.zoo import varied
 from rewild4d.errors import UserError
 from rewild4d.priors.hypotheses import Hypotheses
-from rewild4d.priors.learned import examples, reading
+from rewild4d.priors.learned import pictures, reading
 from rewild4d.priors.learned.drawing import draw
 from rewild4d.priors.learned.evidence import PointEvidence, indices
 from rewild4d.priors.learned.network import PointNetwork
@@ -50,12 +50,12 @@ def test_the_picture_is_that_of_a_camera_along_the_middle_of_the_crop() -> None:
     seen = (vertices - center) @ rotation.T
     flat = np.concatenate((0.5 + 0.5 * seen[:, :2] / seen[:, 2:] / opening, seen[:, 2:]), axis=1)
     shades = np.linspace(0, 1, len(flat), dtype=np.float32)
-    direct = draw(flat.astype(np.float32), animal.surface.faces.astype(np.int32), shades, examples.SIZE)
+    direct = draw(flat.astype(np.float32), animal.surface.faces.astype(np.int32), shades, pictures.SIZE)
     assert np.abs(picture[0] - direct[0]).mean() < 0.01
-    assert np.abs(picture[1] - examples.normalised(direct)[1]).mean() < 0.02
+    assert np.abs(picture[1] - pictures.normalised(direct)[1]).mean() < 0.02
     rows, columns = np.nonzero(picture[0] > 0.5)
     middle = (np.ptp(rows) + 2 * rows.min()) / 2, (np.ptp(columns) + 2 * columns.min()) / 2
-    assert middle == pytest.approx((examples.SIZE / 2 - 0.5,) * 2, abs=3.0)
+    assert middle == pytest.approx((pictures.SIZE / 2 - 0.5,) * 2, abs=3.0)
 
 
 def test_a_long_clip_is_read_in_windows_and_empty_frames_are_left_out() -> None:
