@@ -8,7 +8,7 @@ from torch import Tensor
 
 from rewild4d import transforms as tf
 from rewild4d.harmonics import seen_colors
-from rewild4d.priors.template import MIRROR
+from rewild4d.priors.bodies.tetrapod import MIRROR
 from rewild4d.types import Camera, Splats
 
 

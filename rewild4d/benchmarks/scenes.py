@@ -15,9 +15,10 @@ from rewild4d.ours.config import Config
 from rewild4d.ours.fit import Training
 from rewild4d.ours.model import build_model
 from rewild4d.ours.symmetry import Supervision
+from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.motion import SurfaceSample, pose_gaussians, quats_from_normals, sample_surface
-from rewild4d.priors.template import PARENTS, posed_prior, quadruped
+from rewild4d.priors.posed import posed_prior
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import look_at
 from rewild4d.types import Camera, Clip, Frame, Prior
@@ -144,7 +145,7 @@ def _frame(surface: SurfaceSample, colors: Tensor, prior: Prior, index: int) -> 
 
 def _camera(azimuth: float, focal: float, size: int) -> Camera:
     """Build a camera that looks at the centre of the template at rest from a little above."""
-    target = quadruped().vertices.aminmax(dim=0)
+    target = QUADRUPED.build().vertices.aminmax(dim=0)
     middle = ((target.min + target.max) / 2).double()
     offset = DISTANCE * torch.tensor((math.sin(azimuth), 0.25, math.cos(azimuth)), dtype=torch.float64)
     up = torch.tensor((0.0, 1.0, 0.0), dtype=torch.float64)
@@ -155,15 +156,15 @@ def _camera(azimuth: float, focal: float, size: int) -> Camera:
 def _swing(amplitude: float) -> Tensor:
     """Return transforms of legs that swing by an amplitude in radians, diagonal pairs together, [FRAMES, J, 4, 4]."""
     phase = torch.arange(1, FRAMES + 1) * (2 * math.pi / FRAMES)
-    angles = torch.zeros(FRAMES, len(PARENTS), 3)
+    angles = torch.zeros(FRAMES, len(QUADRUPED.parents), 3)
     for bone, sign in ((10, 1), (16, 1), (13, -1), (19, -1)):
         angles[:, bone, 0] = sign * amplitude * phase.sin()
-    return pose(angles, quadruped().bones[:, 0], PARENTS)
+    return pose(angles, QUADRUPED.build().bones[:, 0], QUADRUPED.parents)
 
 
 def _prior(transforms: Tensor, azimuths: list[float], size: int) -> Prior:
     cameras = [_camera(azimuth, 2.4 * size, size) for azimuth in azimuths]
     world = torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)
     times = torch.arange(FRAMES, dtype=torch.float64) / FPS
-    given = quadruped(), transforms, world, cameras, times
+    given = QUADRUPED.build(), transforms, world, cameras, times
     return posed_prior(*given, name="bench", provenance="the template itself", digest="bench")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 USAGE = """usage: rewild4d-bench prior fit --frames DIR --masks DIR --out prior.npz [--keypoints FILE --mapping NAME]
        rewild4d-bench prior import --files DIR --out prior.npz
        rewild4d-bench prior train --out DIR"""
-DESCRIPTION = """Fit the quadruped template to masked frames of unknown cameras; write the prior and an overlay
+DESCRIPTION = """Fit a template to masked frames of unknown cameras; write the prior and an overlay
 (<out>.png and <out>.mp4): mask green, template magenta, agreement grey, left legs orange, right legs blue, head red."""
 IMPORT = """Import the output of a test run of 3D-Fauna, <step>_<frame>_mesh.obj, _pose.txt, _arti_params.txt, as a
 prior."""
@@ -46,7 +46,9 @@ class FitOptions:
         keypoints: BADJA or COCO-like .json, DeepLabCut or SLEAP .csv.
         mapping: from names of keypoints to points of the template: aptv2, badja, superanimal-quadruped or a .toml file.
         use: frames whose keypoints the fit sees: all; every other one (the rest is scored); none (all are scored).
-        prior: "template" (masks alone) or "learned:<weights>" (also points of the body that a network finds).
+        prior: "template" (masks alone; a quadruped, biped or primate, whichever fits best), "template:<which>" (one of
+            these) or "learned:<weights>" (also points of the body that a network finds).
+        rig: a rig of your own, .glb or .gltf with a skinned mesh and a clip, y up, as the template.
         fps: frames per second as for `run`: DAVIS has 24, other folders 25 where it is left out, videos their own.
         seed: of the fit.
     """
@@ -59,6 +61,7 @@ class FitOptions:
     mapping: str | None = None
     use: Use = "all"
     prior: str = "template"
+    rig: Path | None = None
     fps: float | None = None
     seed: int = 0
 
@@ -150,9 +153,11 @@ def _fit(arguments: list[str]) -> int:
     from rewild4d.progress import Progress
 
     mapping = load_mapping(options.mapping) if options.mapping else {}
-    choice = PriorChoice(options.prior, STANDARD)
+    if options.rig is not None and options.prior != FitOptions.prior:
+        raise UserError("--rig and --prior: expected one of them, got both.")
+    choice = PriorChoice(options.prior if options.rig is None else f"template:{options.rig}", STANDARD)
     if not choice.is_fitted:
-        raise UserError(f"--prior {options.prior}: expected template or learned:<weights>.")
+        raise UserError(f"--prior {options.prior}: expected template, template:<which> or learned:<weights>.")
     choice.require()
     reader = Online(
         options.frames, masks=options.masks, fps=options.fps, keypoints=options.keypoints, parts=options.parts
@@ -167,7 +172,7 @@ def _fit(arguments: list[str]) -> int:
     evidence = Evidence(given, clip.travel)
     prior = fit_footage(
         clip, config=choice.settings_under(known_cameras=False), seed=options.seed, log=progress, said=evidence,
-        network=choice.network(),
+        network=choice.network(), bodies=choice.bodies(),
     )  # fmt: skip
     progress.close()
     if scored is not None:

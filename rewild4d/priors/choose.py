@@ -11,6 +11,10 @@ from rewild4d.contracts import Log
 from rewild4d.errors import UserError
 from rewild4d.files import digest
 from rewild4d.machine import code_version
+from rewild4d.priors.bodies.body import Body
+from rewild4d.priors.bodies.choice import bodies, identity
+from rewild4d.priors.bodies.quadruped import QUADRUPED
+from rewild4d.priors.bodies.tetrapod import MIRROR
 from rewild4d.priors.coarse import coarse_prior
 from rewild4d.priors.config import FOOTAGE, PriorConfig, Use, with_points
 from rewild4d.priors.fit import fit_template
@@ -23,7 +27,6 @@ from rewild4d.priors.learned.weights import load_weights
 from rewild4d.priors.placing import has_cameras, in_world, placed
 from rewild4d.priors.rig import rig_prior
 from rewild4d.priors.steady import without_hops
-from rewild4d.priors.template import MIRROR
 from rewild4d.types import Clip, Prior, Truth
 
 PRIOR_SEED = 0
@@ -40,8 +43,9 @@ class PriorChoice:
     """The prior that a run asks for.
 
     Attributes:
-        name: "template" (fitted to the clip's masks alone, with its cameras where it has any), "learned:<weights>"
-            (fitted to masks and to points of the body that a network finds), "coarse" or
+        name: "template" (fitted to the clip's masks alone, with its cameras where it has any; of the package's
+            templates the one that fits best), "template:<which>" (a template's name or a rig file), "learned:<weights>"
+            (the quadruped, fitted to masks and to points of the body that a network finds), "coarse" or
             "coarse:<noise>" (from the truth, plus noise; for studies of prior quality only), "rig" (the data set's own
             shape and skeleton: a bound) or the path of an npz file.
         config: settings of the template fit under known cameras.
@@ -72,22 +76,38 @@ class PriorChoice:
         """Check the name.
 
         Raises:
-            UserError: a noise that is no number, or a file that is missing or damaged.
+            UserError: a noise that is no number, an unknown template, or a file that is missing or damaged.
         """
         if self.is_learned:
             self.network()
-        elif not self.is_fitted and not self.is_from_truth:
+        elif self.is_fitted:
+            self.bodies()
+        elif not self.is_from_truth:
             load_prior(Path(self.name))
 
     @property
     def is_learned(self) -> bool:
         """Whether a network's points take part in the fit."""
-        return self.name.partition(":")[0] == "learned"
+        return self._kind == "learned"
 
     @property
     def is_fitted(self) -> bool:
         """Whether the template is fitted to the clip, which alone decides the prior."""
-        return self.name == "template" or self.is_learned
+        return self._kind == "template" or self.is_learned
+
+    @property
+    def _kind(self) -> str:
+        return self.name.partition(":")[0]
+
+    def bodies(self) -> tuple[Body, ...]:
+        """Return the templates among which the fit chooses.
+
+        Raises:
+            UserError: an unknown name, or a rig file that cannot be used.
+        """
+        if self.is_learned:
+            return (QUADRUPED,)
+        return bodies(self.name.partition(":")[2] if self._kind == "template" else "")
 
     @property
     def _weights_file(self) -> Path:
@@ -125,6 +145,8 @@ class PriorChoice:
             parts += ["template", msgspec.json.encode(self.settings(clip)), repr(self._pairs), self.use]
             if self.is_learned:
                 parts += ["learned", self._weights_file.read_bytes()]
+            else:
+                parts.append(identity(self.name.partition(":")[2]))
         elif self.is_from_truth:
             named = "rig" if self.noise is None else f"coarse {self.noise}"
             parts += [named, truth.digest, msgspec.json.encode(self.config)]
@@ -191,11 +213,16 @@ def _fitted(choice: PriorChoice, clip: Clip, truth: Truth, log: Log) -> Prior:
         return coarse_prior(clip, truth.held_out, noise=choice.noise, seed=PRIOR_SEED, config=choice.config, log=log)
     network, config = choice.network(), choice.settings(clip)
     if choice.name == "rig" or has_cameras(clip):
-        fitted = fit_template(clip, config=config, seed=PRIOR_SEED, log=log, network=network)
+        fitted = fit_template(
+            clip, config=config, seed=PRIOR_SEED, log=log, network=network, bodies=choice.bodies()
+        )  # fmt: skip
         return rig_prior(clip, truth.rig(), fitted) if choice.name == "rig" and truth.rig else fitted
     given, scored = choice.keypoints(clip)
-    said = Evidence(given, clip.travel)
-    return _scored(fit_footage(clip, config=config, seed=PRIOR_SEED, log=log, said=said, network=network), clip, scored)
+    prior = fit_footage(
+        clip, config=config, seed=PRIOR_SEED, log=log, said=Evidence(given, clip.travel), network=network,
+        bodies=choice.bodies(),
+    )  # fmt: skip
+    return _scored(prior, clip, scored)
 
 
 def _scored(prior: Prior, clip: Clip, found: Marks | None) -> Prior:

@@ -11,7 +11,6 @@ import torch
 from rewild4d.contracts import Log
 from rewild4d.priors.config import PriorConfig
 from rewild4d.priors.fit import Animal, fit_animal, make_prior
-from rewild4d.priors.hypotheses import ANGLE_SPREADS
 from rewild4d.transforms import axis_angle_to_matrix
 from rewild4d.types import OBJECT_DIAGONAL, Clip, Frame, Prior
 
@@ -22,7 +21,7 @@ ROTATION_NOISE = 0.05
 SHIFT_NOISE = 0.01
 """Standard deviation of the root's position at noise 1, as a share of the rest diagonal."""
 SHAPE_NOISE = 0.3
-"""Standard deviation of every proportion at noise 1, in the spreads of `PROPORTIONS`."""
+"""Standard deviation of every proportion at noise 1, in the spreads of the template's measures."""
 
 
 def coarse_prior(
@@ -61,5 +60,5 @@ def _disturb(animal: Animal, noise: float, seed: int) -> Animal:
         animal,
         shape=replace(animal.shape, deviations=animal.shape.deviations + shape),
         object_to_world=moved,
-        angles=animal.angles + angles * (ANGLE_SPREADS > 0),
+        angles=animal.angles + angles * (animal.body.spreads > 0),
     )

@@ -16,10 +16,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from rewild4d.errors import UserError
+from rewild4d.priors.bodies.tetrapod import MIRROR
 from rewild4d.priors.fauna_bones import estimate_bones, joint_transforms, skinning_weights
 from rewild4d.priors.fauna_files import frames, read_obj, stems
 from rewild4d.priors.io import require_loadable, seal
-from rewild4d.priors.template import MIRROR
 from rewild4d.transforms import mirror_camera, mirror_points, mirror_transforms, skin_points
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Prior
 

@@ -1,7 +1,7 @@
-"""Fit the quadruped template to masks under known cameras: similarity, proportions and poses over time.
+"""Fit a template to masks under known cameras: similarity, proportions and poses over time.
 
 The heading is a local minimum (animals look alike from head and tail), so many headings compete, and the best reversed
-one is kept until joints and proportions have settled.
+one is kept until joints and proportions have settled. Kinds of body compete until joints have been fitted once.
 """
 
 from collections.abc import Sequence
@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 
 from rewild4d.contracts import Log
+from rewild4d.priors.bodies.body import Body, Proportions, diagonal
+from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.config import PriorConfig
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.io import seal
@@ -18,11 +20,10 @@ from rewild4d.priors.kinematics import pose
 from rewild4d.priors.learned.evidence import PointEvidence, indices
 from rewild4d.priors.learned.network import PointNetwork
 from rewild4d.priors.learned.reading import read
-from rewild4d.priors.proportions import Proportions
-from rewild4d.priors.race import Race
+from rewild4d.priors.posed import posed_prior
+from rewild4d.priors.race import Race, Steps, decided, steps_of
 from rewild4d.priors.search import facings, mask_rays, single_view, trajectory, up_directions, working_frame
 from rewild4d.priors.silhouettes import known_camera, overlap
-from rewild4d.priors.template import PARENTS, diagonal, posed_prior, quadruped
 from rewild4d.transforms import camera_in_object, similarity, skin_points
 from rewild4d.types import OBJECT_DIAGONAL, Clip, Frame, Prior
 
@@ -32,69 +33,78 @@ class Animal:
     """Result of a fit, before cameras are attached.
 
     Attributes:
+        body: its kind.
         shape: body proportions.
         object_to_world: float64, [T, 4, 4], of the template scaled to `OBJECT_DIAGONAL`.
         angles: axis-angle vectors in radians, [T, J, 3].
         figures: cost of the best guess, its lead over the opposite heading, and costs of the starts.
     """
 
+    body: Body
     shape: Proportions
     object_to_world: Tensor
     angles: Tensor
     figures: dict[str, float]
 
 
-def fit_template(clip: Clip, *, config: PriorConfig, seed: int, log: Log, network: PointNetwork | None = None) -> Prior:
+def fit_template(
+    clip: Clip, *, config: PriorConfig, seed: int, log: Log, network: PointNetwork | None = None,
+    bodies: Sequence[Body] = (QUADRUPED,),
+) -> Prior:  # fmt: skip
     """Fit the template to a clip's masks under its cameras, and to the points that a network finds if there is one.
 
-    The seed is that of the frames drawn for each step.
+    The seed is that of the frames drawn for each step. Of several ``bodies`` the one that fits best is taken.
 
     Returns:
-        A prior with one pose per frame; `quality` has mask_iou, cost, facing_margin, starts (their number) and
-        start_00_cost, ... (after the first stage).
+        A prior with one pose per frame; `quality` has mask_iou, cost, facing_margin, starts (their number),
+        start_00_cost, ... (after the first stage), and of several bodies the figures of `decided`.
 
     Raises:
         UserError: a frame has no camera, or no mask shows anything.
     """
     count = len(clip.frames)
-    animal = fit_animal(clip.frames, range(count), count, clip.name, config, seed, log, network)
+    animal = fit_animal(clip.frames, range(count), count, clip.name, config, seed, log, network, bodies)
     points = " and to points of the body that a network finds in them" if network else ""
-    provenance = f"Template fitted to the {count} masks of the clip{points} under known cameras, seed {seed}."
+    provenance = (
+        f"Template ({animal.body.name}) fitted to the {count} masks of the clip{points} under known cameras, "
+        f"seed {seed}."
+    )
     return make_prior(animal, clip, "learned" if network else "template", provenance)
 
 
 def fit_animal(
     frames: Sequence[Frame], timesteps: Sequence[int], count: int, name: str, config: PriorConfig, seed: int, log: Log,
-    network: PointNetwork | None = None,
+    network: PointNetwork | None = None, bodies: Sequence[Body] = (QUADRUPED,),
 ) -> Animal:  # fmt: skip
     """Fit the template to frames of ``count`` times; ``timesteps`` are indices of their times.
 
-    There may be any number of each time; for a ``network`` one, in their order.
+    There may be any number of each time; for a ``network`` one, in their order. A network reads quadrupeds.
     """
     rays = mask_rays(frames, timesteps, name)
     path = trajectory(rays, count)
     ups = up_directions(rays, config.elevations)
-    total = len(ups) * config.stages[0].steps + sum(stage.steps for stage in config.stages[1:])
-    generator = torch.Generator().manual_seed(seed)
-    best: list[KnownCameras] = []
-    for index, up in enumerate(ups):
-        working = working_frame(rays, path, up)
-        race = KnownCameras(frames, timesteps, name, working, config, generator, log, total)
-        race.view = single_view(rays, working)
-        race.done = index * config.stages[0].steps
-        local = torch.linalg.solve(working[:3, :3], (path - working[:3, 3]).T).T
-        if network is not None:
-            race.said = PointEvidence.of(read(frames, timesteps, up, name, network), working)
-        race.begin(Hypotheses.start(facings(config.yaw_starts), local.float(), config.root_period))
-        race.run(config.stages[0])
-        best.append(race)
-    starts = torch.cat([race.start_costs for race in best]).tolist()
-    leader = min(best, key=lambda race: float(race.costs.min()))
-    leader.figures |= {"starts": float(len(starts))} | {f"start_{k:02d}_cost": cost for k, cost in enumerate(starts)}
-    leader.done = len(ups) * config.stages[0].steps
-    for stage in config.stages[1:]:
-        leader.run(stage)
-    return leader.winner()
+    steps = Steps(log, len(bodies) * len(ups) * config.stages[0].steps + steps_of(config.stages[1:], len(bodies)))
+
+    def leader(body: Body) -> KnownCameras:
+        """Return the best race of a body over the first stage, one for each up direction."""
+        generator = torch.Generator().manual_seed(seed)
+        races: list[KnownCameras] = []
+        for up in ups:
+            working = working_frame(rays, path, up)
+            race = KnownCameras(frames, timesteps, name, working, config, generator, steps)
+            race.view = single_view(rays, working)
+            local = torch.linalg.solve(working[:3, :3], (path - working[:3, 3]).T).T
+            if network is not None:
+                race.said = PointEvidence.of(read(frames, timesteps, up, name, network), working)
+            race.begin(Hypotheses.start(body, facings(config.yaw_starts), local.float(), config.root_period))
+            race.run(config.stages[0])
+            races.append(race)
+        starts = torch.cat([race.start_costs for race in races]).tolist()
+        best = min(races, key=lambda race: float(race.costs.min()))
+        best.figures |= {"starts": float(len(starts))} | {f"start_{k:02d}_cost": cost for k, cost in enumerate(starts)}
+        return best
+
+    return decided([leader(body) for body in bodies], config.stages[1:]).winner()
 
 
 class KnownCameras(Race):
@@ -120,17 +130,18 @@ class KnownCameras(Race):
         """Return the best guess in the world, with the rest mesh's diagonal scaled to the object frame's."""
         best = self.guesses.select(self.costs.argmin()[None])
         shape = Proportions(best.shape[0], best.relief[0])
-        size = best.scales().double()[0] * diagonal(quadruped(shape, unit=False).vertices).double() / OBJECT_DIAGONAL
+        rest = best.body.build(shape, unit=False).vertices
+        size = best.scales().double()[0] * diagonal(rest).double() / OBJECT_DIAGONAL
         roots = best.roots().double()[0]
         local = similarity(size.expand(len(roots)), roots[:, :3, :3], roots[:, :3, 3])
         figures = {"cost": float(self.costs.min()), **self.figures}
-        return Animal(shape, self.working @ local, best.joint_angles()[0], figures)
+        return Animal(best.body, shape, self.working @ local, best.joint_angles()[0], figures)
 
 
 def make_prior(animal: Animal, clip: Clip, name: str, provenance: str) -> Prior:
     """Attach the clip's cameras and the mirrored half, and measure the mask IoU."""
-    template = quadruped(animal.shape)
-    transforms = pose(animal.angles, template.bones[:, 0], PARENTS)
+    template = animal.body.build(animal.shape)
+    transforms = pose(animal.angles, template.bones[:, 0], template.parents)
     cameras = [
         camera_in_object(known_camera(frame, clip.name), matrix)
         for frame, matrix in zip(clip.frames, animal.object_to_world, strict=True)

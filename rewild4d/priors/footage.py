@@ -1,10 +1,11 @@
-"""Fit the quadruped template to masks under unknown cameras.
+"""Fit a template to masks under unknown cameras.
 
 Body proportions are shared by the clip and its mirrored copy; cameras and poses are fitted to each on its own. The
 object frame is the world: `object_to_world` is the identity, and the cameras of the frames hold all motion.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,6 +13,8 @@ from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from rewild4d.contracts import Log
+from rewild4d.priors.bodies.body import Body, Proportions, diagonal
+from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.config import PriorConfig, Stage
 from rewild4d.priors.io import seal
 from rewild4d.priors.judge import measured
@@ -20,11 +23,10 @@ from rewild4d.priors.landmarks import Marks
 from rewild4d.priors.learned.evidence import PointEvidence, indices
 from rewild4d.priors.learned.network import PointNetwork
 from rewild4d.priors.learned.reading import read
-from rewild4d.priors.proportions import Proportions
-from rewild4d.priors.race import Race
+from rewild4d.priors.posed import posed_prior
+from rewild4d.priors.race import Race, Steps, decided, steps_of
 from rewild4d.priors.search import facings
 from rewild4d.priors.silhouettes import require_mask
-from rewild4d.priors.template import PARENTS, diagonal, posed_prior, quadruped
 from rewild4d.priors.views import FIELD_OF_VIEW, Views, fauna_camera, windows
 from rewild4d.transforms import nearest_rotation, rigid
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Prior
@@ -132,63 +134,69 @@ class FixedCamera(Race):
 
 def fit_footage(
     clip: Clip, *, config: PriorConfig, seed: int, log: Log, said: Evidence = NOTHING,
-    network: PointNetwork | None = None,
+    network: PointNetwork | None = None, bodies: Sequence[Body] = (QUADRUPED,),
 ) -> Prior:  # fmt: skip
     """Fit the template to a clip's masks under unknown cameras, and to the points that a network finds if there is one.
 
-    The seed is that of the frames drawn for each step of a long clip.
+    The seed is that of the frames drawn for each step of a long clip. Of several ``bodies`` the one that fits the clip
+    best is taken. A network reads quadrupeds.
 
     Returns:
         A prior with one camera and pose per frame and for its mirror image; `quality` has the figures of
-        `judge.measured`, cost, and facing_margin: the lead of the best guess over the best that heads against it.
+        `judge.measured`, cost, facing_margin (the lead of the best guess over the best that heads against it), and of
+        several bodies the figures of `decided`.
 
     Raises:
         UserError: no mask shows anything.
     """
     require_mask(clip.frames, clip.name)
-    race = _run(clip.name, clip.frames, said, config, seed, log, None, network)
+    total = steps_of(config.stages, len(bodies)) + sum(stage.steps for stage in config.stages)
+    steps = Steps(log, total)
+    races = [_race(clip.name, clip.frames, said, config, seed, steps, body, network) for body in bodies]
+    race = decided(races, config.stages)
     flipped = tuple(replace(f, rgb=f.rgb.flip(-1), mask=f.mask.flip(-1)) for f in clip.frames)
     mirrored = said.mirrored(clip.frames[0].mask.shape[2])
-    race_flip = _run(clip.name, flipped, mirrored, config, seed, log, race.guesses, network)
+    body = race.guesses.body
+    race_flip = _race(clip.name, flipped, mirrored, config, seed, steps, body, network, known=race.guesses)
+    for stage in config.stages:
+        race_flip.run(stage)
     return _prior(clip, race, race_flip, "learned" if network else "template", seed)
 
 
-def _run(
-    case: str, frames: tuple[Frame, ...], said: Evidence, config: PriorConfig, seed: int, log: Log,
-    known: Views | None, network: PointNetwork | None,
+def _race(
+    case: str, frames: tuple[Frame, ...], said: Evidence, config: PriorConfig, seed: int, steps: Steps, body: Body,
+    network: PointNetwork | None, known: Views | None = None,
 ) -> FixedCamera:  # fmt: skip
-    """Run all rounds, from all starts to one guess; scale and proportions are those of ``known``, if given."""
-    total = 2 * sum(stage.steps for stage in config.stages)
+    """Return a race with all its starts; scale and proportions are those of ``known``, if given."""
     boxes = windows(frames)
     seen = [
         replace(frame, camera=fauna_camera(box, frame.mask.shape[2], frame.mask.shape[1]))
         for frame, box in zip(frames, boxes, strict=True)
     ]
     working, generator = torch.eye(4, dtype=torch.float64), torch.Generator().manual_seed(seed)
-    race = FixedCamera(seen, range(len(frames)), case, working, config, generator, log, total)
+    race = FixedCamera(seen, range(len(frames)), case, working, config, generator, steps)
     race.said, race.boxes = said, boxes.float()
     if network is not None:
         found = read(seen, range(len(seen)), UP, case, network, known=False)
         race.points = PointEvidence.of(found, working)
     # known proportions need fewer starts
     count = config.yaw_starts if known is None else max(4, config.yaw_starts // 2)
-    starts = Views.start(facings(count), torch.zeros(len(frames), 3), config.root_period)
+    starts = Views.start(body, facings(count), torch.zeros(len(frames), 3), config.root_period)
     race.begin(starts)
     if known is not None:
-        race.given, race.done = True, total // 2
+        race.given = True
         rows = torch.zeros(len(starts), dtype=torch.long)
         for part in ("scale", "shape", "relief"):
             setattr(race.guesses, part, getattr(known, part)[rows])
-    for stage in config.stages:
-        race.run(stage)
     return race
 
 
 def _prior(clip: Clip, race: FixedCamera, race_flip: FixedCamera, name: str, seed: int) -> Prior:
     """Return the prior of the fitted clip and its mirrored copy."""
-    template, count = quadruped(Proportions(race.guesses.shape[0], race.guesses.relief[0])), len(clip.frames)
+    body, count = race.guesses.body, len(clip.frames)
+    template = body.build(Proportions(race.guesses.shape[0], race.guesses.relief[0]))
     transforms, transforms_flip = (
-        pose(half.guesses.joint_angles()[0], template.bones[:, 0], PARENTS) for half in (race, race_flip)
+        pose(half.guesses.joint_angles()[0], template.bones[:, 0], template.parents) for half in (race, race_flip)
     )
     quality: dict[str, float] = {}
     for suffix, half in (("", race), ("_flip", race_flip)):
@@ -197,8 +205,8 @@ def _prior(clip: Clip, race: FixedCamera, race_flip: FixedCamera, name: str, see
     world, times = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1), torch.tensor(clip.times, dtype=torch.float64)
     prior = posed_prior(
         template, transforms, world, object_cameras(race), times, name=name,
-        provenance=f"Template fitted to the {count} masks of the clip and of its mirror image, cameras unknown, "
-        f"{race.said}seed {seed}.",
+        provenance=f"Template ({body.name}) fitted to the {count} masks of the clip and of its mirror image, "
+        f"cameras unknown, {race.said}seed {seed}.",
     )  # fmt: skip
     prior = replace(prior, cameras_flip=object_cameras(race_flip), transforms_flip=transforms_flip)
     return seal(replace(prior, quality=quality | measured(prior, clip.frames)))
@@ -207,7 +215,7 @@ def _prior(clip: Clip, race: FixedCamera, race_flip: FixedCamera, name: str, see
 def object_cameras(race: FixedCamera) -> tuple[Camera, ...]:
     """Return the cameras of the best guess in the object frame, with a rest diagonal of `OBJECT_DIAGONAL`."""
     guesses = race.guesses
-    size = guesses.scales()[0] * diagonal(quadruped(Proportions(guesses.shape, guesses.relief), unit=False).vertices)[0]
+    size = guesses.scales()[0] * diagonal(guesses.template().vertices)[0]
     cameras = []
     for frame, root in zip(race.frames, guesses.roots()[0].double(), strict=True):
         assert frame.camera is not None

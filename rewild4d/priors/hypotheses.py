@@ -5,21 +5,17 @@ Parameters are in standard deviations, so that one learning rate suits all. Moti
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
+from rewild4d.priors.bodies.body import Body, Proportions, Template
 from rewild4d.priors.config import Stage
 from rewild4d.priors.kinematics import moved, pose
-from rewild4d.priors.proportions import PROPORTIONS, SECTIONS, Proportions
 from rewild4d.priors.silhouettes import Targets, rasterized, splat
-from rewild4d.priors.template import PARENTS, Template, quadruped, quads
 from rewild4d.transforms import axis_angle_to_matrix, rigid
 
-ANGLE_LIMIT = 1.1
-"""Bound of a joint's rotation about each axis, radians (Fauna: 60 degrees)."""
-FEET = [8, 11, 14, 17]
 LIFTED = 0.05
 """Height above its lowest position over which a foot's weight falls to 1 / e, template units."""
 STILL_STEP = 0.03
@@ -27,20 +23,6 @@ STILL_STEP = 0.03
 SCALE_SPREAD = 0.25
 ROTATION_SPREAD = (0.15, 0.35, 0.10)
 SHIFT_SPREAD = 0.30
-
-
-def _angle_spreads() -> Tensor:
-    """Return standard deviations of joint angles about the object's axes in radians, [J, 3]."""
-    by_bone = {
-        0: (0.30, 0.25, 0.10), 1: (0.35, 0.25, 0.10), 2: (0.40, 0.25, 0.10), 3: (0.10, 0.08, 0.04),
-        4: (0.35, 0.35, 0.05), 5: (0.40, 0.40, 0.05), 6: (0.15, 0.10, 0.04), 7: (0.10, 0.08, 0.04),
-    }  # fmt: skip
-    for foot in FEET:
-        by_bone |= {foot: (0.45, 0.0, 0.04), foot + 1: (0.45, 0.0, 0.04), foot + 2: (0.45, 0.05, 0.10)}
-    return torch.tensor([by_bone[bone] for bone in range(len(PARENTS))])
-
-
-ANGLE_SPREADS = _angle_spreads()
 
 
 def cosine_series(count: int, terms: int) -> Tensor:
@@ -55,6 +37,7 @@ class Hypotheses:
     """A batch of B guesses in the working frame (y up, animal near the origin, about template size).
 
     Attributes:
+        body: the kind of animal.
         facing: rotation object -> working frame of each guess, fixed, [B, 3, 3].
         path: position of the animal at each frame according to the masks, fixed, [T, 3].
         scale: logarithm of the size, [B].
@@ -65,6 +48,7 @@ class Hypotheses:
         angles: cosine series of the joint angles, [B, L, J, 3].
     """
 
+    body: Body
     facing: Tensor
     path: Tensor
     scale: Tensor
@@ -75,31 +59,34 @@ class Hypotheses:
     angles: Tensor
 
     @classmethod
-    def start(cls, facing: Tensor, path: Tensor, root_period: int = 4) -> Self:
-        """Return average animals at rest on the path, from facings [B, 3, 3] and a path [T, 3].
+    def start(cls, body: Body, facing: Tensor, path: Tensor, root_period: int = 4) -> Self:
+        """Return average animals of a kind at rest on the path, from facings [B, 3, 3] and a path [T, 3].
 
         The root has a term of motion for each ``root_period`` frames.
         """
         batch, count = len(facing), len(path)
         root, joints = 1 + (count - 1) // root_period, 1 + (count - 1) // 2
         return cls(
+            body,
             facing,
             path,
             scale=torch.zeros(batch),
             rotation=torch.zeros(batch, root, 3),
             shift=torch.zeros(batch, root, 3),
-            shape=torch.zeros(batch, len(PROPORTIONS)),
-            relief=torch.zeros(batch, sum(SECTIONS), 4),
-            angles=torch.zeros(batch, joints, len(PARENTS), 3),
+            shape=torch.zeros(batch, body.measures),
+            relief=torch.zeros(batch, body.sections, 4),
+            angles=torch.zeros(batch, joints, len(body.parents), 3),
         )
 
     def by_guess(self) -> dict[str, Tensor]:
         """Return all tensors with a row for each guess, by name, detached."""
-        return {field.name: getattr(self, field.name).detach() for field in fields(self) if field.name != "path"}
+        names = [field.name for field in fields(self) if field.name not in ("body", "path")]
+        return {name: getattr(self, name).detach() for name in names}
 
     def select(self, rows: Tensor) -> Self:
         """Return some of the guesses, detached."""
-        return replace(self, **{name: value[rows] for name, value in self.by_guess().items()})
+        chosen: dict[str, Any] = {name: value[rows] for name, value in self.by_guess().items()}
+        return replace(self, **chosen)
 
     def __len__(self) -> int:
         return len(self.facing)
@@ -121,16 +108,21 @@ class Hypotheses:
     def joint_angles(self) -> Tensor:
         """Return axis-angle vectors in radians, [B, T, J, 3]."""
         series = cosine_series(len(self.path), self.angles.shape[1])
-        raw = torch.einsum("tk,bkja->btja", series, self.angles) * ANGLE_SPREADS
-        return ANGLE_LIMIT * torch.tanh(raw / ANGLE_LIMIT)
+        raw = torch.einsum("tk,bkja->btja", series, self.angles) * self.body.spreads
+        limits = self.body.limits
+        return limits * torch.tanh(raw / limits)
+
+    def template(self) -> Template:
+        """Return the animals at rest before they are scaled."""
+        return self.body.build(Proportions(self.shape, self.relief), unit=False)
 
     def silhouettes(self, targets: Targets, stage: Stage) -> Tensor:
         """Return the soft silhouettes in the targets' crops, [B, v, s, s]."""
-        template = quadruped(Proportions(self.shape, self.relief), unit=False)
+        template = self.template()
         size = targets.masks.shape[-1]
         if stage.rasterized:
-            vertices = self._in_cameras(template, template.vertices, template.weights, targets, stage.joints)
-            return rasterized(vertices, quads(), targets.intrinsics, size)
+            cover = self._in_cameras(template, template.cover, template.cover_weights, targets, stage.joints)
+            return rasterized(cover, template.quads, targets.intrinsics, size)
         blobs = self._in_cameras(template, template.blobs, template.blob_weights, targets, stage.joints)
         return splat(blobs, (template.blob_sizes * self.scales()[:, None])[:, None], targets.intrinsics, size)
 
@@ -142,15 +134,15 @@ class Hypotheses:
         if not bent:
             return points[:, None] @ linear[..., :3, :3].transpose(-1, -2) + linear[..., None, :3, 3]
         angles = self.joint_angles()[:, targets.timesteps]
-        transforms = linear[:, :, None] @ pose(angles, template.bones[:, None, :, 0], PARENTS)
+        transforms = linear[:, :, None] @ pose(angles, template.bones[:, None, :, 0], self.body.parents)
         blended = (weights @ transforms[..., :3, :].flatten(-2)).unflatten(-1, (3, 4))
         return torch.einsum("bvnac,bnc->bvna", blended[..., :3], points) + blended[..., 3]
 
     def points(self, bones: Tensor, along: Tensor) -> Tensor:
         """Return points of bones, at shares of their lengths ([L] each), at every time, [B, T, L, 3]."""
-        rest = quadruped(Proportions(self.shape, self.relief), unit=False).bones
+        rest = self.template().bones
         start, end = rest[:, bones].unbind(-2)
-        transforms = pose(self.joint_angles(), rest[:, None, :, 0], PARENTS)[:, :, bones]
+        transforms = pose(self.joint_angles(), rest[:, None, :, 0], self.body.parents)[:, :, bones]
         places = (start + along[:, None] * (end - start))[:, None]
         posed, roots = moved(places, transforms) * self.scales()[:, None, None, None], self.roots()
         return posed @ roots[..., :3, :3].transpose(-1, -2) + roots[..., None, :3, 3]
@@ -160,9 +152,9 @@ class Hypotheses:
 
         Feet that bear weight move backwards in the body's frame; forwards means that head and tail are confused.
         """
-        bones = quadruped(Proportions(self.shape), unit=False).bones
-        transforms = pose(self.joint_angles(), bones[:, None, :, 0], PARENTS)[:, :, FEET]
-        toes = moved(bones[:, None, FEET, 1], transforms)
+        bones, feet = self.body.build(Proportions(self.shape), unit=False).bones, list(self.body.feet)
+        transforms = pose(self.joint_angles(), bones[:, None, :, 0], self.body.parents)[:, :, feet]
+        toes = moved(bones[:, None, feet, 1], transforms)
         if toes.shape[1] < 2:
             return toes.new_zeros(len(self))
         height, step = (toes[:, 1:, :, 1] + toes[:, :-1, :, 1]) / 2, toes[..., 2].diff(dim=1)
@@ -185,5 +177,6 @@ class Hypotheses:
     def _body_penalties(self, frequency: float) -> tuple[Tensor, Tensor, Tensor]:
         """Return penalties of proportions, relief and joint angles; term k of the series counts as k * frequency."""
         order = frequency * torch.arange(self.angles.shape[1])
-        angles = self.angles.square() * (ANGLE_SPREADS > 0) * (0.3 + (order / 4).square())[:, None, None]
-        return self.shape.square().mean(1), self.relief.square().mean((1, 2)), angles.sum(1).mean((1, 2))
+        angles = self.angles.square() * (self.body.spreads > 0) * (0.3 + (order / 4).square())[:, None, None]
+        relief = self.relief.square().mean((1, 2)) if self.body.sections else torch.zeros(len(self))
+        return self.shape.square().mean(1), relief, angles.sum(1).mean((1, 2))

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from rewild4d.errors import UserError, shown, unknown_name
 from rewild4d.foreign.texts import read_toml
+from rewild4d.priors.bodies.tetrapod import MIRROR
 from rewild4d.priors.kinematics import moved
-from rewild4d.priors.template import MIRROR
 from rewild4d.types import Keypoints, Prior
 
 

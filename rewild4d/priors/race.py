@@ -1,6 +1,8 @@
 """Fit competing hypotheses: rounds of gradient descent on silhouettes; after each the worst are dropped."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -12,27 +14,46 @@ from rewild4d.priors.search import match_areas
 from rewild4d.priors.silhouettes import Targets, crop_targets, mismatch
 from rewild4d.types import Frame
 
+HANDICAP = 1.3
+"""The costs of all kinds of body but the usual one are multiplied by this where they are compared."""
 STILL_PARAMETERS = ("scale", "rotation", "shift", "shape")
 
 
+@dataclass
+class Steps:
+    """Steps of descent, told to a log.
+
+    Attributes:
+        log: called after each step.
+        total: number of all steps to come.
+        done: steps so far.
+    """
+
+    log: Log
+    total: int
+    done: int = 0
+
+    def told(self, cost: float) -> None:
+        self.done += 1
+        self.log(self.done, self.total, {"prior": cost})
+
+
 class Race:
-    """Guesses that are fitted side by side.
+    """Guesses of one kind of body that are fitted side by side.
 
     Attributes:
         guesses: those that remain.
         costs: of each after the last round, [B].
         start_costs: of every start after the first round.
         figures: named figures of the race (facing_margin, ...).
-        done: steps of descent so far, of the log's total.
     """
 
     def __init__(
         self, frames: Sequence[Frame], timesteps: Sequence[int], name: str, working: Tensor, config: PriorConfig,
-        generator: torch.Generator, log: Log, total: int,
+        generator: torch.Generator, steps: Steps,
     ) -> None:  # fmt: skip
         self.frames, self.timesteps, self.name = frames, timesteps, name
-        self.working, self.config, self.generator = working, config, generator
-        self.log, self.total, self.done = log, total, 0
+        self.working, self.config, self.generator, self.steps = working, config, generator, steps
         self.costs = self.start_costs = torch.zeros(0)
         self.figures: dict[str, float] = {}
         self.guesses: Hypotheses
@@ -81,8 +102,7 @@ class Race:
             optimizer.zero_grad()
             torch.autograd.backward(cost.sum(), inputs=leaves)
             optimizer.step()
-            self.done += 1
-            self.log(self.done, self.total, {"prior": float(cost.detach().min())})
+            self.steps.told(float(cost.detach().min()))
         with torch.no_grad():
             self.costs = self._cost(_spaced(targets, 2 * stage.frames), stage.size * stage.blur[1], stage)
             self.costs = self.costs + self.verdict(stage)
@@ -116,6 +136,37 @@ class Race:
         rest = [row for row in order if row not in wanted][: keep - len(wanted)]
         rows = torch.tensor(sorted(wanted + rest, key=order.index))
         self.guesses, self.costs = self.guesses.select(rows), self.costs[rows]
+
+
+R = TypeVar("R", bound=Race)
+
+
+def decided(races: Sequence[R], stages: Sequence[Stage]) -> R:
+    """Run races of one kind of body each until joints have been fitted; let the best run the stages that are left.
+
+    The first is the usual one: another has to be better by a factor of `HANDICAP`, for it bends more freely. Of
+    several, `figures` has <body>_cost of each and body_margin, the lead of the best over the next as a share, handicap
+    included.
+    """
+    first = 1 + [stage.joints for stage in stages].index(True) if len(races) > 1 else 0
+    for race in races:
+        for stage in stages[:first]:
+            race.run(stage)
+    best = races[0]
+    if len(races) > 1:
+        costs = [float(race.costs.min()) * (1.0 if race is races[0] else HANDICAP) for race in races]
+        best = races[costs.index(min(costs))]
+        best.figures |= {f"{race.guesses.body.name}_cost": float(race.costs.min()) for race in races}
+        best.figures["body_margin"] = sorted(costs)[1] / min(costs) - 1
+    for stage in stages[first:]:
+        best.run(stage)
+    return best
+
+
+def steps_of(stages: Sequence[Stage], races: int) -> int:
+    """Return the number of steps that `decided` takes."""
+    first = 1 + [stage.joints for stage in stages].index(True)
+    return races * sum(stage.steps for stage in stages[:first]) + sum(stage.steps for stage in stages[first:])
 
 
 def _spaced(targets: Targets, count: int) -> Targets:

@@ -7,19 +7,18 @@ working frame is the camera's with y up and z towards the camera.
 
 import math
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
+from rewild4d.priors.bodies.body import Body
 from rewild4d.priors.hypotheses import Hypotheses, cosine_series
 from rewild4d.priors.kinematics import moved, pose, rotation_about
 from rewild4d.priors.landmarks import Marks
-from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.silhouettes import mask_box
-from rewild4d.priors.template import MIRROR, PARENTS, quadruped
 from rewild4d.transforms import rigid
 from rewild4d.types import Camera, Frame
 
@@ -34,9 +33,6 @@ AZIMUTH_SPREAD, ELEVATION_SPREAD, ELEVATION = 0.35, math.radians(8.0), math.radi
 """Standard deviations of azimuth and elevation, and the mean elevation, radians."""
 SHIFT_SPREADS = (0.10, 0.10, 0.6)
 """Standard deviations of the animal's position in its window in x, y and depth, working units."""
-HEAD_FORWARD, NOSE_FORWARD, POLL_FORWARD = 0.4, 0.35, 0.1
-"""Least distance forwards of the nose from the poll, in head lengths; of nose and poll from the withers, in body
-lengths."""
 CARRIAGE_FRAMES = 16
 """About as many frames of a clip are looked at for the carriage of head and tail."""
 LONG = 24
@@ -78,9 +74,9 @@ class Views(Hypotheses):
     """
 
     @classmethod
-    def start(cls, facing: Tensor, path: Tensor, root_period: int = 4) -> Self:
-        """Return average animals at rest at the window's centre, from facings [B, 3, 3] and a path [T, 3]."""
-        still = super().start(facing, path, root_period)
+    def start(cls, body: Body, facing: Tensor, path: Tensor, root_period: int = 4) -> Self:
+        """Return average animals of a kind at rest at the window's centre, from facings [B, 3, 3] and a path [T, 3]."""
+        still = super().start(body, facing, path, root_period)
         rotation, shift = torch.zeros(*still.rotation.shape[:2], 2), torch.zeros(len(facing), len(path), 3)
         return replace(still, rotation=rotation, shift=shift)
 
@@ -95,8 +91,8 @@ class Views(Hypotheses):
         mirrored = self.by_guess()
         mirrored["facing"] = half_circle @ self.facing.transpose(-1, -2)
         mirrored["rotation"] = self.rotation.detach() * torch.tensor((-1.0, 1.0))
-        mirrored["angles"] = self.angles.detach()[..., list(MIRROR), :] * torch.tensor((1.0, -1.0, -1.0))
-        both = {name: torch.cat((value, mirrored[name])) for name, value in self.by_guess().items()}
+        mirrored["angles"] = self.angles.detach()[..., list(self.body.mirror), :] * torch.tensor((1.0, -1.0, -1.0))
+        both: dict[str, Any] = {name: torch.cat((value, mirrored[name])) for name, value in self.by_guess().items()}
         return replace(self, **both)
 
     def roots(self) -> Tensor:
@@ -110,9 +106,9 @@ class Views(Hypotheses):
 
     def projected(self, found: Marks) -> Tensor:
         """Project the marks of each guess: x and y over depth in the camera's axes, [B, m, 2]."""
-        bones = quadruped(Proportions(self.shape, self.relief), unit=False).bones
+        bones = self.template().bones
         frames, rows = found.frames.unique(return_inverse=True)
-        transforms = pose(self.joint_angles()[:, frames], bones[:, None, :, 0], PARENTS)[:, rows, found.bones]
+        transforms = pose(self.joint_angles()[:, frames], bones[:, None, :, 0], self.body.parents)[:, rows, found.bones]
         start, end = bones[:, found.bones].unbind(2)
         posed = moved(start + found.along[:, None] * (end - start), transforms)
         seen = moved(self.scales()[:, None, None] * posed, self.roots()[:, found.frames])
@@ -132,22 +128,8 @@ class Views(Hypotheses):
     def carriage(self) -> Tensor:
         """Return a penalty on heads folded into the body and on raised tails, squared body lengths, [B].
 
-        A head points forwards and lies before the withers, a tail hangs behind the hips; outlines alone do not tell.
+        Outlines alone do not tell.
         """
-        bones = quadruped(Proportions(self.shape, self.relief), unit=False).bones
-        every = max(1, len(self.path) // CARRIAGE_FRAMES)
-        chain = pose(self.joint_angles()[:, ::every, :8], bones[:, None, :8, 0], PARENTS[:8])
-        ends = torch.einsum("btjac,bjkc->btjka", chain[..., :3, :3], bones[:, :8]) + chain[..., None, :3, 3]
-        nose, poll, withers, tip, hips = (
-            ends[:, :, bone, end] for bone, end in ((0, 1), (0, 0), (3, 1), (4, 1), (6, 0))
-        )
-        length = (bones[:, 3, 1, 2] - bones[:, 6, 0, 2])[:, None]
-        head = (bones[:, 0, 1] - bones[:, 0, 0]).norm(dim=-1)[:, None]
-        faults = (
-            HEAD_FORWARD * head - (nose - poll)[..., 2],
-            NOSE_FORWARD * length - (nose - withers)[..., 2],
-            POLL_FORWARD * length - (poll - withers)[..., 2],
-            (tip - hips)[..., 1],
-            (tip - hips)[..., 2],
-        )
-        return (torch.stack(faults).clamp_min(0) / length).square().mean(2).sum(0)
+        bones, every = self.template().bones, max(1, len(self.path) // CARRIAGE_FRAMES)
+        transforms = pose(self.joint_angles()[:, ::every], bones[:, None, :, 0], self.body.parents)
+        return self.body.carriage(bones, transforms)

@@ -18,9 +18,10 @@ from rewild4d.config import load_preset
 from rewild4d.contracts import Finding, Method, Reconstruction
 from rewild4d.errors import UserError
 from rewild4d.files import digest
+from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.motion import pose_at, pose_gaussians, quats_from_normals, sample_surface
-from rewild4d.priors.template import PARENTS, posed_prior, quadruped
+from rewild4d.priors.posed import posed_prior
 from rewild4d.progress import Progress
 from rewild4d.registry import load_method
 from rewild4d.running.runner import save_reconstruction
@@ -102,12 +103,12 @@ def _difference(one: Reconstruction, other: Reconstruction, case: Case, what: st
 
 def tiny_case(frames: int = 4, width: int = 96, height: int = 64, views: int = 6) -> Case:
     """Render a walking template from a ring of cameras in a rotated, scaled world: the truth is known exactly."""
-    template = quadruped()
+    template = QUADRUPED.build()
     times = torch.arange(frames, dtype=torch.float64) / 10
-    angles = torch.zeros(frames, len(PARENTS), 3)
+    angles = torch.zeros(frames, len(template.parents), 3)
     for leg, phase in zip((10, 13, 16, 19), (0.0, 0.5, 0.0, 0.5), strict=True):
         angles[:, leg, 0] = 0.4 * torch.sin(2 * math.pi * (times.float() * 2 + phase))
-    transforms = pose(angles, template.bones[:, 0], PARENTS)
+    transforms = pose(angles, template.bones[:, 0], template.parents)
     rotation = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3)))[0]
     translation = torch.tensor((0.4, -0.2, 0.7), dtype=torch.float64)
     world = similarity(0.3, rotation * torch.linalg.det(rotation), translation)

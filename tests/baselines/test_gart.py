@@ -24,8 +24,8 @@ from rewild4d.errors import UserError
 from rewild4d.harmonics import C0
 from rewild4d.ours.canonical import REST_GAIN, Gaussians
 from rewild4d.ours.symmetry import Supervision
+from rewild4d.priors.bodies.tetrapod import PARENTS
 from rewild4d.priors.kinematics import pose
-from rewild4d.priors.template import PARENTS
 from rewild4d.running.conformance import tiny_case
 from rewild4d.transforms import matrix_to_quat, quat_to_matrix, skin_points, skin_quats
 from rewild4d.types import Case, Prior

@@ -23,7 +23,7 @@ def test_wrong_numbers_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_a_prior_of_something_else_than_the_clip_is_no_fit(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     flags = ("--frames", tmp_path, "--out", tmp_path / "p.npz", "--prior", "rig")
     said = refusal(capsys, "prior", "fit", *flags)
-    assert said == "rewild4d-bench: --prior rig: expected template or learned:<weights>.\n"
+    assert said == "rewild4d-bench: --prior rig: expected template, template:<which> or learned:<weights>.\n"
 
 
 def test_it_writes_weights_and_a_curve(

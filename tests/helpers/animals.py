@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.io.sampling import sample_mesh
-from rewild4d.priors.template import quadruped
+from rewild4d.priors.bodies.quadruped import QUADRUPED
 
 UP = torch.tensor((0.0, 1.0, 0.0))
 LEGS = {"front left": (8, 9, 10), "front right": (17, 18, 19)}
@@ -12,7 +12,7 @@ LEGS = {"front left": (8, 9, 10), "front right": (17, 18, 19)}
 
 def animal(count: int, seed: int, *, without: str | None = None, swing: float = 0.4) -> Tensor:
     """Area-uniform points in the object frame (y up, z towards the head), float64, [count, 3]."""
-    template = quadruped()
+    template = QUADRUPED.build()
     vertices, faces = template.vertices.double(), template.faces
     x, y, z = vertices.unbind(1)
     bend = 0.25 * (z - 0.3).clamp_min(0) ** 2 + 0.15 * (-0.5 - z).clamp_min(0) ** 2

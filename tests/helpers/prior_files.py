@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from rewild4d.priors.template import quadruped
+from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.transforms import look_at
 from rewild4d.types import Camera, Clip, Frame, Prior
 
@@ -19,7 +19,7 @@ def ring(angles: list[float]) -> tuple[Camera, ...]:
 
 def a_prior(angles: list[float], flipped: list[float]) -> Prior:
     """A prior of 24 frames a second, whose cameras and those of the mirrored frames are at these azimuths."""
-    template, count = quadruped(), len(angles)
+    template, count = QUADRUPED.build(), len(angles)
     still = torch.eye(4).repeat(count, 20, 1, 1)
     return Prior(
         "made", "", template.vertices, template.faces, template.weights, template.bones, torch.full((20,), -1),

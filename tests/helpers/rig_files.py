@@ -3,6 +3,7 @@
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -100,5 +101,64 @@ def build(path: Path, *, attach_to: int = 2, skinned: bool = True, move_tag: boo
         "materials": [{"pbrMetallicRoughness": {"baseColorFactor": [0.5, 1.0, 1.0, 1.0]}}],
         "skins": [{"joints": [1, 2], "inverseBindMatrices": bind}],
         "animations": [{"name": "Trot", "samplers": samplers, "channels": channels}],
+    }
+    return b.write(path, tree)
+
+
+def quats_about_x(angles: np.ndarray) -> np.ndarray:
+    """Return xyzw quaternions of rotations about x, [n] -> [n, 4]."""
+    zero = np.zeros_like(angles)
+    return np.stack((np.sin(angles / 2), zero, zero, np.cos(angles / 2)), axis=1)
+
+
+def save_template(
+    path: Path, template: Any, swings: dict[int, np.ndarray], *, hung: dict[int, int] | None = None,
+    shifts: dict[int, np.ndarray] | None = None, yaw: float = 0.0,
+) -> Path:  # fmt: skip
+    """Write a template of the package as a rig with one clip of a second.
+
+    Args:
+        path: the .glb to write.
+        template: a `Template`.
+        swings: angles about x of some bones over the clip, each [n].
+        hung: other parents of some bones in the file, -1 for the root.
+        shifts: translations of some bones over the clip against their parents in the file, each [n, 3].
+        yaw: the whole animal is turned by in the file, radians.
+    """
+    b, count = Builder(), len(template.parents)
+    parents = [(hung or {}).get(bone, parent) for bone, parent in enumerate(template.parents)]
+    pivots = template.bones[:, 0].numpy().astype(float)
+    weights = template.weights.numpy()
+    order = np.argsort(-weights, axis=1)[:, :4]
+    largest = np.take_along_axis(weights, order, 1)
+    inverse = np.tile(np.eye(4), (count, 1, 1))
+    inverse[:, :3, 3] = -pivots
+    attributes = {
+        "POSITION": b.add(template.vertices.numpy()),
+        "JOINTS_0": b.add(order, np.uint8),
+        "WEIGHTS_0": b.add(largest / largest.sum(1, keepdims=True)),
+    }
+    faces, bind = b.add(template.faces.numpy().flatten(), np.uint16), b.add(inverse.transpose(0, 2, 1))
+    nodes: list[dict] = [
+        {"name": f"bone_{bone}", "translation": list(pivots[bone] - (pivots[parent] if parent >= 0 else 0))}
+        for bone, parent in enumerate(parents)
+    ]
+    nodes.append({"name": "armature", "rotation": [0.0, float(np.sin(yaw / 2)), 0.0, float(np.cos(yaw / 2))]})
+    nodes.append({"name": "skin", "mesh": 0, "skin": 0})
+    for bone, parent in enumerate(parents):
+        nodes[parent if parent >= 0 else count].setdefault("children", []).append(bone)
+    nodes[count]["children"].append(count + 1)
+    samplers, channels = [], []
+    tracks = [(bone, "rotation", quats_about_x(angles)) for bone, angles in swings.items()]
+    for bone, kind, values in [*tracks, *((bone, "translation", moved) for bone, moved in (shifts or {}).items())]:
+        samplers.append({"input": b.add(np.linspace(0, 1, len(values))), "output": b.add(values)})
+        channels.append({"sampler": len(samplers) - 1, "target": {"node": bone, "path": kind}})
+    tree = {
+        "scene": 0,
+        "scenes": [{"nodes": [count]}],
+        "nodes": nodes,
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": faces}]}],
+        "skins": [{"joints": list(range(count)), "inverseBindMatrices": bind}],
+        "animations": [{"name": "Swing", "samplers": samplers, "channels": channels}] if channels else [],
     }
     return b.write(path, tree)

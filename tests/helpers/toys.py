@@ -6,9 +6,11 @@ import torch
 
 from rewild4d.ours.config import Canonical, Config, Deform, Density, Skinning, WarmUp
 from rewild4d.ours.losses.config import Geometry
+from rewild4d.priors.bodies.quadruped import QUADRUPED
+from rewild4d.priors.bodies.tetrapod import PARENTS
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.motion import quats_from_normals, sample_surface
-from rewild4d.priors.template import PARENTS, posed_prior, quadruped
+from rewild4d.priors.posed import posed_prior
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import look_at, skin_points
 from rewild4d.types import Camera, Clip, Frame, Prior
@@ -44,7 +46,7 @@ def swing(amplitude: float) -> torch.Tensor:
         step = amplitude * math.sin(2 * math.pi * (frame + 1) / FRAMES)
         for bone, sign in ((10, 1), (19, -1), (13, -1), (16, 1)):
             angles[frame, bone, 0] = sign * step
-    return pose(angles, quadruped().bones[:, 0], PARENTS)
+    return pose(angles, QUADRUPED.build().bones[:, 0], PARENTS)
 
 
 def make_toy() -> tuple[Clip, Prior]:
@@ -52,7 +54,8 @@ def make_toy() -> tuple[Clip, Prior]:
     cameras = [camera(index) for index in range(FRAMES)]
     still = torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)
     times = torch.arange(FRAMES, dtype=torch.float64) / 10
-    prior = posed_prior(quadruped(), swing(0.0), still, cameras, times, name="toy", provenance="toy", digest="toy")
+    given = QUADRUPED.build(), swing(0.0), still, cameras, times
+    prior = posed_prior(*given, name="toy", provenance="toy", digest="toy")
     surface = sample_surface(prior, 800, torch.Generator().manual_seed(1))
     front = surface.points[:, 2:] > 0
     colors = torch.where(front, torch.tensor((0.8, 0.3, 0.1)), torch.tensor((0.1, 0.4, 0.7)))

@@ -250,9 +250,9 @@ def gradients(made: Training, given: StepInput) -> dict[str, Tensor]:
 @pytest.mark.parametrize("name", CONFIGS)
 def test_gradients_of_a_step_are_those_of_plain_torch_in_double_precision(name: str, device: str) -> None:
     """Kernels of the device against their twins; both render with the rasterizer's reference."""
+    made, exact = training(CONFIGS[name], torch.device(device)), training(CONFIGS[name])
     set_default("reference")
     try:
-        made, exact = training(CONFIGS[name], torch.device(device)), training(CONFIGS[name])
         for each in (made, exact):  # they start at zero, where gradients vanish
             generator = torch.Generator().manual_seed(1)
             for layer in (each.model.network.head, each.model.deform.out):

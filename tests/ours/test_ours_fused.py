@@ -18,7 +18,8 @@ from rewild4d.ours.model import Model
 from rewild4d.ours.pose import joint_transforms
 from rewild4d.ours.skinning import SkinningField, build_field
 from rewild4d.ours.symmetry import Target
-from rewild4d.priors.template import MIRROR, PARENTS, quadruped
+from rewild4d.priors.bodies.quadruped import QUADRUPED
+from rewild4d.priors.bodies.tetrapod import MIRROR, PARENTS
 from rewild4d.types import Camera
 
 
@@ -115,7 +116,7 @@ def test_image_losses(height: int, width: int, center: tuple[float, float], radi
 
 @pytest.fixture(scope="module")
 def field() -> SkinningField:
-    template = quadruped()
+    template = QUADRUPED.build()
     return build_field(template.vertices, template.weights, torch.tensor(MIRROR), Skinning(resolution=9, sweeps=1))
 
 
@@ -132,7 +133,7 @@ def test_sampled_skinning_weights(field: SkinningField) -> None:
 
 @pytest.mark.parametrize(("isolated", "spread"), [(True, 1.0), (False, 1.0), (True, 0.2)])
 def test_skinning_of_both_branches(isolated: bool, spread: float) -> None:
-    template, count = quadruped(), 1300
+    template, count = QUADRUPED.build(), 1300
     # Near the rest pose no rotation is opposed to another, which is a path of its own.
     quats = torch.nn.functional.normalize(unit(20, 4, seed=1) * spread + torch.eye(4)[0] * (1 - spread), dim=-1)
     assert bool((quats @ quats.T < 0).any()) == (spread == 1)

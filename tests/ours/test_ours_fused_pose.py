@@ -18,7 +18,8 @@ from rewild4d.ours.model import Model
 from rewild4d.ours.pose import Pose, PoseNetwork, blend_poses, pose_distance, time_code
 from rewild4d.ours.skinning import SkinningField
 from rewild4d.ours.symmetry import Key
-from rewild4d.priors.template import MIRROR, PARENTS, quadruped
+from rewild4d.priors.bodies.quadruped import QUADRUPED
+from rewild4d.priors.bodies.tetrapod import MIRROR, PARENTS
 from rewild4d.types import OBJECT_DIAGONAL
 
 SMALL = PoseConfig(width=32, heads=2, anchor_size=5, frequencies=2)
@@ -37,7 +38,7 @@ def model(dtype: torch.dtype = torch.float32, pose: PoseConfig = SMALL) -> Model
     values = {name: torch.zeros(4, size) for name, size in (("means", 3), ("quats", 4), ("log_scales", 3))}
     values |= {"logit_opacities": torch.zeros(4), "colors": torch.zeros(4, 1, 3)}
     grid = SkinningField(torch.zeros(8, 20), torch.zeros(3), torch.ones(3), torch.tensor(MIRROR), False)
-    skeleton = quadruped().bones[:, 0].float(), torch.tensor(PARENTS), torch.tensor(MIRROR)
+    skeleton = QUADRUPED.build().bones[:, 0].float(), torch.tensor(PARENTS), torch.tensor(MIRROR)
     config = Config(deform=Deform(width=16), pose=pose)
     made = Model(config, Gaussians(values, 1.0), grid, *skeleton, torch.Generator().manual_seed(0))
     made.network = network(pose)

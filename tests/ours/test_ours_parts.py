@@ -25,7 +25,8 @@ from rewild4d.ours.pose import PoseNetwork, blend_poses, joint_transforms, time_
 from rewild4d.ours.schedule import exponential, fade, ramp
 from rewild4d.ours.skinning import build_field
 from rewild4d.ours.symmetry import Target
-from rewild4d.priors.template import MIRROR, PARENTS, quadruped
+from rewild4d.priors.bodies.quadruped import QUADRUPED
+from rewild4d.priors.bodies.tetrapod import MIRROR, PARENTS
 from rewild4d.transforms import mirror_points, mirror_quats, mirror_transforms, similarity, skin_points, skin_quats
 from rewild4d.types import Camera
 
@@ -56,7 +57,7 @@ def test_the_four_codes_differ_at_every_frame(frames: int) -> None:
 
 
 def test_mirrored_pose_is_the_mirrored_transform() -> None:
-    template = quadruped()
+    template = QUADRUPED.build()
     mirror, pivots = torch.tensor(MIRROR), template.bones[:, 0]
     assert torch.equal(mirror[mirror], torch.arange(20))
     quats, shifts = random_poses(2)
@@ -121,7 +122,7 @@ def test_folded_attention_equals_the_plain_one() -> None:
 
 
 def test_field_samples_stay_on_the_simplex_and_follow_the_prior() -> None:
-    template = quadruped()
+    template = QUADRUPED.build()
     field = build_field(template.vertices, template.weights, torch.tensor(MIRROR), Skinning(resolution=24))
     points = 6 * torch.rand(500, 3, generator=generator()) - 3
     weights = field.sample(field.probabilities(), points)
@@ -133,7 +134,7 @@ def test_field_samples_stay_on_the_simplex_and_follow_the_prior() -> None:
 
 
 def test_field_interpolates_linearly_between_voxels() -> None:
-    template = quadruped()
+    template = QUADRUPED.build()
     field = build_field(template.vertices, template.weights, torch.tensor(MIRROR), Skinning(resolution=8, sweeps=1))
     table = field.probabilities()
     row = (3 * 8 + 4) * 8 + 5
@@ -145,7 +146,7 @@ def test_field_interpolates_linearly_between_voxels() -> None:
 
 
 def test_tied_field_is_its_own_mirror_image() -> None:
-    template, mirror = quadruped(), torch.tensor(MIRROR)
+    template, mirror = QUADRUPED.build(), torch.tensor(MIRROR)
     field = build_field(template.vertices, template.weights, mirror, Skinning(resolution=16, tied=True))
     with torch.no_grad():
         field.logits += torch.randn(field.logits.shape, generator=generator())

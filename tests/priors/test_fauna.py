@@ -11,11 +11,11 @@ import torch
 from calling import call, refusal
 
 from rewild4d.errors import UserError
+from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.fauna import read_fauna
 from rewild4d.priors.fauna_bones import estimate_bones, joint_transforms, skinning_weights
 from rewild4d.priors.fauna_files import read_obj
 from rewild4d.priors.io import load_prior
-from rewild4d.priors.template import quadruped
 from rewild4d.transforms import skin_points
 
 STILL = np.concatenate((np.eye(3).ravel(), np.zeros(3)))
@@ -36,7 +36,7 @@ def write_fauna(folder: Path, rest: torch.Tensor, faces: torch.Tensor, angles: t
 
 
 def test_fauna_files_become_a_prior(tmp_path: Path) -> None:
-    template = quadruped()
+    template = QUADRUPED.build()
     rest = 0.8 * template.vertices.double()
     angles = 0.15 * torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     angles[1] *= 0.2  # the strongly bent first frame is not the one whose rest mesh is kept
@@ -58,7 +58,7 @@ def test_fauna_files_become_a_prior(tmp_path: Path) -> None:
 
 
 def test_fauna_boxes_place_the_crop(tmp_path: Path) -> None:
-    template = quadruped()
+    template = QUADRUPED.build()
     write_fauna(tmp_path / "f", template.vertices.double(), template.faces, torch.zeros(2, 20, 3).double(), STILL)
     (tmp_path / "b").mkdir()
     for frame in range(2):
@@ -74,7 +74,7 @@ def test_fauna_boxes_place_the_crop(tmp_path: Path) -> None:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the files of two frames and their boxes, without a fault."""
     folder = tmp_path_factory.mktemp("fauna") / "f"
-    template = quadruped()
+    template = QUADRUPED.build()
     write_fauna(folder, template.vertices.double(), template.faces, torch.zeros(2, 20, 3).double(), STILL)
     for frame in range(2):
         (folder / f"{frame}_box.txt").write_text(f"{frame} 30 40 100 100 320 240 1.0")

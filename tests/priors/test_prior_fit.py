@@ -3,70 +3,27 @@
 import math
 from dataclasses import replace
 
-import msgspec
 import pytest
 import torch
 from torch import Tensor
+from walking import QUICK, WORLD_SCALE, shortened, silent, walking_clip, world
 
 from rewild4d.errors import UserError
-from rewild4d.priors.config import PRESETS, PriorConfig
+from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.fit import fit_template
 from rewild4d.priors.hypotheses import Hypotheses, cosine_series
-from rewild4d.priors.kinematics import pose
 from rewild4d.priors.overlay import overlay
-from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.search import mask_rays, single_view, trajectory, up_directions
 from rewild4d.priors.silhouettes import outline, rasterized, splat
-from rewild4d.priors.template import PARENTS, quadruped, quads
-from rewild4d.transforms import axis_angle_to_matrix, look_at, similarity, skin_points
-from rewild4d.types import Camera, Clip, Frame
+from rewild4d.transforms import look_at
+from rewild4d.types import Camera
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-QUICK = PRESETS["quick"]
-WORLD_SCALE = 0.37
-
-
-def world() -> tuple[Tensor, Tensor]:
-    """The animal's similarity to a world with a tilted up axis, and that up axis."""
-    rotation = axis_angle_to_matrix(torch.tensor((0.9, 2.1, -0.7), dtype=torch.float64))
-    return similarity(WORLD_SCALE, rotation, torch.tensor((1.0, -2.0, 0.5), dtype=torch.float64)), rotation[:, 1]
-
-
-def walking_clip(count: int, cameras: str) -> Clip:
-    """A long-necked walking template seen by a ring of cameras ("sweep") or from one place ("fixed")."""
-    template = quadruped(Proportions.of(neck_length=1.2, tail_length=0.7, body_length=2.0))
-    object_to_world, up = world()
-    frames = []
-    for t in range(count):
-        angles, phase = torch.zeros(20, 3), 2 * math.pi * t / count
-        for top, offset in ((10, 0.0), (13, math.pi), (16, 0.0), (19, math.pi)):
-            angles[top, 0] = 0.45 * math.sin(phase + offset)
-        posed = skin_points(template.vertices, template.weights, pose(angles, template.bones[:, 0], PARENTS))
-        turn = 2 * math.pi * t / count if cameras == "sweep" else 0.8
-        eye = torch.tensor((9 * math.sin(turn), 2.5, 9 * math.cos(turn)), dtype=torch.float64)
-        eye = object_to_world[:3, :3] @ eye + object_to_world[:3, 3]
-        intrinsics = torch.tensor(((150.0, 0.0, 64.0), (0.0, 150.0, 48.0), (0.0, 0.0, 1.0)), dtype=torch.float64)
-        camera = Camera(look_at(eye, object_to_world[:3, 3], up), intrinsics, 128, 96)
-        points = posed.double() @ object_to_world[:3, :3].T + object_to_world[:3, 3]
-        mask = torch.from_numpy(outline(points, template.faces, camera)).float()[None] / 255
-        frames.append(Frame(t / 24, camera, mask.expand(3, -1, -1), mask))
-    return Clip("made/walk", "none", tuple(frames), 24.0, "CC0", "")
-
-
-def shortened(steps: int, yaw_starts: int = 4) -> PriorConfig:
-    """The quick preset with fewer steps a stage and fewer starts."""
-    stages = tuple(msgspec.structs.replace(stage, steps=steps) for stage in QUICK.stages)
-    return msgspec.structs.replace(QUICK, stages=stages, yaw_starts=yaw_starts)
 
 
 def angle(a: Tensor, b: Tensor) -> float:
     cosine = torch.nn.functional.cosine_similarity(a, b, dim=0).clamp(-1, 1)
     return float(torch.rad2deg(torch.arccos(cosine)))
-
-
-def silent(*_: object) -> None:
-    return None
 
 
 def test_a_known_animal_is_found_again() -> None:
@@ -146,7 +103,7 @@ def test_only_a_single_direction_of_view_is_a_gaze_and_it_is_told_in_the_working
 
 
 def test_heading_is_free_but_leaning_and_turning_over_time_cost() -> None:
-    guesses = Hypotheses.start(torch.eye(3).expand(3, 3, 3), torch.zeros(8, 3))
+    guesses = Hypotheses.start(QUADRUPED, torch.eye(3).expand(3, 3, 3), torch.zeros(8, 3))
     guesses.rotation[0, 0, 1] = guesses.rotation[1, 0, 0] = guesses.rotation[2, 1, 1] = 1.0
     assert guesses.penalties()[3].tolist() == pytest.approx([0.0, 1.0, 1.0])
     turned = torch.tensor((math.sin(0.35), 0.0, math.cos(0.35)))
@@ -166,14 +123,14 @@ def test_one_blob_is_a_round_gaussian_of_its_projected_size() -> None:
 
 @pytest.mark.parametrize("size", [64, 128])
 def test_flat_gaussians_on_the_surface_have_its_outline(size: int) -> None:
-    template = quadruped()
+    template = QUADRUPED.build()
     eye = torch.tensor((5.0, 3.0, 6.0), dtype=torch.float64)
     focal, half = 1.35 * size, size / 2
     intrinsics = torch.tensor(((focal, 0, half), (0, focal, half), (0, 0, 1)), dtype=torch.float64)
     camera = Camera(look_at(eye, 0 * eye, torch.tensor((0.0, 1.0, 0.0)).double()), intrinsics, size, size)
     matrix = camera.world_to_camera.float()
     vertices = (template.vertices @ matrix[:3, :3].T + matrix[:3, 3])[None, None].requires_grad_()
-    matte = rasterized(vertices, quads(), intrinsics.float()[None], size)
+    matte = rasterized(vertices, template.quads, intrinsics.float()[None], size)
     assert matte.shape == (1, 1, size, size)
     drawn, wanted = matte[0, 0] > 0.5, torch.from_numpy(outline(template.vertices, template.faces, camera)) > 127
     assert float((drawn & wanted).sum() / (drawn | wanted).sum()) > 0.93
@@ -189,10 +146,10 @@ def test_cosines_start_with_a_constant_and_damp_fast_motion() -> None:
 
 
 def test_legs_that_swing_backwards_on_the_ground_are_a_gait_and_time_reversed_they_are_none() -> None:
-    guesses = Hypotheses.start(torch.eye(3).expand(2, 3, 3), torch.zeros(16, 3))
+    guesses = Hypotheses.start(QUADRUPED, torch.eye(3).expand(2, 3, 3), torch.zeros(16, 3))
     # the series' second term falls over time; a positive angle about x takes a hanging foot backwards
     guesses.angles[:, 1, [10, 13, 16, 19], 0] = torch.tensor((-1.0, 1.0))[:, None]
     forwards, backwards = guesses.backward_gait().tolist()
     assert forwards < -0.5 and backwards == pytest.approx(-forwards, abs=1e-5)
-    still = Hypotheses.start(torch.eye(3)[None], torch.zeros(16, 3))
+    still = Hypotheses.start(QUADRUPED, torch.eye(3)[None], torch.zeros(16, 3))
     assert float(still.backward_gait()) == pytest.approx(0.0, abs=1e-6)

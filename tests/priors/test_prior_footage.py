@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from rewild4d.errors import UserError
+from rewild4d.priors.bodies.quadruped import QUADRUPED
+from rewild4d.priors.bodies.tetrapod import MIRROR, PARENTS
 from rewild4d.priors.config import FOOTAGE, PriorConfig
 from rewild4d.priors.footage import Evidence, fit_footage
 from rewild4d.priors.judge import joint_scores
@@ -16,9 +18,7 @@ from rewild4d.priors.landmarks import LANDMARKS, Marks, landmark_pixels, load_ma
 from rewild4d.priors.motion import camera_at
 from rewild4d.priors.overlay import save_overlay
 from rewild4d.priors.placing import in_crops, resized, with_cameras
-from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.silhouettes import outline
-from rewild4d.priors.template import MIRROR, PARENTS, quadruped
 from rewild4d.priors.views import DISTANCE, ELEVATION, ELEVATION_SPREAD, WINDOW, Views, fauna_camera, windows
 from rewild4d.transforms import axis_angle_to_matrix, look_at, skin_points
 from rewild4d.types import Camera, Clip, Crop, Frame, Keypoints, Prior
@@ -40,7 +40,7 @@ def shortened(steps: tuple[int, ...]) -> PriorConfig:
 @pytest.fixture(scope="module")
 def walk() -> tuple[Clip, list[Camera], Marks]:
     """A walking template seen from its left, its true cameras in the object frame, and where its landmarks are."""
-    template = quadruped(Proportions.of(neck_length=1.1, tail_length=0.7, body_length=2.0))
+    template = QUADRUPED.build(QUADRUPED.proportions(neck_length=1.1, tail_length=0.7, body_length=2.0))
     frames, cameras, points, count = [], [], [], 6
     for t in range(count):
         angles, phase = torch.zeros(20, 3), 2 * math.pi * t / count
@@ -179,10 +179,10 @@ def test_windows_follow_the_box_and_bridge_a_gap() -> None:
 
 
 def test_marks_project_like_the_prior_that_a_guess_becomes(fitted: Prior) -> None:
-    guess = Views.start(torch.eye(3)[None], torch.zeros(1, 3))
+    guess = Views.start(QUADRUPED, torch.eye(3)[None], torch.zeros(1, 3))
     bones = torch.tensor((0, 8, 4))
     found = Marks(torch.zeros(3, dtype=torch.long), bones, torch.tensor((1.0, 0.5, 0.0)), torch.zeros(3, 2))
-    template = quadruped(unit=False)
+    template = QUADRUPED.build(unit=False)
     rest = template.bones[bones, 0] + found.along[:, None] * (template.bones[bones, 1] - template.bones[bones, 0])
     turn = guess.roots()[0, 0]
     seen = rest @ turn[:3, :3].T
@@ -193,7 +193,7 @@ def test_marks_project_like_the_prior_that_a_guess_becomes(fitted: Prior) -> Non
 
 def test_a_guess_reflected_in_depth_has_the_same_outline_from_afar() -> None:
     generator = torch.Generator().manual_seed(0)
-    guess = Views.start(axis_angle_to_matrix(torch.tensor(((0.0, 0.7, 0.0),))), torch.zeros(8, 3))
+    guess = Views.start(QUADRUPED, axis_angle_to_matrix(torch.tensor(((0.0, 0.7, 0.0),))), torch.zeros(8, 3))
     guess.rotation = torch.randn(guess.rotation.shape, generator=generator) * torch.tensor((1.0, 0.0))
     guess.rotation[..., 0, 1] = -ELEVATION / ELEVATION_SPREAD  # eye level
     guess.angles = 0.5 * torch.randn(guess.angles.shape, generator=generator)
@@ -209,7 +209,7 @@ def test_a_guess_reflected_in_depth_has_the_same_outline_from_afar() -> None:
 
 
 def test_a_folded_head_and_a_raised_tail_cost() -> None:
-    guesses = Views.start(torch.eye(3).expand(3, 3, 3), torch.zeros(4, 3))
+    guesses = Views.start(QUADRUPED, torch.eye(3).expand(3, 3, 3), torch.zeros(4, 3))
     guesses.angles[1, 0, 2, 0] = guesses.angles[1, 0, 1, 0] = -4.0  # about x backwards: over the back
     guesses.angles[2, 0, 6, 0] = guesses.angles[2, 0, 5, 0] = 4.0
     plain, folded, raised = guesses.carriage().tolist()

@@ -15,12 +15,13 @@ from rewild4d.datasets.artemis.files import list_motions
 from rewild4d.datasets.artemis.rig import read_rig
 from rewild4d.datasets.artemis.volume import read_pose
 from rewild4d.errors import UserError
+from rewild4d.priors.bodies.quadruped import QUADRUPED
+from rewild4d.priors.bodies.tetrapod import MIRROR, PARENTS
 from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import STANDARD
 from rewild4d.priors.io import require_loadable
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.rig import rig_prior, twins
-from rewild4d.priors.template import MIRROR, PARENTS, quadruped
 from rewild4d.transforms import axis_angle_to_matrix, rigid, similarity, skin_points
 from rewild4d.types import Camera, Clip, Frame, Rig, Truth
 
@@ -35,7 +36,7 @@ def moved(points: Tensor, matrix: Tensor) -> Tensor:
 def a_rig() -> tuple[Rig, Tensor]:
     """The template as somebody's rig: any axes, bones with local axes of their own, a body that goes its way; and the
     vertices as they are in the world at each frame, [T, n, 3]."""
-    template, generator = quadruped(), torch.Generator().manual_seed(0)
+    template, generator = QUADRUPED.build(), torch.Generator().manual_seed(0)
     stand = similarity(SIZE, TRUE, torch.tensor((0.4, -0.2, 3.0), dtype=torch.float64))
     pivots = template.bones[:, 0].double()
     axes = axis_angle_to_matrix(torch.randn(20, 3, generator=generator, dtype=torch.float64))
@@ -85,8 +86,8 @@ def test_a_rig_becomes_a_prior_that_moves_as_the_animal_does(degrees: float) -> 
         posed = skin_points(found.vertices.double(), found.weights.double(), found.transforms[t].double())
         assert (moved(posed, found.object_to_world[t]) - points[t]).abs().max() < 1e-5
     # the object frame is the template's own but for where its origin lies in the plane of symmetry
-    shift = found.vertices.mean(0) - quadruped().vertices.mean(0)
-    assert abs(shift[0]) < 2e-3 and (found.vertices - shift - quadruped().vertices).abs().max() < 1e-2
+    shift = found.vertices.mean(0) - QUADRUPED.build().vertices.mean(0)
+    assert abs(shift[0]) < 2e-3 and (found.vertices - shift - QUADRUPED.build().vertices).abs().max() < 1e-2
     assert found.mirror.tolist() == list(MIRROR) and found.parents.tolist() == list(PARENTS)
     assert found.name == "rig" and "mask_iou" in found.quality
 

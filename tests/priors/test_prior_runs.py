@@ -265,6 +265,7 @@ def test_the_command_writes_a_file_that_a_run_takes(
     folder = panned(tmp_path / "clip", 14)
     moving.save(folder / "masks" / "00000.png", moving.mask(0) * 0)  # the clip starts at the second frame
     words = ["--frames", folder / "frames", "--masks", folder / "masks", "--out", tmp_path / "p.npz", "--fps", 10]
+    words += ["--prior", "template:quadruped"]
     with pytest.raises(SystemExit) as stop:
         main(["prior", "fit", *map(str, words)])
     assert stop.value.code == 0

@@ -8,10 +8,11 @@ import torch
 from prior_files import a_prior, ring
 
 from rewild4d.ours.motion import Root
+from rewild4d.priors.bodies.quadruped import QUADRUPED
+from rewild4d.priors.bodies.tetrapod import MIRROR, PARENTS
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.placing import known_frames, with_cameras
 from rewild4d.priors.steady import without_hops
-from rewild4d.priors.template import MIRROR, PARENTS, quadruped
 from rewild4d.transforms import camera_in_object, mirror_points, rigid
 from rewild4d.types import Camera, Clip, Frame, Prior
 
@@ -24,7 +25,7 @@ def posed_prior() -> Prior:
     hopping = [angle + math.pi * (t == PLAIN_HOPS) for t, angle in enumerate(ANGLES)]
     mirrored = [-angle + math.pi * (t == FLIP_HOPS) for t, angle in enumerate(ANGLES)]
     angles = 0.3 * torch.randn(2, COUNT, 20, 3, generator=torch.Generator().manual_seed(0))
-    plain, flipped = (pose(each, quadruped().bones[:, 0], PARENTS) for each in angles)
+    plain, flipped = (pose(each, QUADRUPED.build().bones[:, 0], PARENTS) for each in angles)
     made = a_prior(hopping, mirrored)
     return replace(made, transforms=plain, transforms_flip=flipped, mirror=torch.tensor(MIRROR))
 
@@ -39,7 +40,7 @@ def test_a_mended_sequence_shows_the_mirror_image_of_the_other(row: int) -> None
     """A point of a bone lies in one image where its reflection, on the other side's bone, lies in the flipped one."""
     given = posed_prior()
     made = without_hops(given).prior
-    points = quadruped().bones[:, 1] + 0.1
+    points = QUADRUPED.build().bones[:, 1] + 0.1
     reflected = mirror_points(points)[given.mirror]  # given.mirror is its own inverse
     plain = pixels(points, made.transforms[row], made.cameras[row])
     flipped = pixels(reflected, made.transforms_flip[row], made.cameras_flip[row])[given.mirror]

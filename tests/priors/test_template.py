@@ -3,9 +3,10 @@
 import pytest
 import torch
 
+from rewild4d.priors.bodies.body import Proportions, diagonal
+from rewild4d.priors.bodies.quadruped import QUADRUPED
+from rewild4d.priors.bodies.tetrapod import MIRROR, PARENTS, SECTIONS
 from rewild4d.priors.kinematics import depth_levels, pose
-from rewild4d.priors.proportions import PROPORTIONS, SECTIONS, Proportions
-from rewild4d.priors.template import MIRROR, PARENTS, diagonal, quadruped
 from rewild4d.transforms import mirror_points, mirror_transforms, skin_points
 
 
@@ -13,11 +14,11 @@ from rewild4d.transforms import mirror_points, mirror_transforms, skin_points
 def shape(request: pytest.FixtureRequest) -> Proportions:
     """The average animal and a random one."""
     generator = torch.Generator().manual_seed(3)
-    return Proportions(request.param * 0.7 * torch.randn(len(PROPORTIONS), generator=generator))
+    return Proportions(request.param * 0.7 * torch.randn(QUADRUPED.measures, generator=generator))
 
 
 def test_rest_shape_has_the_units_and_axes_of_the_object_frame(shape: Proportions) -> None:
-    template = quadruped(shape)
+    template = QUADRUPED.build(shape)
     assert float(diagonal(template.vertices)) == pytest.approx(5.0, abs=1e-5)
     head, tail = template.bones[0, 1], template.bones[4, 1]
     assert head[2] > tail[2]
@@ -27,7 +28,7 @@ def test_rest_shape_has_the_units_and_axes_of_the_object_frame(shape: Proportion
 
 
 def test_symmetric_about_the_plane_with_the_mirror_involution(shape: Proportions) -> None:
-    template, mirror = quadruped(shape), torch.tensor(MIRROR)
+    template, mirror = QUADRUPED.build(shape), torch.tensor(MIRROR)
     assert (mirror[mirror] == torch.arange(20)).all()
     assert torch.allclose(mirror_points(template.bones), template.bones[mirror], atol=1e-6)
     distances = torch.cdist(mirror_points(template.vertices), template.vertices)
@@ -39,7 +40,7 @@ def test_symmetric_about_the_plane_with_the_mirror_involution(shape: Proportions
 
 
 def test_every_edge_of_the_mesh_is_shared_by_two_opposite_triangles(shape: Proportions) -> None:
-    template = quadruped(shape)
+    template = QUADRUPED.build(shape)
     edges = torch.cat([template.faces[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0))]).tolist()
     directed = {tuple(edge) for edge in edges}
     assert len(directed) == len(edges)
@@ -47,7 +48,7 @@ def test_every_edge_of_the_mesh_is_shared_by_two_opposite_triangles(shape: Propo
 
 
 def test_every_tube_faces_outwards(shape: Proportions) -> None:
-    template = quadruped(shape)
+    template = QUADRUPED.build(shape)
     a, b, c = template.vertices[template.faces].unbind(1)
     volumes = (a * torch.linalg.cross(b, c)).sum(1) / 6
     body, leg = 2 * 47 * 16 + 32, 2 * 15 * 10 + 20
@@ -56,7 +57,7 @@ def test_every_tube_faces_outwards(shape: Proportions) -> None:
 
 
 def test_weights_sum_to_one_and_never_join_two_legs() -> None:
-    weights = quadruped().weights
+    weights = QUADRUPED.build().weights
     assert torch.allclose(weights.sum(1), torch.ones(len(weights)), atol=1e-6) and bool((weights >= 0).all())
     legs = torch.stack([weights[:, 8 + 3 * k : 11 + 3 * k].sum(1) for k in range(4)], 1)
     assert int(((legs > 0).sum(1) > 1).sum()) == 0
@@ -64,23 +65,24 @@ def test_weights_sum_to_one_and_never_join_two_legs() -> None:
 
 
 def test_measures_change_what_they_name_and_carry_gradients() -> None:
-    plain = quadruped(Proportions.of(neck_length=0.5), unit=False)
-    longer = quadruped(Proportions.of(neck_length=1.5), unit=False)
+    plain = QUADRUPED.build(QUADRUPED.proportions(neck_length=0.5), unit=False)
+    longer = QUADRUPED.build(QUADRUPED.proportions(neck_length=1.5), unit=False)
     assert float((longer.bones[2, 0] - longer.bones[1, 1]).norm()) == pytest.approx(1.5, abs=1e-5)
     assert torch.allclose(plain.bones[8:], longer.bones[8:])
-    deviations = torch.zeros(len(PROPORTIONS), requires_grad=True)
-    template = quadruped(Proportions(deviations), unit=False)
+    deviations = torch.zeros(QUADRUPED.measures, requires_grad=True)
+    template = QUADRUPED.build(Proportions(deviations), unit=False)
     (template.vertices.square().sum() + template.bones.square().sum()).backward()
     assert deviations.grad is not None and bool((deviations.grad != 0).all())
 
 
 def test_relief_widens_one_place_of_both_sides_and_leaves_the_bones() -> None:
     relief = torch.zeros(sum(SECTIONS), 4, requires_grad=True)
-    plain, flat = quadruped(unit=False), quadruped(Proportions(torch.zeros(len(PROPORTIONS)), relief), unit=False)
+    level = Proportions(torch.zeros(QUADRUPED.measures), relief)
+    plain, flat = QUADRUPED.build(unit=False), QUADRUPED.build(level, unit=False)
     assert torch.equal(plain.vertices, flat.vertices)
     wide = relief.detach().clone()
     wide[8, 0] = 1.0
-    widened = quadruped(Proportions(torch.zeros(len(PROPORTIONS)), wide), unit=False)
+    widened = QUADRUPED.build(Proportions(torch.zeros(QUADRUPED.measures), wide), unit=False)
     moved = (widened.vertices - plain.vertices).abs()
     belly = moved[:, 0] > 1e-4
     assert float(moved[:, 1:].max()) < 1e-6 and torch.equal(plain.bones, widened.bones)
@@ -90,7 +92,7 @@ def test_relief_widens_one_place_of_both_sides_and_leaves_the_bones() -> None:
 
 
 def test_turning_the_top_of_a_leg_moves_that_leg_rigidly_and_nothing_else() -> None:
-    template = quadruped()
+    template = QUADRUPED.build()
     angles = torch.zeros(20, 3)
     angles[10, 0] = 0.7
     transforms = pose(angles, template.bones[:, 0], PARENTS)
@@ -102,7 +104,7 @@ def test_turning_the_top_of_a_leg_moves_that_leg_rigidly_and_nothing_else() -> N
 
 
 def test_mirrored_angles_give_the_mirrored_pose() -> None:
-    template, mirror = quadruped(), torch.tensor(MIRROR)
+    template, mirror = QUADRUPED.build(), torch.tensor(MIRROR)
     angles = 0.5 * torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
     swapped = angles[mirror] * torch.tensor((1.0, -1.0, -1.0))
     posed = pose(angles, template.bones[:, 0], PARENTS)

@@ -10,15 +10,14 @@ import torch
 from prior_files import ring
 
 from rewild4d.priors import fit, footage
+from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.config import FOOTAGE, PRESETS, PriorConfig, with_points
 from rewild4d.priors.kinematics import moved
 from rewild4d.priors.learned.evidence import indices
 from rewild4d.priors.learned.network import PointNetwork
 from rewild4d.priors.learned.points import NAMES, ROOT
 from rewild4d.priors.learned.reading import Reading
-from rewild4d.priors.proportions import Proportions
 from rewild4d.priors.silhouettes import outline
-from rewild4d.priors.template import quadruped
 from rewild4d.types import Clip, Frame, Prior
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -35,7 +34,7 @@ def shortened(config: PriorConfig, steps: int) -> PriorConfig:
 
 def standing_clip() -> Clip:
     """The average template at rest, seen by three cameras of a ring."""
-    template, frames = quadruped(), []
+    template, frames = QUADRUPED.build(), []
     for t, camera in enumerate(ring([0.3, 1.2, 2.3])):
         mask = torch.from_numpy(outline(template.vertices, template.faces, camera)).float()[None] / 255
         frames.append(Frame(t / 24, camera, mask.expand(3, -1, -1), mask))
@@ -98,7 +97,8 @@ def test_a_longer_neck_carries_the_nose_further() -> None:
     """Points move with the proportions."""
     bones, along = indices()
     nose = NAMES.index("nose")
-    short, long = (quadruped(Proportions.of(neck_length=length), unit=False).bones[bones] for length in (0.6, 1.2))
+    shapes = (QUADRUPED.proportions(neck_length=length) for length in (0.6, 1.2))
+    short, long = (QUADRUPED.build(shape, unit=False).bones[bones] for shape in shapes)
     places = [
         start[nose] + along[nose] * (end[nose] - start[nose]) for start, end in (b.unbind(1) for b in (short, long))
     ]

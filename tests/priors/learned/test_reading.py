@@ -8,6 +8,7 @@ import torch
 
 from rewild4d.datasets.builtin.zoo import varied
 from rewild4d.errors import UserError
+from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.learned import pictures, reading
 from rewild4d.priors.learned.drawing import draw
@@ -80,7 +81,7 @@ def test_a_long_clip_is_read_in_windows_and_empty_frames_are_left_out() -> None:
 
 
 def test_a_guess_is_no_distance_from_its_own_points_whatever_its_distance_from_one_camera() -> None:
-    guess = Hypotheses.start(facings(4)[1:2], torch.zeros(3, 3))
+    guess = Hypotheses.start(QUADRUPED, facings(4)[1:2], torch.zeros(3, 3))
     points = guess.points(*indices())
     working = similarity(torch.tensor(2.0).double(), torch.eye(3).double(), torch.tensor((0.3, 0, 0)).double())
     camera = looking(0.0)
@@ -100,5 +101,5 @@ def test_a_guess_is_no_distance_from_its_own_points_whatever_its_distance_from_o
     assert evidence.distance(eye + 1.7 * (points - eye)) == pytest.approx(0, abs=1e-5)
     moved = replace(made, points=said + torch.tensor((0.0, 0.0, 0.1)))
     assert PointEvidence.of(moved, working).distance(points) == pytest.approx(2**0.5 - 1, abs=1e-5)
-    turned = Hypotheses.start(facings(4)[3:4], torch.zeros(3, 3)).points(*indices())
+    turned = Hypotheses.start(QUADRUPED, facings(4)[3:4], torch.zeros(3, 3)).points(*indices())
     assert evidence.distance(turned) > 1
