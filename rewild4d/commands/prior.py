@@ -29,7 +29,7 @@ IMPORT = """Import the output of a test run of 3D-Fauna, <step>_<frame>_mesh.obj
 prior."""
 TRAIN = """Train the network of the learned prior on random four-footed animals, or go on from the folder's checkpoint.
 Writes weights.safetensors and curve.json; `run --prior learned:DIR/weights.safetensors` uses the weights. A round takes
-about 10 seconds on two cores."""
+about 15 seconds on two cores."""
 WHOLE = Selection(cameras="unknown", size=256, framing="crop", split=5)
 """Selection that names the cases of a reader; frames are used whole and none is held out."""
 
@@ -99,7 +99,7 @@ class TrainOptions:
     """
 
     out: Path
-    rounds: int = 4000
+    rounds: int = 2000
     seed: int = 0
     workers: int = 1
 

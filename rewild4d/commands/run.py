@@ -39,10 +39,10 @@ class RunChoice:
             terms that the paper does not have, for known cameras, and one-side, for a camera that stays at one side.
         seeds: one run for each.
         prior: "template" (fitted to the clip's masks: a quadruped, biped or primate, whichever fits best),
-            "template:<which>" (one of these, or a rig of your own, FILE.glb), "learned:<weights>" (a quadruped fitted
-            to masks and to points that a network finds; `prior train` makes weights), "coarse:<noise>" (from the truth
-            plus noise, for studies), "rig" (the data set's own shape and skeleton, an upper bound) or a file (of a real
-            video, by `prior fit` or `prior import`).
+            "template:<which>" (one of these, or a rig of your own, FILE.glb), "colors" (then to the colours too),
+            "learned:<weights>" (a quadruped, also to points that a network finds; `prior train` makes weights),
+            "coarse:<noise>" (from the truth plus noise, for studies), "rig" (the data set's own shape and skeleton, an
+            upper bound) or a file (of a real video, by `prior fit` or `prior import`).
         keypoints: of a real video (davis, online): BADJA or COCO-like .json, DeepLabCut or SLEAP .csv.
         mapping: from names of keypoints to points of the template: aptv2, badja, superanimal-quadruped or a .toml file.
         use_keypoints: frames whose keypoints the prior's fit sees: all; half (the rest is scored); none (all are

@@ -16,7 +16,7 @@ from rewild4d.priors.bodies.choice import bodies, identity
 from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.bodies.tetrapod import MIRROR
 from rewild4d.priors.coarse import coarse_prior
-from rewild4d.priors.config import FOOTAGE, PriorConfig, Use, with_points
+from rewild4d.priors.config import FOOTAGE, PriorConfig, Use, with_colors, with_points
 from rewild4d.priors.fit import fit_template
 from rewild4d.priors.footage import Evidence, fit_footage
 from rewild4d.priors.io import load_prior, save_prior, seal
@@ -44,8 +44,9 @@ class PriorChoice:
 
     Attributes:
         name: "template" (fitted to the clip's masks alone, with its cameras where it has any; of the package's
-            templates the one that fits best), "template:<which>" (a template's name or a rig file), "learned:<weights>"
-            (the quadruped, fitted to masks and to points of the body that a network finds), "coarse" or
+            templates the one that fits best), "template:<which>" (a template's name or a rig file), "colors" and
+            "colors:<which>" (the same, then to colours too), "learned:<weights>" (the quadruped, fitted to masks and to
+            points of the body that a network finds), "coarse" or
             "coarse:<noise>" (from the truth, plus noise; for studies of prior quality only), "rig" (the data set's own
             shape and skeleton: a bound) or the path of an npz file.
         config: settings of the template fit under known cameras.
@@ -93,7 +94,7 @@ class PriorChoice:
     @property
     def is_fitted(self) -> bool:
         """Whether the template is fitted to the clip, which alone decides the prior."""
-        return self._kind == "template" or self.is_learned
+        return self._kind in ("template", "colors", "learned")
 
     @property
     def _kind(self) -> str:
@@ -107,7 +108,7 @@ class PriorChoice:
         """
         if self.is_learned:
             return (QUADRUPED,)
-        return bodies(self.name.partition(":")[2] if self._kind == "template" else "")
+        return bodies(self.name.partition(":")[2] if self.is_fitted else "")
 
     @property
     def _weights_file(self) -> Path:
@@ -161,6 +162,8 @@ class PriorChoice:
     def settings_under(self, known_cameras: bool) -> PriorConfig:
         """Return settings of the fit where cameras are known or not."""
         config = FOOTAGE if self.is_fitted and not known_cameras else self.config
+        if self._kind == "colors":
+            return with_colors(config) if known_cameras else config
         return with_points(config) if self.is_learned else config
 
     def keypoints(self, clip: Clip) -> tuple[Marks | None, Marks | None]:

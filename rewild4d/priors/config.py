@@ -20,6 +20,9 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         joints: fit joint angles and their motion.
         rasterized: draw silhouettes by the rasterizer; otherwise by its batched approximation.
         relief: fit the cross sections too, beyond the proportions.
+        colors: fit colours of the surface too, and compare them with the images; left out where all cameras look one
+            way.
+        pace: factor of the learning rate.
     """
 
     size: int
@@ -30,6 +33,8 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     frames: int = 24
     rasterized: bool = False
     relief: bool = False
+    colors: bool = False
+    pace: float = 1.0
 
 
 class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -49,6 +54,7 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         gait_weight: feet on the ground that move towards the head, when hypotheses are compared.
         travel_weight: heading against the direction of travel, when hypotheses are compared.
         carriage_weight: heads folded into the body and raised tails, under unknown cameras.
+        color_weight: robust distance of colours, in stages that fit them.
         keypoint_weight: robust distance of joints to keypoints.
         points_weight: robust distance of joints to the points that a network finds, in its expected errors, where
             there is one.
@@ -67,6 +73,7 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gait_weight: float = 0.015
     travel_weight: float = 0.08
     carriage_weight: float = 1.0
+    color_weight: float = 10.0
     keypoint_weight: float = 0.1
     points_weight: float = 0.0
     root_period: int = 4
@@ -88,6 +95,10 @@ QUICK = PriorConfig(
         Stage(size=64, steps=80, blur=(0.02, 0.008), keep=1, rasterized=True, relief=True),
     )
 )
+COLORS = Stage(
+    size=96, steps=300, blur=(0.03, 0.005), keep=1, frames=12, rasterized=True, relief=True, colors=True, pace=0.33
+)
+"""The round that looks at colours too."""
 FOOTAGE = PriorConfig(
     stages=(
         Stage(size=32, steps=50, blur=(0.08, 0.04), keep=6, joints=False, frames=12),
@@ -105,6 +116,17 @@ def with_points(config: PriorConfig) -> PriorConfig:
     return msgspec.structs.replace(
         config, points_weight=0.05, angle_weight=0.03, root_weight=0.05, root_period=2, gait_weight=0.0
     )
+
+
+def with_colors(config: PriorConfig) -> PriorConfig:
+    """Return the settings of a fit that ends with a round on colours too."""
+    return msgspec.structs.replace(config, stages=(*config.stages, COLORS))
+
+
+def without_colors(config: PriorConfig) -> PriorConfig:
+    """Return the settings of a fit to masks alone."""
+    stages = tuple(stage for stage in config.stages if not stage.colors)
+    return msgspec.structs.replace(config, stages=stages)
 
 
 PRESETS = {"quick": QUICK, "standard": STANDARD}

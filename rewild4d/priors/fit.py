@@ -13,7 +13,7 @@ from torch import Tensor
 from rewild4d.contracts import Log
 from rewild4d.priors.bodies.body import Body, Proportions, diagonal
 from rewild4d.priors.bodies.quadruped import QUADRUPED
-from rewild4d.priors.config import PriorConfig
+from rewild4d.priors.config import PriorConfig, without_colors
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.io import seal
 from rewild4d.priors.kinematics import pose
@@ -22,7 +22,16 @@ from rewild4d.priors.learned.network import PointNetwork
 from rewild4d.priors.learned.reading import read
 from rewild4d.priors.posed import posed_prior
 from rewild4d.priors.race import Race, Steps, decided, steps_of
-from rewild4d.priors.search import facings, mask_rays, single_view, trajectory, up_directions, working_frame
+from rewild4d.priors.search import (
+    WIDE_BASELINE,
+    facings,
+    mask_rays,
+    single_view,
+    spread,
+    trajectory,
+    up_directions,
+    working_frame,
+)
 from rewild4d.priors.silhouettes import known_camera, overlap
 from rewild4d.transforms import camera_in_object, similarity, skin_points
 from rewild4d.types import OBJECT_DIAGONAL, Clip, Frame, Prior
@@ -81,6 +90,8 @@ def fit_animal(
     There may be any number of each time; for a ``network`` one, in their order. A network reads quadrupeds.
     """
     rays = mask_rays(frames, timesteps, name)
+    if spread(rays.directions) < WIDE_BASELINE:  # from one side colours say nothing of depth
+        config = without_colors(config)
     path = trajectory(rays, count)
     ups = up_directions(rays, config.elevations)
     steps = Steps(log, len(bodies) * len(ups) * config.stages[0].steps + steps_of(config.stages[1:], len(bodies)))

@@ -13,7 +13,7 @@ from torch import Tensor
 from rewild4d.priors.bodies.body import Body, Proportions, Template
 from rewild4d.priors.config import Stage
 from rewild4d.priors.kinematics import moved, pose
-from rewild4d.priors.silhouettes import Targets, rasterized, splat
+from rewild4d.priors.silhouettes import PARTS, Targets, rasterized, splat
 from rewild4d.transforms import axis_angle_to_matrix, rigid
 
 LIFTED = 0.05
@@ -46,6 +46,7 @@ class Hypotheses:
         shape: proportions, [B, P].
         relief: of the cross sections, [B, S, 4].
         angles: cosine series of the joint angles, [B, L, J, 3].
+        colors: RGB of parts of the surface, see `rasterized`, [B, D, 3]; none before a stage fits them.
     """
 
     body: Body
@@ -57,6 +58,7 @@ class Hypotheses:
     shape: Tensor
     relief: Tensor
     angles: Tensor
+    colors: Tensor
 
     @classmethod
     def start(cls, body: Body, facing: Tensor, path: Tensor, root_period: int = 4) -> Self:
@@ -76,6 +78,7 @@ class Hypotheses:
             shape=torch.zeros(batch, body.measures),
             relief=torch.zeros(batch, body.sections, 4),
             angles=torch.zeros(batch, joints, len(body.parents), 3),
+            colors=torch.zeros(batch, 0, 3),
         )
 
     def by_guess(self) -> dict[str, Tensor]:
@@ -116,13 +119,23 @@ class Hypotheses:
         """Return the animals at rest before they are scaled."""
         return self.body.build(Proportions(self.shape, self.relief), unit=False)
 
+    def painted(self, color: Tensor) -> Self:
+        """Return these guesses in one colour, [3]."""
+        parts = PARTS * PARTS * len(self.template().quads)
+        return replace(self, colors=color.expand(len(self), parts, 3).clone())
+
+    def pictures(self, targets: Targets) -> tuple[Tensor, Tensor]:
+        """Return colours times mattes in the targets' crops, and mattes, [B, v, 3, s, s] and [B, v, s, s]."""
+        template, size = self.template(), targets.masks.shape[-1]
+        cover = self._in_cameras(template, template.cover, template.cover_weights, targets, True)
+        return rasterized(cover, template.quads, targets.intrinsics, size, self.colors)
+
     def silhouettes(self, targets: Targets, stage: Stage) -> Tensor:
         """Return the soft silhouettes in the targets' crops, [B, v, s, s]."""
-        template = self.template()
-        size = targets.masks.shape[-1]
+        template, size = self.template(), targets.masks.shape[-1]
         if stage.rasterized:
             cover = self._in_cameras(template, template.cover, template.cover_weights, targets, stage.joints)
-            return rasterized(cover, template.quads, targets.intrinsics, size)
+            return rasterized(cover, template.quads, targets.intrinsics, size)[1]
         blobs = self._in_cameras(template, template.blobs, template.blob_weights, targets, stage.joints)
         return splat(blobs, (template.blob_sizes * self.scales()[:, None])[:, None], targets.intrinsics, size)
 

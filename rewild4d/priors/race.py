@@ -11,11 +11,13 @@ from rewild4d.contracts import Log
 from rewild4d.priors.config import PriorConfig, Stage
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.search import match_areas
-from rewild4d.priors.silhouettes import Targets, crop_targets, mismatch
+from rewild4d.priors.silhouettes import Targets, color_mismatch, crop_targets, mean_color, mismatch
 from rewild4d.types import Frame
 
 HANDICAP = 1.3
 """The costs of all kinds of body but the usual one are multiplied by this where they are compared."""
+COLOR_RATE = 0.05
+"""Learning rate of the surface's colours."""
 STILL_PARAMETERS = ("scale", "rotation", "shift", "shape")
 
 
@@ -65,7 +67,9 @@ class Race:
 
     def free(self, stage: Stage) -> list[str]:
         """Return names of the parameters that a round fits."""
-        return [*STILL_PARAMETERS, *("angles",) * stage.joints, *("relief",) * stage.relief]
+        return [
+            *STILL_PARAMETERS, *("angles",) * stage.joints, *("relief",) * stage.relief, *("colors",) * stage.colors,
+        ]  # fmt: skip
 
     def evidence(self) -> Tensor | float:
         """Return the cost of each guess at every step besides its silhouette and penalties, [B]."""
@@ -87,14 +91,19 @@ class Race:
     def run(self, stage: Stage) -> None:
         """Fit for one round, then drop the worst guesses."""
         targets = self._targets(stage.size)
+        if stage.colors:
+            self.guesses = self.guesses.painted(mean_color(targets))
         names = self.free(stage)
         leaves = [getattr(self.guesses, name).detach().requires_grad_() for name in names]
         for name, leaf in zip(names, leaves, strict=True):
             setattr(self.guesses, name, leaf)
-        optimizer = torch.optim.Adam(leaves, lr=self.config.learning_rate, betas=(0.9, 0.98))
+        rates = [COLOR_RATE if name == "colors" else self.config.learning_rate * stage.pace for name in names]
+        groups = [{"params": [leaf], "lr": rate} for leaf, rate in zip(leaves, rates, strict=True)]
+        optimizer = torch.optim.Adam(groups, betas=(0.9, 0.98))
         for step in range(stage.steps):
             share = step / max(stage.steps - 1, 1)
-            optimizer.param_groups[0]["lr"] = self.config.learning_rate * (1 - 0.85 * share)
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                group["lr"] = rate * (1 - 0.85 * share)
             sigma = stage.size * (stage.blur[0] + share * (stage.blur[1] - stage.blur[0]))
             cost = self._cost(self._draw(targets, stage.frames), sigma, stage)
             if not torch.isfinite(cost).all():
@@ -125,7 +134,11 @@ class Race:
         config = self.config
         penalty = config.shape_weight * shape + config.relief_weight * relief
         penalty = penalty + config.angle_weight * swing + config.root_weight * root + self.evidence()
-        return mismatch(self.guesses.silhouettes(targets, stage), targets, sigma) + penalty
+        if not stage.colors:
+            return mismatch(self.guesses.silhouettes(targets, stage), targets, sigma) + penalty
+        images, mattes = self.guesses.pictures(targets)
+        penalty = penalty + config.color_weight * color_mismatch(images, targets, sigma)
+        return mismatch(mattes, targets, stage.size * stage.blur[1]) + penalty
 
     def _cut(self, keep: int) -> None:
         """Keep the best guess, its rivals and the next best, ``keep`` in all."""

@@ -1,4 +1,4 @@
-"""Soft silhouettes in square crops around the animal, and their difference.
+"""Soft silhouettes and pictures in square crops around the animal, and their difference.
 
 `rasterized` draws flat Gaussians on the surface by the benchmark's rasterizer, one call per pose and view. `splat` is
 its fast approximation while there are many hypotheses: the image of a round Gaussian is separable, so the density of
@@ -24,6 +24,11 @@ CROP_MARGIN = 0.25
 """Border added on each side of the mask's bounding box, as a share of its longer side."""
 DISC_SIZE, DISC_OPACITY = 0.4, 0.95
 """Standard deviations, in edge lengths, and opacity of the flat Gaussian on a quadrilateral."""
+PARTS, PART_SIZE, PART_OPACITY = 3, 0.26, 0.33
+"""Coloured quadrilaterals are cut into as many parts along each side, whose standard deviations, in edge lengths of the
+whole, leave no gaps: gaps would be taken for patterns."""
+NOISE = 0.01
+"""Distance of colours below which it counts as a square."""
 DENSITY = 2.5
 """Optical depth at the centre of one round Gaussian, so that a few that overlap are opaque."""
 
@@ -34,6 +39,7 @@ class Targets:
 
     Attributes:
         masks: soft mattes of the crops, [v, s, s].
+        colors: RGB of the crops times their mattes, [v, 3, s, s].
         valid: share of each pixel that lies inside the image, [v, s, s].
         world_to_camera: [v, 4, 4].
         intrinsics: of the crops, [v, 3, 3].
@@ -41,6 +47,7 @@ class Targets:
     """
 
     masks: Tensor
+    colors: Tensor
     valid: Tensor
     world_to_camera: Tensor
     intrinsics: Tensor
@@ -67,12 +74,12 @@ def require_mask(frames: Sequence[Frame], name: str) -> None:
 
 
 def crop_targets(frames: Sequence[Frame], timesteps: Sequence[int], world: Tensor, size: int, name: str) -> Targets:
-    """Cut square crops of ``size`` pixels around the masks, resampled by area, and leave out frames with an empty mask.
+    """Cut square crops of ``size`` pixels around masks, resampled by area, and leave out frames with an empty mask.
 
     ``timesteps`` are indices of the frames' times, ``world`` the similarity [4, 4] from the working frame, where the
     targets' cameras are, to the world, and ``name`` the case.
     """
-    masks, valid, cameras, kept = [], [], [], []
+    masks, colors, valid, cameras, kept = [], [], [], [], []
     for frame, timestep in zip(frames, timesteps, strict=True):
         box = mask_box(frame.mask[0] > 0.5)
         if box is None:
@@ -81,11 +88,13 @@ def crop_targets(frames: Sequence[Frame], timesteps: Sequence[int], world: Tenso
         camera = camera_in_object(known_camera(frame, name), world)
         cameras.append(camera.shifted(left, top, side, side).resized(size, size))
         inside = torch.ones_like(frame.mask[0])
-        masks.append(_window(frame.mask[0], left, top, side, size))
-        valid.append(_window(inside, left, top, side, size))
+        masks.append(_window(frame.mask, left, top, side, size)[0])
+        colors.append(_window(frame.rgb, left, top, side, size))
+        valid.append(_window(inside[None], left, top, side, size)[0])
         kept.append(timestep)
     return Targets(
         torch.stack(masks),
+        torch.stack(colors),
         torch.stack(valid),
         torch.stack([camera.world_to_camera for camera in cameras]).float(),
         torch.stack([camera.intrinsics for camera in cameras]).float(),
@@ -108,12 +117,13 @@ def _square(left: int, top: int, right: int, bottom: int) -> tuple[int, int, int
 
 
 def _window(image: Tensor, left: int, top: int, side: int, size: int) -> Tensor:
-    height, width = image.shape
+    """Cut a square out of an image [c, h, w], zero outside, and resample it by area, [c, size, size]."""
+    height, width = image.shape[1:]
     padding = (max(-left, 0), max(left + side - width, 0), max(-top, 0), max(top + side - height, 0))
     padded = torch.nn.functional.pad(image, padding)
     x, y = left + padding[0], top + padding[2]
-    window = padded[y : y + side, x : x + side]
-    return torch.nn.functional.interpolate(window[None, None], (size, size), mode="area")[0, 0]
+    window = padded[:, y : y + side, x : x + side]
+    return torch.nn.functional.interpolate(window[None], (size, size), mode="area")[0]
 
 
 def splat(points: Tensor, sizes: Tensor, intrinsics: Tensor, size: int) -> Tensor:
@@ -134,8 +144,10 @@ def splat(points: Tensor, sizes: Tensor, intrinsics: Tensor, size: int) -> Tenso
     return 1 - torch.exp(-density)
 
 
-def rasterized(vertices: Tensor, quads: Tensor, intrinsics: Tensor, size: int) -> Tensor:
-    """Render silhouettes of a surface by a flat Gaussian on every quadrilateral, alpha [..., v, size, size].
+def rasterized(
+    vertices: Tensor, quads: Tensor, intrinsics: Tensor, size: int, colors: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Render a surface by flat Gaussians on every quadrilateral.
 
     The 50 % contour is the surface's outline to a few hundredths of its area. Gradients reach the vertices through the
     Gaussians' centres alone, which is most of them at half the cost.
@@ -145,24 +157,44 @@ def rasterized(vertices: Tensor, quads: Tensor, intrinsics: Tensor, size: int) -
         quads: corners in order, [q, 4].
         intrinsics: [v, 3, 3].
         size: side of the square images in pixels.
+        colors: RGB of parts of the quadrilaterals, [..., PARTS * PARTS * q, 3]; None draws each as a whole, in white.
+
+    Returns:
+        RGB [..., v, 3, size, size] (one channel without colours), and alpha [..., v, size, size].
     """
+    parts = 1 if colors is None else PARTS
     corners = vertices[..., quads, :]
-    means = corners.mean(-2)
+    means = _part_means(corners, parts)
     a, b, c, d = corners.detach().unbind(-2)
     along, around = (c + d - a - b) / 2, (b + c - a - d) / 2
     first, normal = (normalize(axis, dim=-1) for axis in (along, torch.linalg.cross(along, around)))
     quats = matrix_to_quat(torch.stack((first, torch.linalg.cross(normal, first), normal), dim=-1))
     lengths = torch.stack((along, around), dim=-2).norm(dim=-1)
-    scales = torch.cat((DISC_SIZE * lengths, 0.01 * lengths[..., :1]), dim=-1)
-    opacities = torch.full(means.shape[-2:-1], DISC_OPACITY)
-    eye, mattes = torch.eye(4)[None], []
+    scales = torch.cat(((DISC_SIZE if parts == 1 else PART_SIZE) * lengths, 0.01 * lengths[..., :1]), dim=-1)
+    quats, scales = (value.repeat_interleave(parts * parts, dim=-2) for value in (quats, scales))
+    opacities = torch.full(means.shape[-2:-1], DISC_OPACITY if parts == 1 else PART_OPACITY)
+    eye, images, mattes = torch.eye(4)[None], [], []
     for index in np.ndindex(*means.shape[:-2]):
-        _, matte, _ = rasterize(
-            means[index], quats[index], scales[index], opacities, opacities[:, None], eye, intrinsics[index[-1]][None],
+        shown = opacities[:, None] if colors is None else colors[index[:-1]]
+        image, matte, _ = rasterize(
+            means[index], quats[index], scales[index], opacities, shown, eye, intrinsics[index[-1]][None],
             size, size, antialias=True,
         )  # fmt: skip
+        images.append(image[0])
         mattes.append(matte[0, 0])
-    return torch.stack(mattes).unflatten(0, means.shape[:-2])
+    return torch.stack(images).unflatten(0, means.shape[:-2]), torch.stack(mattes).unflatten(0, means.shape[:-2])
+
+
+def _part_means(corners: Tensor, parts: int) -> Tensor:
+    """Return middles of parts of quadrilaterals, in order of these, [..., q, 4, 3] -> [..., parts * parts * q, 3]."""
+    if parts == 1:
+        return corners.mean(-2)
+    share = (torch.arange(parts) + 0.5) / parts
+    along, around = (grid.flatten() for grid in torch.meshgrid(share, share, indexing="ij"))
+    weights = torch.stack(
+        ((1 - along) * (1 - around), (1 - along) * around, along * around, along * (1 - around)), dim=1
+    )  # fmt: skip
+    return (weights @ corners).flatten(-3, -2)
 
 
 @cache
@@ -186,6 +218,18 @@ def mismatch(rendered: Tensor, targets: Targets, sigma: float) -> Tensor:
     square = (rendered - wanted).square().sum((-1, -2)) / wanted.sum((-1, -2))
     dice = 1 - 2 * (rendered * wanted).sum((-1, -2)) / (rendered.square() + wanted.square()).sum((-1, -2))
     return (square + dice).mean(-1)
+
+
+def color_mismatch(rendered: Tensor, targets: Targets, sigma: float) -> Tensor:
+    """Return the mean distance of blurred colours over the animal's area, robust, [..., v, 3, s, s] -> [...]."""
+    away = blur(rendered * targets.valid[:, None], sigma) - blur(targets.colors, sigma)
+    distance = (away.square().sum(-3) + NOISE**2).sqrt().sum((-1, -2))
+    return (distance / blur(targets.masks, sigma).sum((-1, -2))).mean(-1)
+
+
+def mean_color(targets: Targets) -> Tensor:
+    """Return the mean RGB of the animal, [3]."""
+    return targets.colors.sum((0, 2, 3)) / targets.masks.sum()
 
 
 def outline(vertices: Tensor, faces: Tensor, camera: Camera) -> np.ndarray:

@@ -130,7 +130,7 @@ def test_flat_gaussians_on_the_surface_have_its_outline(size: int) -> None:
     camera = Camera(look_at(eye, 0 * eye, torch.tensor((0.0, 1.0, 0.0)).double()), intrinsics, size, size)
     matrix = camera.world_to_camera.float()
     vertices = (template.vertices @ matrix[:3, :3].T + matrix[:3, 3])[None, None].requires_grad_()
-    matte = rasterized(vertices, template.quads, intrinsics.float()[None], size)
+    _, matte = rasterized(vertices, template.quads, intrinsics.float()[None], size)
     assert matte.shape == (1, 1, size, size)
     drawn, wanted = matte[0, 0] > 0.5, torch.from_numpy(outline(template.vertices, template.faces, camera)) > 127
     assert float((drawn & wanted).sum() / (drawn | wanted).sum()) > 0.93

@@ -24,6 +24,8 @@ ANIMALS = 8
 """Animals of a round: each has `CLIPS` sequences, which are seen plain and in a mirror."""
 BATCH = 16
 """Sequences of a step."""
+REPEATS = 2
+"""How often the sequences of a round are gone through: a step takes less time than drawing what it learns from."""
 LEARNING_RATE, WEIGHT_DECAY = 1e-3, 0.02
 """Of AdamW, the first at its highest."""
 WARMUP = 200
@@ -48,7 +50,7 @@ class TrainingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         seed: of all animals and of the weights.
     """
 
-    rounds: int = 4000
+    rounds: int = 2000
     seed: int = 0
 
 
@@ -126,7 +128,7 @@ def _round(progress: Training, animals: Examples, config: TrainingConfig) -> flo
     """Take a step for each batch of the round's sequences, plain and mirrored; return the mean loss."""
     generator = torch.Generator().manual_seed(1000 * config.seed + progress.round)
     both = joined([animals, animals.mirrored()])
-    order = torch.randperm(len(both.known), generator=generator)
+    order = torch.cat([torch.randperm(len(both.known), generator=generator) for _ in range(REPEATS)])
     steps = len(order) // BATCH
     losses = []
     for index, rows in enumerate(order.split(BATCH)):
