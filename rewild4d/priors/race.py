@@ -46,6 +46,7 @@ class Race:
     Attributes:
         guesses: those that remain.
         costs: of each after the last round, [B].
+        misfits: the same without `verdict`, which may be negative, [B].
         start_costs: of every start after the first round.
         figures: named figures of the race (facing_margin, ...).
     """
@@ -56,7 +57,7 @@ class Race:
     ) -> None:  # fmt: skip
         self.frames, self.timesteps, self.name = frames, timesteps, name
         self.working, self.config, self.generator, self.steps = working, config, generator, steps
-        self.costs = self.start_costs = torch.zeros(0)
+        self.costs = self.misfits = self.start_costs = torch.zeros(0)
         self.figures: dict[str, float] = {}
         self.guesses: Hypotheses
 
@@ -113,8 +114,8 @@ class Race:
             optimizer.step()
             self.steps.told(float(cost.detach().min()))
         with torch.no_grad():
-            self.costs = self._cost(_spaced(targets, 2 * stage.frames), stage.size * stage.blur[1], stage)
-            self.costs = self.costs + self.verdict(stage)
+            self.misfits = self._cost(_spaced(targets, 2 * stage.frames), stage.size * stage.blur[1], stage)
+            self.costs = self.misfits + self.verdict(stage)
         if not len(self.start_costs):
             self.start_costs = self.costs
         self._cut(stage.keep)
@@ -148,7 +149,7 @@ class Race:
         wanted = [order[0], *(row for row in self.rivals(order) if row != order[0])][:keep]
         rest = [row for row in order if row not in wanted][: keep - len(wanted)]
         rows = torch.tensor(sorted(wanted + rest, key=order.index))
-        self.guesses, self.costs = self.guesses.select(rows), self.costs[rows]
+        self.guesses, self.costs, self.misfits = self.guesses.select(rows), self.costs[rows], self.misfits[rows]
 
 
 R = TypeVar("R", bound=Race)
@@ -157,9 +158,9 @@ R = TypeVar("R", bound=Race)
 def decided(races: Sequence[R], stages: Sequence[Stage]) -> R:
     """Run races of one kind of body each until joints have been fitted; let the best run the stages that are left.
 
-    The first is the usual one: another has to be better by a factor of `HANDICAP`, for it bends more freely. Of
-    several, `figures` has <body>_cost of each and body_margin, the lead of the best over the next as a share, handicap
-    included.
+    The first is the usual one: the misfit of another has to be lower by a factor of `HANDICAP`, for it bends more
+    freely. Of several, `figures` has <body>_cost of each and body_margin, the lead of the best over the next as a
+    share, handicap included.
     """
     first = 1 + [stage.joints for stage in stages].index(True) if len(races) > 1 else 0
     for race in races:
@@ -167,9 +168,10 @@ def decided(races: Sequence[R], stages: Sequence[Stage]) -> R:
             race.run(stage)
     best = races[0]
     if len(races) > 1:
-        costs = [float(race.costs.min()) * (1.0 if race is races[0] else HANDICAP) for race in races]
+        found = [float(race.misfits[race.costs.argmin()]) for race in races]
+        costs = [cost * (HANDICAP if index else 1.0) for index, cost in enumerate(found)]
         best = races[costs.index(min(costs))]
-        best.figures |= {f"{race.guesses.body.name}_cost": float(race.costs.min()) for race in races}
+        best.figures |= {f"{race.guesses.body.name}_cost": cost for race, cost in zip(races, found, strict=True)}
         best.figures["body_margin"] = sorted(costs)[1] / min(costs) - 1
     for stage in stages[first:]:
         best.run(stage)

@@ -23,7 +23,8 @@ class Told:
 
     def __init__(self, name: str, cost: float) -> None:
         self.guesses = SimpleNamespace(body=SimpleNamespace(name=name))
-        self.costs, self.figures, self.ran = torch.tensor([cost, 9.0]), cast(dict[str, float], {}), 0
+        self.misfits, self.figures, self.ran = torch.tensor([9.0, cost]), cast(dict[str, float], {}), 0
+        self.costs = self.misfits - torch.tensor([0.0, 0.6])  # the verdict may be negative, and names no body
 
     def run(self, stage: Stage) -> None:
         self.ran += stage.steps
