@@ -158,6 +158,8 @@ def _fit(arguments: list[str]) -> int:
     choice = PriorChoice(options.prior if options.rig is None else f"template:{options.rig}", STANDARD)
     if not choice.is_fitted:
         raise UserError(f"--prior {options.prior}: expected template, template:<which> or learned:<weights>.")
+    if choice.is_own_rig and options.keypoints is not None:
+        raise UserError("--rig and --keypoints: expected one of them; keypoints are mapped to the package's templates.")
     choice.require()
     reader = Online(
         options.frames, masks=options.masks, fps=options.fps, keypoints=options.keypoints, parts=options.parts

@@ -12,7 +12,7 @@ from rewild4d.errors import UserError
 from rewild4d.files import digest
 from rewild4d.machine import code_version
 from rewild4d.priors.bodies.body import Body
-from rewild4d.priors.bodies.choice import bodies, identity
+from rewild4d.priors.bodies.choice import bodies, identity, is_rig_file
 from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.bodies.tetrapod import MIRROR
 from rewild4d.priors.coarse import coarse_prior
@@ -95,6 +95,11 @@ class PriorChoice:
     def is_fitted(self) -> bool:
         """Whether the template is fitted to the clip, which alone decides the prior."""
         return self._kind in ("template", "colors", "learned")
+
+    @property
+    def is_own_rig(self) -> bool:
+        """Whether the template is a rig file."""
+        return self.is_fitted and not self.is_learned and is_rig_file(self.name)
 
     @property
     def _kind(self) -> str:
@@ -221,6 +226,8 @@ def _fitted(choice: PriorChoice, clip: Clip, truth: Truth, log: Log) -> Prior:
         )  # fmt: skip
         return rig_prior(clip, truth.rig(), fitted) if choice.name == "rig" and truth.rig else fitted
     given, scored = choice.keypoints(clip)
+    if choice.is_own_rig:  # keypoints are mapped to bones of the package's templates
+        given = None
     prior = fit_footage(
         clip, config=config, seed=PRIOR_SEED, log=log, said=Evidence(given, clip.travel), network=network,
         bodies=choice.bodies(),

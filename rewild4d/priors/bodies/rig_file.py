@@ -26,7 +26,7 @@ LOOSE = 0.03
 """A bone whose start moves further against its parent, in sizes of the animal, is hung from a bone that keeps it."""
 GROUND = 0.04
 """Height above the lowest vertex below which skin treads the ground, as a share of the animal's height."""
-FRONT, REAR = r"head|skull|jaw|nose|snout|beak|mouth|eye|ear[\W\d_]", r"tail|hip|pelvis|rump"
+FRONT, REAR = r"head|skull|jaw|nose|snout|beak|mouth|eye|(?<![a-z])ear(?![a-z])", r"tail|hip|pelvis|rump"
 """What names of bones in front and behind contain."""
 LEAST_SPREAD, ROOM = 0.06, 1.5
 """Least standard deviation of a joint angle, radians; those of clips are multiplied by the second for other animals."""
@@ -152,10 +152,7 @@ def _rehung(rig: _Rig) -> _Rig:
     """
     rig = _chosen(rig, torch.nonzero(_shares(rig) > 0)[:, 0].tolist())
     mirror = _mirror(rig).tolist()
-    homogeneous = torch.nn.functional.pad(rig.pivots, (0, 1), value=1.0)
-    inverse = torch.linalg.inv(rig.motion)
-    seen = torch.einsum("tqab,tjbc,jc->tqja", inverse, rig.motion, homogeneous)[..., :3]
-    slack = (seen - rig.pivots).norm(dim=-1).square().mean(0).sqrt() / _size(rig)
+    slack = _slack(rig)
     slack = (slack + slack[mirror][:, mirror]) / 2  # both sides alike
     apart = torch.cdist(rig.pivots, rig.pivots) / _size(rig)
     parents, shares = list(rig.parents), _shares(rig)
@@ -171,6 +168,15 @@ def _rehung(rig: _Rig) -> _Rig:
             parents[bone] = min(others, key=lambda other: float(slack[other, bone] + 0.1 * apart[other, bone]))
             parents[twin] = mirror[parents[bone]]
     return replace(rig, parents=parents)
+
+
+def _slack(rig: _Rig) -> Tensor:
+    """Return how far the start of each bone (column) moves against each bone (row), in sizes of the animal, [J, J]."""
+    starts = (rig.motion[..., :3, :3] @ rig.pivots[..., None])[..., 0] + rig.motion[..., :3, 3]
+    back = torch.linalg.pinv(rig.motion)  # a clip may hide a part by a scale of zero
+    rows = [starts @ own[:, :3, :3].transpose(-1, -2) + own[:, None, :3, 3] for own in back.unbind(1)]
+    away = [(row - rig.pivots).norm(dim=-1).square().mean(0).sqrt() for row in rows]
+    return torch.stack(away) / _size(rig)
 
 
 def _mirror(rig: _Rig) -> Tensor:
@@ -201,7 +207,7 @@ def _fewer_bones(rig: _Rig) -> _Rig:
 
 def _axes(rig: _Rig) -> Tensor:
     """Return the object's x, y and z axes in the file's, as columns, [3, 3]: by names of bones, else +z is ahead."""
-    ahead = [k for k, name in enumerate(rig.names) if re.search(FRONT, name + "_", re.IGNORECASE)]
+    ahead = [k for k, name in enumerate(rig.names) if re.search(FRONT, name, re.IGNORECASE)]
     behind = [k for k, name in enumerate(rig.names) if re.search(REAR, name, re.IGNORECASE)]
     forward = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
     if ahead:
