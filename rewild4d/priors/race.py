@@ -14,7 +14,7 @@ from rewild4d.priors.search import match_areas
 from rewild4d.priors.silhouettes import Targets, color_mismatch, crop_targets, mean_color, mismatch
 from rewild4d.types import Frame
 
-HANDICAP = 1.3
+HANDICAP = 1.4
 """The costs of all kinds of body but the usual one are multiplied by this where they are compared."""
 COLOR_RATE = 0.05
 """Learning rate of the surface's colours."""
