@@ -143,6 +143,7 @@ def _fit(arguments: list[str]) -> int:
         raise UserError("--keypoints and --mapping: expected both or neither.")
     from rewild4d.datasets.video.online import Online
     from rewild4d.datasets.video.whole_frames import whole_clip
+    from rewild4d.priors.bodies.choice import is_rig_file
     from rewild4d.priors.choose import PriorChoice, split_marks
     from rewild4d.priors.footage import Evidence, fit_footage
     from rewild4d.priors.io import save_prior, seal
@@ -155,6 +156,8 @@ def _fit(arguments: list[str]) -> int:
     mapping = load_mapping(options.mapping) if options.mapping else {}
     if options.rig is not None and options.prior != FitOptions.prior:
         raise UserError("--rig and --prior: expected one of them, got both.")
+    if options.rig is not None and not is_rig_file(str(options.rig)):
+        raise UserError(f"--rig {options.rig}: expected a .glb or .gltf file.")
     choice = PriorChoice(options.prior if options.rig is None else f"template:{options.rig}", STANDARD)
     if not choice.is_fitted:
         raise UserError(f"--prior {options.prior}: expected template, template:<which> or learned:<weights>.")

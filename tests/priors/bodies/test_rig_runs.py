@@ -59,6 +59,7 @@ def test_what_cannot_be_used_is_one_sentence(rig: Path, tmp_path: Path, capsys: 
         capsys, "prior", "fit", *words, rig, "--prior", "template:biped"
     )
     assert "missing.glb" in refusal(capsys, "prior", "fit", *words, tmp_path / "missing.glb")
+    assert f"--rig {tmp_path}: expected a .glb or .gltf file." in refusal(capsys, "prior", "fit", *words, tmp_path)
     (tmp_path / "broken.glb").write_bytes(rig.read_bytes()[:500])
     assert "broken.glb" in refusal(capsys, "prior", "fit", *words, tmp_path / "broken.glb")
     assert not (tmp_path / "p.npz").exists()
