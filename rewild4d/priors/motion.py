@@ -42,14 +42,21 @@ class SurfaceSample:
 
 def sample_surface(prior: Prior, count: int, generator: torch.Generator) -> SurfaceSample:
     """Draw ``count`` points uniformly by area from the rest mesh."""
-    corners = prior.vertices[prior.faces]
+    return sample_mesh(prior.vertices, prior.faces, prior.weights, count, generator)
+
+
+def sample_mesh(
+    vertices: Tensor, faces: Tensor, vertex_weights: Tensor, count: int, generator: torch.Generator
+) -> SurfaceSample:
+    """Draw ``count`` points uniformly by area from a mesh, [n, 3], [f, 3], with skinning weights, [n, J]."""
+    corners = vertices[faces]
     cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = cross.norm(dim=-1) / 2
     face = torch.multinomial(area, count, replacement=True, generator=generator)
     u, v = torch.rand(2, count, generator=generator)
     barycentric = torch.stack((1 - u.sqrt(), u.sqrt() * (1 - v), u.sqrt() * v), dim=-1)
     points = (barycentric[..., None] * corners[face]).sum(1)
-    weights = (barycentric[..., None] * prior.weights[prior.faces[face]]).sum(1)
+    weights = (barycentric[..., None] * vertex_weights[faces[face]]).sum(1)
     radius = math.sqrt(float(area.sum()) / (math.pi * count))
     return SurfaceSample(points, normalize(cross[face], dim=-1), weights / weights.sum(-1, keepdim=True), radius)
 

@@ -2,11 +2,10 @@
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from rewild4d.priors.bodies.body import Measure
 from rewild4d.priors.bodies.quadruped import leg_sections
-from rewild4d.priors.bodies.tetrapod import Measures, Tetrapod, direction
+from rewild4d.priors.bodies.tetrapod import Measures, Tetrapod, direction, head_sections, tail_sections
 from rewild4d.priors.bodies.tubes import Section, point
 
 HEAD_FORWARD, NOSE_FORWARD = 0.3, 0.1
@@ -102,25 +101,15 @@ class Biped(Tetrapod):
 
     def trunk(self, m: Measures, joints: list[Tensor]) -> list[Section]:
         half, zero = m["body_length"] / 2, torch.zeros_like(m["body_length"])
-        nose, poll, neck, withers, _, _, root, tail, tip = joints
-        snout = normalize(nose - poll, dim=-1)
-        throat = withers + _pitched(m, -0.35 * m["chest_height"], 0.12 * half)
+        throat = joints[3] + _pitched(m, -0.35 * m["chest_height"], 0.12 * half)
         return [
-            (nose, 0.55 * m["muzzle"], 0.55 * m["muzzle"]),
-            (nose - 0.18 * snout * m["head_length"][..., None], m["muzzle"], m["muzzle"]),
-            (0.5 * (nose + poll), 0.8 * m["head_width"], 0.85 * m["head_height"]),
-            (poll + 0.12 * snout, 1.1 * m["head_width"], 1.15 * m["head_height"]),
-            (poll - 0.25 * (poll - neck), m["neck_top"] * 0.85, m["neck_top"]),
-            (neck, 0.5 * (m["neck_top"] + m["neck_base"]) * 0.8, 0.5 * (m["neck_top"] + m["neck_base"])),
+            *head_sections(m, joints),
             (throat, 0.8 * m["chest_width"], 1.2 * m["neck_base"]),
             (_pitched(m, m["chest_drop"], 0.8 * half), m["chest_width"], m["chest_height"]),
             (_pitched(m, m["belly_drop"], zero), m["belly_width"], m["belly_height"]),
             (_pitched(m, zero, -0.75 * half), m["hip_width"], m["hip_height"]),
             (_pitched(m, zero, -half - 0.45 * m["hip_height"]), 0.75 * m["hip_width"], 0.75 * m["hip_height"]),
-            (root, 1.3 * m["tail_base"], 1.3 * m["tail_base"]),
-            (0.5 * (root + tail), m["tail_base"], m["tail_base"]),
-            (tail + 0.25 * (tip - tail), m["tail_middle"], m["tail_middle"]),
-            (tip, 0.4 * m["tail_middle"], 0.4 * m["tail_middle"]),
+            *tail_sections(m, joints),
         ]
 
     def limb_sections(self, m: Measures, joints: list[Tensor], end: str) -> list[Section]:

@@ -5,7 +5,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from rewild4d.priors.motion import quats_from_normals
+from rewild4d.priors.motion import quats_from_normals, sample_mesh
 from rewild4d.transforms import quat_to_matrix
 
 SQUARES, BLOBS = 1400, 700
@@ -23,7 +23,7 @@ INSET = 2.1
 
 
 def spread_points(
-    vertices: np.ndarray, faces: np.ndarray, weights: np.ndarray, count: int
+    vertices: Tensor, faces: Tensor, weights: Tensor, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return about ``count`` evenly spread points of a surface.
 
@@ -36,18 +36,10 @@ def spread_points(
     Returns:
         Points [m, 3], unit normals [m, 3], weights [m, J], and the area of the surface.
     """
-    corners = vertices[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(cross, axis=1) / 2
-    rng = np.random.default_rng(0)
-    face = rng.choice(len(faces), DRAWN, p=area / area.sum())
-    u, v = rng.random((2, DRAWN))
-    share = np.stack((1 - np.sqrt(u), np.sqrt(u) * (1 - v), np.sqrt(u) * v), axis=1)
-    points = np.einsum("nk,nka->na", share, corners[face])
-    kept = _one_per_cell(points, count)
-    normals = cross[face[kept]] / (2 * area[face[kept], None])
-    blended = np.einsum("nk,nkj->nj", share[kept], weights[faces[face[kept]]])
-    return points[kept], normals, blended, float(area.sum())
+    drawn = sample_mesh(vertices, faces, weights, DRAWN, torch.Generator().manual_seed(0))
+    kept = _one_per_cell(drawn.points.numpy(), count)
+    points, normals, blended = (value[kept].numpy() for value in (drawn.points, drawn.normals, drawn.weights))
+    return points, normals, blended, DRAWN * np.pi * drawn.radius**2
 
 
 def _one_per_cell(points: np.ndarray, count: int) -> np.ndarray:

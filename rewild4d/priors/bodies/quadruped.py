@@ -2,10 +2,9 @@
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from rewild4d.priors.bodies.body import Measure
-from rewild4d.priors.bodies.tetrapod import ENDS, Measures, Tetrapod, direction
+from rewild4d.priors.bodies.tetrapod import ENDS, Measures, Tetrapod, direction, head_sections, tail_sections
 from rewild4d.priors.bodies.tubes import Section, point
 
 HEAD_FORWARD, NOSE_FORWARD, POLL_FORWARD = 0.4, 0.35, 0.1
@@ -92,24 +91,14 @@ class Quadruped(Tetrapod):
 
     def trunk(self, m: Measures, joints: list[Tensor]) -> list[Section]:
         half, zero = m["body_length"] / 2, torch.zeros_like(m["body_length"])
-        nose, poll, neck, withers, _, _, root, tail, tip = joints
-        snout = normalize(nose - poll, dim=-1)
         return [
-            (nose, 0.55 * m["muzzle"], 0.55 * m["muzzle"]),
-            (nose - 0.18 * snout * m["head_length"][..., None], m["muzzle"], m["muzzle"]),
-            (0.5 * (nose + poll), 0.8 * m["head_width"], 0.85 * m["head_height"]),
-            (poll + 0.12 * snout, 1.1 * m["head_width"], 1.15 * m["head_height"]),
-            (poll - 0.25 * (poll - neck), m["neck_top"] * 0.85, m["neck_top"]),
-            (neck, 0.5 * (m["neck_top"] + m["neck_base"]) * 0.8, 0.5 * (m["neck_top"] + m["neck_base"])),
-            (withers + point(-0.35 * m["chest_height"], 0.12 * half), 0.8 * m["chest_width"], 1.2 * m["neck_base"]),
+            *head_sections(m, joints),
+            (joints[3] + point(-0.35 * m["chest_height"], 0.12 * half), 0.8 * m["chest_width"], 1.2 * m["neck_base"]),
             (point(m["chest_drop"], 0.8 * half), m["chest_width"], m["chest_height"]),
             (point(m["belly_drop"], zero), m["belly_width"], m["belly_height"]),
             (point(zero, -0.75 * half), m["hip_width"], m["hip_height"]),
             (point(zero, -half - 0.45 * m["hip_height"]), 0.75 * m["hip_width"], 0.75 * m["hip_height"]),
-            (root, 1.3 * m["tail_base"], 1.3 * m["tail_base"]),
-            (0.5 * (root + tail), m["tail_base"], m["tail_base"]),
-            (tail + 0.25 * (tip - tail), m["tail_middle"], m["tail_middle"]),
-            (tip, 0.4 * m["tail_middle"], 0.4 * m["tail_middle"]),
+            *tail_sections(m, joints),
         ]
 
     def limb_sections(self, m: Measures, joints: list[Tensor], end: str) -> list[Section]:

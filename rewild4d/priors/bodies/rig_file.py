@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from rewild4d.datasets.rigs.reader import clips, load_rig
@@ -284,16 +285,9 @@ def _spreads(rig: _Rig, mean: Tensor, mirror: Tensor) -> Tensor:
     """Return standard deviations of joint angles about the object's axes around the mean pose, [J, 3]."""
     local = _against_parents(_turns(rig) @ mean.transpose(-1, -2), rig.parents)
     both = torch.cat((local, _flipped(local, mirror)))
-    spreads = ROOM * _angles(both).square().mean(0).sqrt()
+    angles = torch.from_numpy(Rotation.from_matrix(both.flatten(0, 1).numpy()).as_rotvec()).unflatten(0, both.shape[:2])
+    spreads = ROOM * angles.square().mean(0).sqrt()
     return spreads.clamp_min(LEAST_SPREAD)
-
-
-def _angles(rotations: Tensor) -> Tensor:
-    """Return axis-angle vectors of rotations by less than half a turn, radians, [..., 3]."""
-    skew = rotations - rotations.transpose(-1, -2)
-    axis = torch.stack((skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]), dim=-1) / 2
-    sine, cosine = axis.norm(dim=-1), (rotations.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
-    return axis * (torch.atan2(sine, cosine) / sine.clamp_min(1e-9))[..., None]
 
 
 def _posed(rig: _Rig, turns: Tensor) -> _Rig:
@@ -322,7 +316,7 @@ def _feet(rig: _Rig, mirror: Tensor) -> tuple[list[int], list[Tensor]]:
 
 
 def _template(rig: _Rig, bones: Tensor, mirror: Tensor) -> Template:
-    mesh = rig.vertices.numpy(), rig.faces.numpy(), rig.weights.numpy()
+    mesh = rig.vertices, rig.faces, rig.weights
     points, normals, weights, area = spread_points(*mesh, SQUARES)
     inner, inner_normals, inner_weights, _ = spread_points(*mesh, INNER)
     blobs, sizes, kept = filled(inner, inner_normals, BLOBS)

@@ -11,6 +11,7 @@ from functools import cache
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from rewild4d.priors.bodies.body import ANGLE_LIMIT, Measure, Proportions, Template, to_unit
 from rewild4d.priors.bodies.tubes import Section, Tube, chain_weights, loft, point, tube_faces, tube_quads
@@ -180,3 +181,28 @@ def _quads() -> Tensor:
 def direction(angle: Tensor, forward: float = 1.0) -> Tensor:
     """Return unit vectors in the plane of symmetry, risen by an angle above +z, or above -z where forward is -1."""
     return point(angle.sin(), forward * angle.cos())
+
+
+def head_sections(m: Measures, joints: list[Tensor]) -> list[Section]:
+    """Return the trunk's sections from the nose to the middle of the neck, from the joints of the spine."""
+    nose, poll, neck = joints[:3]
+    snout = normalize(nose - poll, dim=-1)
+    return [
+        (nose, 0.55 * m["muzzle"], 0.55 * m["muzzle"]),
+        (nose - 0.18 * snout * m["head_length"][..., None], m["muzzle"], m["muzzle"]),
+        (0.5 * (nose + poll), 0.8 * m["head_width"], 0.85 * m["head_height"]),
+        (poll + 0.12 * snout, 1.1 * m["head_width"], 1.15 * m["head_height"]),
+        (poll - 0.25 * (poll - neck), m["neck_top"] * 0.85, m["neck_top"]),
+        (neck, 0.5 * (m["neck_top"] + m["neck_base"]) * 0.8, 0.5 * (m["neck_top"] + m["neck_base"])),
+    ]
+
+
+def tail_sections(m: Measures, joints: list[Tensor]) -> list[Section]:
+    """Return the trunk's sections from the root to the tip of the tail."""
+    root, tail, tip = joints[6:]
+    return [
+        (root, 1.3 * m["tail_base"], 1.3 * m["tail_base"]),
+        (0.5 * (root + tail), m["tail_base"], m["tail_base"]),
+        (tail + 0.25 * (tip - tail), m["tail_middle"], m["tail_middle"]),
+        (tip, 0.4 * m["tail_middle"], 0.4 * m["tail_middle"]),
+    ]
