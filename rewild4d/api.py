@@ -75,7 +75,7 @@ def load_case(
         name: of the case, such as "horse/walk"; the first one where it is left out.
         data: folder or video file; the built-in animals where it is left out.
         protocol: its name; the data set's default where it is left out.
-        prior: "template", "template:<which>", "colors", "learned:<weights>", "coarse:<noise>", "rig" or an .npz
+        prior: "template", "template:<which>", "masks", "learned:<weights>", "coarse:<noise>", "rig" or an .npz
             file, as `run --prior`.
         preset: effort of the prior's fit under known cameras: "quick", "standard" or "paper".
         progress: whether a bar is shown on standard error.

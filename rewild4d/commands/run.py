@@ -38,8 +38,8 @@ class RunChoice:
         preset: settings and length of the fit: quick, standard or paper; of `ours` also beyond, which is standard with
             terms that the paper does not have, for known cameras, and one-side, for a camera that stays at one side.
         seeds: one run for each.
-        prior: "template" (fitted to the clip's masks: a quadruped, biped or primate, whichever fits best),
-            "template:<which>" (one of these, or a rig of your own, FILE.glb), "colors" (then to the colours too),
+        prior: "template" (fitted to the clip's masks and colours: a quadruped, biped or primate, whichever fits best),
+            "template:<which>" (one of these, or a rig of your own, FILE.glb), "masks" (the same from masks alone),
             "learned:<weights>" (a quadruped, also to points that a network finds; `prior train` makes weights),
             "coarse:<noise>" (from the truth plus noise, for studies), "rig" (the data set's own shape and skeleton, an
             upper bound) or a file (of a real video, by `prior fit` or `prior import`).

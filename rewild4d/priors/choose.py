@@ -16,7 +16,7 @@ from rewild4d.priors.bodies.choice import bodies, identity, is_rig_file
 from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.bodies.tetrapod import MIRROR
 from rewild4d.priors.coarse import coarse_prior
-from rewild4d.priors.config import FOOTAGE, PriorConfig, Use, with_colors, with_points
+from rewild4d.priors.config import FOOTAGE, PriorConfig, Use, with_points, without_colors
 from rewild4d.priors.fit import fit_template
 from rewild4d.priors.footage import Evidence, fit_footage
 from rewild4d.priors.io import load_prior, save_prior, seal
@@ -43,12 +43,12 @@ class PriorChoice:
     """The prior that a run asks for.
 
     Attributes:
-        name: "template" (fitted to the clip's masks alone, with its cameras where it has any; of the package's
-            templates the one that fits best), "template:<which>" (a template's name or a rig file), "colors" and
-            "colors:<which>" (the same, then to colours too), "learned:<weights>" (the quadruped, fitted to masks and to
-            points of the body that a network finds), "coarse" or
-            "coarse:<noise>" (from the truth, plus noise; for studies of prior quality only), "rig" (the data set's own
-            shape and skeleton: a bound) or the path of an npz file.
+        name: "template" (fitted to the clip's masks, and to its colours where known cameras see several sides; of the
+            package's templates the one that fits best), "template:<which>" (a template's name or a rig file), "masks"
+            and "masks:<which>" (the same from masks alone), "learned:<weights>" (the quadruped, fitted to masks and to
+            points of the body that a network finds), "coarse" or "coarse:<noise>" (from the truth, plus noise; for
+            studies of prior quality only), "rig" (the data set's own shape and skeleton: a bound) or the path of an npz
+            file.
         config: settings of the template fit under known cameras.
         mapping: names the template's point of each keypoint (`landmarks.load_mapping`); None ignores keypoints.
         use: frames whose keypoints a fit under unknown cameras sees.
@@ -94,7 +94,7 @@ class PriorChoice:
     @property
     def is_fitted(self) -> bool:
         """Whether the template is fitted to the clip, which alone decides the prior."""
-        return self._kind in ("template", "colors", "learned")
+        return self._kind in ("template", "masks", "learned")
 
     @property
     def is_own_rig(self) -> bool:
@@ -155,7 +155,7 @@ class PriorChoice:
                 parts.append(identity(self.name.partition(":")[2]))
         elif self.is_from_truth:
             named = "rig" if self.noise is None else f"coarse {self.noise}"
-            parts += [named, truth.digest, msgspec.json.encode(self.config)]
+            parts += [named, truth.digest, msgspec.json.encode(self.settings(clip))]
         else:
             parts += ["file", load_prior(Path(self.name)).digest, repr(self._pairs)]
         return digest(*parts)[:16]
@@ -165,11 +165,11 @@ class PriorChoice:
         return self.settings_under(has_cameras(clip))
 
     def settings_under(self, known_cameras: bool) -> PriorConfig:
-        """Return settings of the fit where cameras are known or not."""
+        """Return settings of the fit where cameras are known or not; only "template" looks at colours."""
         config = FOOTAGE if self.is_fitted and not known_cameras else self.config
-        if self._kind == "colors":
-            return with_colors(config) if known_cameras else config
-        return with_points(config) if self.is_learned else config
+        if self._kind == "template":
+            return config
+        return with_points(without_colors(config)) if self.is_learned else without_colors(config)
 
     def keypoints(self, clip: Clip) -> tuple[Marks | None, Marks | None]:
         """Return the clip's keypoints for the fit and those to score it by; None where there are none."""
@@ -217,9 +217,10 @@ def make_prior(choice: PriorChoice, clip: Clip, truth: Truth, path: Path, log: L
 
 
 def _fitted(choice: PriorChoice, clip: Clip, truth: Truth, log: Log) -> Prior:
+    config = choice.settings(clip)
     if choice.noise is not None:
-        return coarse_prior(clip, truth.held_out, noise=choice.noise, seed=PRIOR_SEED, config=choice.config, log=log)
-    network, config = choice.network(), choice.settings(clip)
+        return coarse_prior(clip, truth.held_out, noise=choice.noise, seed=PRIOR_SEED, config=config, log=log)
+    network = choice.network()
     if choice.name == "rig" or has_cameras(clip):
         fitted = fit_template(
             clip, config=config, seed=PRIOR_SEED, log=log, network=network, bodies=choice.bodies()

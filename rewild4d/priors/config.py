@@ -73,18 +73,23 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gait_weight: float = 0.015
     travel_weight: float = 0.08
     carriage_weight: float = 1.0
-    color_weight: float = 10.0
+    color_weight: float = 4.0
     keypoint_weight: float = 0.1
     points_weight: float = 0.0
     root_period: int = 4
 
 
+COLORS = Stage(
+    size=96, steps=300, blur=(0.03, 0.005), keep=1, frames=12, rasterized=True, relief=True, colors=True, pace=0.33
+)
+"""The round that looks at colours too."""
 STANDARD = PriorConfig(
     stages=(
         Stage(size=32, steps=40, blur=(0.08, 0.04), keep=6, joints=False, frames=12),
         Stage(size=48, steps=80, blur=(0.05, 0.03), keep=2),
         Stage(size=64, steps=150, blur=(0.04, 0.015), keep=2),
         Stage(size=80, steps=250, blur=(0.02, 0.006), keep=1, rasterized=True, relief=True),
+        COLORS,
     )
 )
 QUICK = PriorConfig(
@@ -95,10 +100,6 @@ QUICK = PriorConfig(
         Stage(size=64, steps=80, blur=(0.02, 0.008), keep=1, rasterized=True, relief=True),
     )
 )
-COLORS = Stage(
-    size=96, steps=300, blur=(0.03, 0.005), keep=1, frames=12, rasterized=True, relief=True, colors=True, pace=0.33
-)
-"""The round that looks at colours too."""
 FOOTAGE = PriorConfig(
     stages=(
         Stage(size=32, steps=50, blur=(0.08, 0.04), keep=6, joints=False, frames=12),
@@ -116,11 +117,6 @@ def with_points(config: PriorConfig) -> PriorConfig:
     return msgspec.structs.replace(
         config, points_weight=0.05, angle_weight=0.03, root_weight=0.05, root_period=2, gait_weight=0.0
     )
-
-
-def with_colors(config: PriorConfig) -> PriorConfig:
-    """Return the settings of a fit that ends with a round on colours too."""
-    return msgspec.structs.replace(config, stages=(*config.stages, COLORS))
 
 
 def without_colors(config: PriorConfig) -> PriorConfig:

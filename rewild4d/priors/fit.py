@@ -46,6 +46,7 @@ class Animal:
         shape: body proportions.
         object_to_world: float64, [T, 4, 4], of the template scaled to `OBJECT_DIAGONAL`.
         angles: axis-angle vectors in radians, [T, J, 3].
+        colored: whether colours took part in the fit.
         figures: cost of the best guess, its lead over the opposite heading, and costs of the starts.
     """
 
@@ -53,6 +54,7 @@ class Animal:
     shape: Proportions
     object_to_world: Tensor
     angles: Tensor
+    colored: bool
     figures: dict[str, float]
 
 
@@ -60,7 +62,8 @@ def fit_template(
     clip: Clip, *, config: PriorConfig, seed: int, log: Log, network: PointNetwork | None = None,
     bodies: Sequence[Body] = (QUADRUPED,),
 ) -> Prior:  # fmt: skip
-    """Fit the template to a clip's masks under its cameras, and to the points that a network finds if there is one.
+    """Fit the template to a clip's masks under its cameras, then to its colours too where they see several sides, and
+    to the points that a network finds if there is one.
 
     The seed is that of the frames drawn for each step. Of several ``bodies`` the one that fits best is taken.
 
@@ -74,8 +77,9 @@ def fit_template(
     count = len(clip.frames)
     animal = fit_animal(clip.frames, range(count), count, clip.name, config, seed, log, network, bodies)
     points = " and to points of the body that a network finds in them" if network else ""
+    seen = "masks and colours" if animal.colored else "masks"
     provenance = (
-        f"Template ({animal.body.name}) fitted to the {count} masks of the clip{points} under known cameras, "
+        f"Template ({animal.body.name}) fitted to {seen} of the clip's {count} frames{points} under known cameras, "
         f"seed {seed}."
     )
     return make_prior(animal, clip, "learned" if network else "template", provenance)
@@ -146,7 +150,8 @@ class KnownCameras(Race):
         roots = best.roots().double()[0]
         local = similarity(size.expand(len(roots)), roots[:, :3, :3], roots[:, :3, 3])
         figures = {"cost": float(self.costs.min()), **self.figures}
-        return Animal(best.body, shape, self.working @ local, best.joint_angles()[0], figures)
+        colored = any(stage.colors for stage in self.config.stages)
+        return Animal(best.body, shape, self.working @ local, best.joint_angles()[0], colored, figures)
 
 
 def make_prior(animal: Animal, clip: Clip, name: str, provenance: str) -> Prior:

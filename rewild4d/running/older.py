@@ -1,4 +1,4 @@
-"""Records from before a preset was mended: they stand for their row, with a note, until there are later ones."""
+"""Records from before a preset or the prior was mended stand for their row, with a note, until there are later ones."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,9 +6,21 @@ from typing import Any
 import msgspec
 
 from rewild4d.leaderboard.records import RunRecord
+from rewild4d.priors.config import PriorConfig
 
 LOSSES = "run before two regularizers, the times of frames and the frame filter were mended (docs/experiments/paper.md)"
 MIRRORS = "run without the mirror images that the preset has since (docs/experiments/baseline-presets.md)"
+
+COLORS = "from priors fitted to masks alone, not to colours too (docs/experiments/prior-colors.md)"
+
+
+def notes_on(run: RunRecord) -> tuple[str, ...]:
+    """Return notes on what was mended since a run, none where nothing was."""
+    known = run.protocol.get("selection", {}).get("cameras") in ("sweep", "random")
+    fitted = run.prior.get("choice") == "template" and run.preset != "quick"
+    stages = (run.prior.get("config") or {}).get("stages", ())
+    masks_alone = known and fitted and bool(stages) and not any("colors" in stage for stage in stages)
+    return tuple(note for note in (older(run.config), COLORS if masks_alone else "") if note)
 
 
 def older(settings: Any) -> str:
@@ -38,7 +50,15 @@ def renewed(settings: Any, wanted: msgspec.Struct) -> Any:
     return settings
 
 
+def renewed_prior(settings: dict[str, Any], wanted: PriorConfig) -> dict[str, Any]:
+    """Add the rounds on colours of ``wanted`` to settings of a prior from before there were any; others unchanged."""
+    stages = settings.get("stages", [])
+    if any("colors" in stage for stage in stages):
+        return settings
+    return settings | {"stages": [*stages, *(msgspec.to_builtins(stage) for stage in wanted.stages if stage.colors)]}
+
+
 def without_older(found: Sequence[RunRecord]) -> tuple[RunRecord, ...]:
     """Leave out older runs where there are later ones."""
-    later = tuple(run for run in found if not older(run.config))
+    later = tuple(run for run in found if not notes_on(run))
     return later or tuple(found)

@@ -18,7 +18,7 @@ from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import PRESETS as PRIOR_PRESETS
 from rewild4d.priors.config import STANDARD
 from rewild4d.registry import load_dataset, load_method, names
-from rewild4d.running.older import older, renewed, without_older
+from rewild4d.running.older import notes_on, renewed, renewed_prior, without_older
 from rewild4d.running.provenance import FROM_TRUTH
 from rewild4d.running.runner import Entry
 
@@ -142,7 +142,7 @@ def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[
             without_older([r for r in found if r.method == entry.method and _equals(r.config, entry.config)])
             for found in under
         )
-        notes += tuple(dict.fromkeys(note for found in own for run in found if (note := older(run.config))))
+        notes += tuple(dict.fromkeys(note for found in own for run in found for note in notes_on(run)))
         rows.append(Entrant(row.label, own, "", notes))
     shown = {row.method for row in spec.rows}
     # Lower bounds are shown for the cases of the other rows.
@@ -178,7 +178,7 @@ def _is_under(record: RunRecord, condition: Condition, spec: Spec) -> bool:
     effort = record.prior.get("config")  # records from before it was written have none
     known_cameras = record.protocol.get("selection", {}).get("cameras") != "unknown"
     asked = PriorChoice(condition.prior, PRIOR_PRESETS.get(spec.preset, STANDARD)).settings_under(known_cameras)
-    same_effort = effort is None or _equals(effort, asked)
+    same_effort = effort is None or _equals(renewed_prior(effort, asked), asked)
     found = record.dataset, record.protocol["name"], choice, record.prior.get("keypoints", "none")
     return found == wanted and fits and same_effort
 

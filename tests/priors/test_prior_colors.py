@@ -12,7 +12,7 @@ from walking import shortened, silent, walking_clip
 
 from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.choose import PriorChoice
-from rewild4d.priors.config import COLORS, STANDARD, Stage, with_colors
+from rewild4d.priors.config import COLORS, STANDARD, Stage
 from rewild4d.priors.fit import KnownCameras, fit_template
 from rewild4d.priors.hypotheses import ROTATION_SPREAD, Hypotheses
 from rewild4d.priors.race import Steps
@@ -130,23 +130,32 @@ def colored(clip: Clip) -> Clip:
     return replace(clip, frames=tuple(frames))
 
 
-def test_a_name_adds_a_round_that_looks_at_colours() -> None:
-    choices: dict[str, Any] = {name: PriorChoice(name, STANDARD) for name in ("template", "colors", "colors:biped")}
+def test_the_template_is_fitted_to_colours_too_unless_masks_are_asked_for() -> None:
+    names = ("template", "template:biped", "masks", "masks:biped", "rig", "coarse:1", "learned:w")
+    choices: dict[str, Any] = {name: PriorChoice(name, STANDARD) for name in names}
     stages = {name: choice.settings_under(known_cameras=True).stages for name, choice in choices.items()}
-    assert stages["template"] == STANDARD.stages and not any(stage.colors for stage in STANDARD.stages)
-    assert stages["colors"] == stages["colors:biped"] == (*STANDARD.stages, COLORS)
-    assert not any(stage.colors for stage in choices["colors"].settings_under(known_cameras=False).stages)
-    assert [body.name for body in choices["colors:biped"].bodies()] == ["biped"]
+    assert STANDARD.stages[-1] == COLORS
+    for name in names:
+        assert stages[name] == (STANDARD.stages if name.startswith("template") else STANDARD.stages[:-1]), name
+    assert not any(stage.colors for stage in choices["template"].settings_under(known_cameras=False).stages)
+    assert [body.name for body in choices["masks:biped"].bodies()] == ["biped"]
+
+
+def test_only_a_round_on_colours_looks_at_them() -> None:
     clip, other, short = walking_clip(3, "sweep"), colored(walking_clip(3, "sweep")), shortened(2)
-    same = [fit_template(each, config=short, seed=0, log=silent).transforms for each in (clip, other)]
+    same = [fit_template(each, config=short, seed=0, log=silent) for each in (clip, other)]
     brief = msgspec.structs.replace(COLORS, steps=2)
     config = msgspec.structs.replace(short, stages=(*short.stages, brief))
-    apart = [fit_template(each, config=config, seed=0, log=silent).transforms for each in (clip, other)]
-    assert torch.equal(*same) and not torch.equal(*apart)
+    apart = [fit_template(each, config=config, seed=0, log=silent) for each in (clip, other)]
+    assert torch.equal(*(made.transforms for made in same))
+    assert not torch.equal(*(made.transforms for made in apart))
+    assert "fitted to masks of the clip's 3 frames" in same[0].provenance
+    assert "fitted to masks and colours of the clip's 3 frames" in apart[0].provenance
 
 
 def test_under_one_direction_of_view_colours_are_left_out() -> None:
     clip = walking_clip(3, "fixed")
-    config = with_colors(shortened(1))
+    brief = msgspec.structs.replace(COLORS, steps=1)
+    config = msgspec.structs.replace(shortened(1), stages=(*shortened(1).stages, brief))
     fitted = [fit_template(each, config=config, seed=0, log=silent) for each in (clip, colored(clip))]
     assert torch.equal(fitted[0].transforms, fitted[1].transforms)

@@ -8,9 +8,9 @@ from records_for_tests import PROTOCOL, psnr, record, spec
 from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.specs import Line
 from rewild4d.leaderboard.tables import Entrant
-from rewild4d.priors.config import QUICK
+from rewild4d.priors.config import QUICK, STANDARD, without_colors
 from rewild4d.running import planning
-from rewild4d.running.older import LOSSES, MIRRORS
+from rewild4d.running.older import COLORS, LOSSES, MIRRORS
 
 
 def test_runs_from_before_the_losses_were_mended_stand_for_their_row_until_there_are_later_ones() -> None:
@@ -60,3 +60,27 @@ def test_runs_of_gart_from_before_it_had_mirror_images_stand_for_its_row_with_a_
     assert [r.run_id for r in old.records[0]] == ["0"] and MIRRORS in old.notes
     assert [r.run_id for r in new.records[0]] == ["1"] and not new.notes
     assert none.records == ((),), "a run that was asked to have none is another row"
+
+
+def test_runs_from_priors_of_masks_alone_stand_for_their_row_with_a_note_until_there_are_later_ones() -> None:
+    found = spec([Line(label="Ours", method="ours")], preset="standard")
+    config = msgspec.to_builtins(planning.row_entry("t", found.rows[0], found, ()).config)
+    now, masks = (msgspec.to_builtins(prior) for prior in (STANDARD, without_colors(STANDARD)))
+    then = masks | {"stages": [{k: v for k, v in stage.items() if k != "colors"} for stage in masks["stages"]]}
+
+    def row(*efforts: dict[str, Any], cameras: str = "sweep") -> Entrant:
+        protocol = PROTOCOL | {"name": "artemis-sweep-128", "scores": ["psnr"], "selection": {"cameras": cameras}}
+        runs = [
+            record(
+                config=config, preset="standard", protocol=protocol, prior={"choice": "template", "config": effort},
+                scores=psnr(float(index)), run_id=str(index),
+            )
+            for index, effort in enumerate(efforts)
+        ]  # fmt: skip
+        return planning.entrants("t", found, runs)[0][0]
+
+    old, new, none, fixed = row(then), row(then, now), row(masks), row(then, cameras="fixed")
+    assert [r.run_id for r in old.records[0]] == ["0"] and old.notes == (COLORS,)
+    assert [r.run_id for r in new.records[0]] == ["1"] and not new.notes
+    assert none.records == ((),), "a run that was asked to have masks alone is another row"
+    assert [r.run_id for r in fixed.records[0]] == ["0"] and not fixed.notes, "one camera: no colours today either"
