@@ -249,6 +249,33 @@ class Footage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """Instead of `cameras`: fits of a film and of its mirror image disagree by some pixels."""
 
 
+class OneSide(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Values that replace others where all frames see the animal from one side (docs/experiments/held-skin.md)."""
+
+    when: Literal["never", "known", "always"] = "never"
+    """Where they are used: "known" where cameras are known, "always" for footage of unknown cameras too."""
+    samples: Count = 12_000
+    """Instead of `canonical.samples`."""
+    thickness: Positive = 0.3
+    """Instead of `canonical.thickness`."""
+    opacity: Opacity = 0.98
+    """Instead of `canonical.opacity`."""
+    pull: Weight = 5.0
+    """Instead of `prior.pull`."""
+    pull_until: Weight = 0.35
+    """Instead of `prior.pull_until`."""
+    untold: Weight = 0.2
+    """Instead of `prior.untold`."""
+    temporal: Weight = 5.0
+    """Instead of `geometry.temporal`."""
+    colors_epsilon: Positive = 1e-4
+    """Instead of `rates.colors_epsilon`."""
+    cap: Count = 16_000
+    """Instead of `density.cap`."""
+    skin: Skin = Skin(disc=0.05, bind=0.02, evidence=0.03, heights=1e-3, follow=True)
+    """Instead of `skin`."""
+
+
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Settings of `ours`; the defaults are the paper's profile, presets change them."""
 
@@ -281,3 +308,4 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     rates: Rates = Rates()
     density: Density = Density()
     footage: Footage = Footage()
+    one_side: OneSide = OneSide()

@@ -13,12 +13,12 @@ from rewild4d.ours.canonical import Gaussians, Posed
 from rewild4d.ours.symmetry import Key, Supervision
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import quat_to_matrix
-from rewild4d.types import Camera
+from rewild4d.types import Camera, Prior
 
 LEAST_COSINE = 0.1
 """Of a disc seen from its edge: the rasterizer widens it, so that its patch does not vanish."""
-
-
+ONE_SIDE = math.radians(40.0)
+"""Largest angle of a line of sight to their mean, in the object frame, of frames that see one side of an animal."""
 NEAR = 2
 """Frames on either side that tell a pose too, since poses are smooth over time."""
 
@@ -63,6 +63,12 @@ def turn(centers: Tensor, positions: Tensor) -> Tensor:
     gaps = (positions[:, None] - positions).abs()
     near = ((gaps > 0) & (gaps < NEAR + 0.5)).double()
     return (squares * near).sum(1) / near.sum(1).clamp_min(1)
+
+
+def sees_one_side(prior: Prior) -> bool:
+    """Tell whether all frames see the animal from one side; one that turns before a camera shows others."""
+    sights = normalize(torch.stack([camera.center.double() for camera in prior.cameras]), dim=-1)
+    return bool((sights @ normalize(sights.mean(0), dim=0)).min() > math.cos(ONE_SIDE))
 
 
 def pull_shares(supervision: Supervision, limit: float) -> list[float]:

@@ -8,6 +8,7 @@ import torch
 from rewild4d.contracts import Log, MethodInfo
 from rewild4d.ours import INFO
 from rewild4d.ours.config import Config as OursConfig
+from rewild4d.ours.evidence import sees_one_side
 from rewild4d.ours.fit import train
 from rewild4d.ours.motion import Root
 from rewild4d.ours.reconstruction import OursReconstruction, load_reconstruction
@@ -33,7 +34,8 @@ class Ours:
         workdir: Path | None,
     ) -> OursReconstruction:
         """Reconstruct from the clip and the prior; see contracts.Method."""
-        config = for_clip_of_ours(config, len(clip.frames), filmed=clip.guessed_cameras)
+        filmed, one_sided = clip.guessed_cameras, sees_one_side(prior)
+        config = for_clip_of_ours(config, len(clip.frames), filmed=filmed, one_sided=one_sided)
         root = Root.of(clip, prior)
         model = train(clip, prior, config, seed, device, log, workdir)
         return OursReconstruction(model, config, root)

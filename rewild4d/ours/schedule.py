@@ -16,12 +16,14 @@ def for_clip(config: C, frames: int) -> C:
     return msgspec.structs.replace(config, iterations=max(own.iterations, own.steps_per_frame * frames))
 
 
-def for_clip_of_ours(config: Config, frames: int, *, filmed: bool = False) -> Config:
-    """Resolve settings for a clip: fewer steps if short, a finer time code if long, `Footage` if its cameras are
-    unknown.
+def for_clip_of_ours(config: Config, frames: int, *, filmed: bool = False, one_sided: bool = False) -> Config:
+    """Resolve settings for a clip: fewer steps if short, a finer time code if long, `OneSide` if all frames see the
+    animal from one side, and then `Footage` if its cameras are unknown.
 
     The result stays the same for a clip of any length.
     """
+    if one_sided and config.one_side.when in (("always",) if filmed else ("always", "known")):
+        config = _for_one_side(config)
     config = _for_footage(config) if filmed and config.footage.use else config
     config = _for_short(config) if frames <= config.short_frames else config
     pose = config.pose
@@ -41,6 +43,20 @@ def _for_footage(config: Config) -> Config:
         rates=replace(config.rates, pose=own.pose, deform=own.deform),
         cameras=own.cameras,
         footage=replace(own, use=False),
+    )
+
+
+def _for_one_side(config: Config) -> Config:
+    own, replace = config.one_side, msgspec.structs.replace
+    return replace(
+        config,
+        canonical=replace(config.canonical, samples=own.samples, thickness=own.thickness, opacity=own.opacity),
+        prior=replace(config.prior, pull=own.pull, pull_until=own.pull_until, untold=own.untold),
+        geometry=replace(config.geometry, temporal=own.temporal),
+        rates=replace(config.rates, colors_epsilon=own.colors_epsilon),
+        density=replace(config.density, cap=own.cap),
+        skin=own.skin,
+        one_side=replace(own, when="never"),
     )
 
 

@@ -136,7 +136,7 @@ def test_an_interval_that_holds_0_is_no_lead(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_a_preset_or_a_case_that_is_not_there_is_said(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bogus = "unknown preset 'bogus'. Available: beyond, one-side, paper, paper-short, quick, standard."
+    bogus = "unknown preset 'bogus'. Available: beyond, paper, paper-short, quick, standard."
     assert bogus in refusal(capsys, "table", "sweep-random", "--runs", str(runs), "--preset", "bogus")
     page = str(runs / "page")
     assert bogus in refusal(capsys, "leaderboard", "build", "--runs", str(runs), "--out", page, "--preset", "bogus")

@@ -1,13 +1,20 @@
 """The settings that a preset gives: by the length of the clip, and by whether its cameras are known."""
 
+import math
+from dataclasses import replace
+
 import msgspec
+import pytest
 import torch
 from toys import TINY
 
 from rewild4d.config import load_preset
 from rewild4d.ours.config import Config
+from rewild4d.ours.evidence import sees_one_side
 from rewild4d.ours.method import Ours
 from rewild4d.ours.schedule import for_clip_of_ours
+from rewild4d.priors.kinematics import rotation_about
+from rewild4d.transforms import camera_in_object
 from rewild4d.types import Clip, Prior
 
 CPU = torch.device("cpu")
@@ -31,23 +38,47 @@ def test_settings_follow_the_length_of_the_clip() -> None:
 
 def test_what_is_beyond_the_paper_differs_from_standard_in_these_alone() -> None:
     standard, beyond = (load_preset("ours", Config, name) for name in ("standard", "beyond"))
-    replace = msgspec.structs.replace
-    assert beyond == replace(
+    own = msgspec.structs.replace
+    assert beyond == own(
         standard,
-        geometry=replace(standard.geometry, limb_plane=100.0, sideways=1000.0, temporal=2.0, still=0.0),
-        loss=replace(standard.loss, isolated=False),
-        prior=replace(standard.prior, pull_turn=0.07),
-        rates=replace(standard.rates, deform=(2e-3, 1e-5)),
-        density=replace(standard.density, cap=14_000, end=0.9),
+        geometry=own(standard.geometry, limb_plane=100.0, sideways=1000.0, temporal=2.0, still=0.0),
+        loss=own(standard.loss, isolated=False),
+        prior=own(standard.prior, pull_turn=0.07),
+        rates=own(standard.rates, deform=(2e-3, 1e-5)),
+        density=own(standard.density, cap=14_000, end=0.9),
+        one_side=own(standard.one_side, when="known"),
     )
     assert standard.loss.isolated and standard.geometry.limb_plane == standard.geometry.sideways == 0
 
 
-def test_a_camera_at_one_side_has_its_own_preset_beyond_the_paper() -> None:
-    beyond, one_side = (load_preset("ours", Config, name) for name in ("beyond", "one-side"))
-    changed = {name for name in beyond.__struct_fields__ if getattr(beyond, name) != getattr(one_side, name)}
-    assert changed == {"canonical", "skin", "prior", "rates", "density", "geometry"}
-    assert one_side.skin.holds and one_side.prior.untold and not beyond.skin.holds and not beyond.prior.untold
+def test_where_one_side_is_seen_beyond_keeps_what_the_prior_knows_of_the_others() -> None:
+    beyond = for_clip_of_ours(load_preset("ours", Config, "beyond"), 24)
+    held = for_clip_of_ours(load_preset("ours", Config, "beyond"), 24, one_sided=True)
+    changed = {name for name in beyond.__struct_fields__ if getattr(beyond, name) != getattr(held, name)}
+    assert changed == {"canonical", "skin", "prior", "rates", "density", "geometry", "one_side"}
+    assert (held.canonical.samples, held.density.cap, held.geometry.temporal) == (12_000, 16_000, 5.0)
+    assert held.skin.holds and held.prior.untold and not beyond.skin.holds and not beyond.prior.untold
+    assert for_clip_of_ours(held, 300, one_sided=True).skin == held.skin, "a saved fit stays as it is"
+
+
+def test_films_keep_it_only_where_it_is_asked_for_and_the_paper_never_does() -> None:
+    beyond, standard = (load_preset("ours", Config, name) for name in ("beyond", "standard"))
+    always = msgspec.structs.replace(beyond, one_side=msgspec.structs.replace(beyond.one_side, when="always"))
+    assert not for_clip_of_ours(beyond, 24, filmed=True, one_sided=True).skin.holds
+    film = for_clip_of_ours(always, 24, filmed=True, one_sided=True)
+    assert film.skin.holds and film.prior.pull_until == film.footage.pull_until and film.iterations == 24 * 250
+    assert for_clip_of_ours(standard, 24, one_sided=True) == for_clip_of_ours(standard, 24)
+
+
+@pytest.mark.parametrize(("degrees", "one_sided"), [(0.0, True), (75.0, True), (85.0, False), (360.0, False)])
+def test_one_side_is_within_forty_degrees_of_the_mean(toy: tuple[Clip, Prior], degrees: float, one_sided: bool) -> None:
+    _, prior = toy
+    cameras = []
+    for angle in torch.linspace(0, math.radians(degrees), 7).double():
+        turned = torch.eye(4, dtype=torch.float64)
+        turned[:3, :3] = rotation_about(1, angle[None])[0]
+        cameras.append(camera_in_object(prior.cameras[0], turned))
+    assert sees_one_side(replace(prior, cameras=tuple(cameras))) == one_sided
 
 
 def test_settings_follow_whether_the_cameras_are_known() -> None:
