@@ -19,6 +19,8 @@ from rewild4d.priors.coarse import coarse_prior
 from rewild4d.priors.config import FOOTAGE, PriorConfig, Use, with_points, without_colors
 from rewild4d.priors.fit import fit_template
 from rewild4d.priors.footage import Evidence, fit_footage
+from rewild4d.priors.heading.network import HeadingNetwork
+from rewild4d.priors.heading.weights import package_digest, package_weights
 from rewild4d.priors.io import load_prior, save_prior, seal
 from rewild4d.priors.judge import doubts, joint_scores, measured
 from rewild4d.priors.landmarks import Marks, load_mapping, marks
@@ -133,6 +135,14 @@ class PriorChoice:
         """
         return load_weights(self._weights_file) if self.is_learned else None
 
+    def heading(self) -> HeadingNetwork | None:
+        """Return the network that reads headings, of a template that is fitted to more than masks; None for others."""
+        return package_weights() if self._reads_headings else None
+
+    @property
+    def _reads_headings(self) -> bool:
+        return self._kind == "template"
+
     @property
     def is_from_truth(self) -> bool:
         """Whether the prior is made from held-out data, so that results with it are bounds."""
@@ -149,6 +159,7 @@ class PriorChoice:
         parts: list[str | bytes] = [clip.digest, str(code_version())]
         if self.is_fitted:
             parts += ["template", msgspec.json.encode(self.settings(clip)), repr(self._pairs), self.use]
+            parts += [package_digest()] if self._reads_headings else []
             if self.is_learned:
                 parts += ["learned", self._weights_file.read_bytes()]
             else:
@@ -223,7 +234,8 @@ def _fitted(choice: PriorChoice, clip: Clip, truth: Truth, log: Log) -> Prior:
     network = choice.network()
     if choice.name == "rig" or has_cameras(clip):
         fitted = fit_template(
-            clip, config=config, seed=PRIOR_SEED, log=log, network=network, bodies=choice.bodies()
+            clip, config=config, seed=PRIOR_SEED, log=log, network=network, bodies=choice.bodies(),
+            heading=choice.heading(),
         )  # fmt: skip
         return rig_prior(clip, truth.rig(), fitted) if choice.name == "rig" and truth.rig else fitted
     given, scored = choice.keypoints(clip)

@@ -51,6 +51,7 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         root_weight: squared motion and tilt of the root, in standard deviations; fast motion counts more.
         view_weight: squared cosine between heading and viewing direction, where all cameras look one way: an animal at
             an angle looks like a shorter one.
+        heading_weight: nats below the heading that a network finds likeliest, likewise.
         gait_weight: feet on the ground that move towards the head, when hypotheses are compared.
         travel_weight: heading against the direction of travel, when hypotheses are compared.
         carriage_weight: heads folded into the body and raised tails, under unknown cameras.
@@ -70,6 +71,7 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     angle_weight: float = 0.15
     root_weight: float = 0.2
     view_weight: float = 0.01
+    heading_weight: float = 0.01
     gait_weight: float = 0.015
     travel_weight: float = 0.08
     carriage_weight: float = 1.0

@@ -14,6 +14,8 @@ from rewild4d.contracts import Log
 from rewild4d.priors.bodies.body import Body, Proportions, diagonal
 from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.config import PriorConfig, without_colors
+from rewild4d.priors.heading.network import HeadingNetwork
+from rewild4d.priors.heading.reading import Headings, read_headings
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.io import seal
 from rewild4d.priors.kinematics import pose
@@ -46,7 +48,7 @@ class Animal:
         shape: body proportions.
         object_to_world: float64, [T, 4, 4], of the template scaled to `OBJECT_DIAGONAL`.
         angles: axis-angle vectors in radians, [T, J, 3].
-        colored: whether colours took part in the fit.
+        seen: what it was fitted to, for the provenance.
         figures: cost of the best guess, its lead over the opposite heading, and costs of the starts.
     """
 
@@ -54,18 +56,19 @@ class Animal:
     shape: Proportions
     object_to_world: Tensor
     angles: Tensor
-    colored: bool
+    seen: str
     figures: dict[str, float]
 
 
 def fit_template(
     clip: Clip, *, config: PriorConfig, seed: int, log: Log, network: PointNetwork | None = None,
-    bodies: Sequence[Body] = (QUADRUPED,),
+    bodies: Sequence[Body] = (QUADRUPED,), heading: HeadingNetwork | None = None,
 ) -> Prior:  # fmt: skip
     """Fit the template to a clip's masks under its cameras, then to its colours too where they see several sides, and
     to the points that a network finds if there is one.
 
-    The seed is that of the frames drawn for each step. Of several ``bodies`` the one that fits best is taken.
+    The seed is that of the frames drawn for each step. Of several ``bodies`` the one that fits best is taken. Where all
+    cameras look one way, a network of ``heading`` takes part, if there is one.
 
     Returns:
         A prior with one pose per frame; `quality` has mask_iou, cost, facing_margin, starts (their number),
@@ -75,12 +78,11 @@ def fit_template(
         UserError: a frame has no camera, or no mask shows anything.
     """
     count = len(clip.frames)
-    animal = fit_animal(clip.frames, range(count), count, clip.name, config, seed, log, network, bodies)
+    animal = fit_animal(clip.frames, range(count), count, clip.name, config, seed, log, network, bodies, heading)
     points = " and to points of the body that a network finds in them" if network else ""
-    seen = "masks and colours" if animal.colored else "masks"
     provenance = (
-        f"Template ({animal.body.name}) fitted to {seen} of the clip's {count} frames{points} under known cameras, "
-        f"seed {seed}."
+        f"Template ({animal.body.name}) fitted to {animal.seen} of the clip's {count} frames{points} "
+        f"under known cameras, seed {seed}."
     )
     return make_prior(animal, clip, "learned" if network else "template", provenance)
 
@@ -88,10 +90,11 @@ def fit_template(
 def fit_animal(
     frames: Sequence[Frame], timesteps: Sequence[int], count: int, name: str, config: PriorConfig, seed: int, log: Log,
     network: PointNetwork | None = None, bodies: Sequence[Body] = (QUADRUPED,),
+    heading: HeadingNetwork | None = None,
 ) -> Animal:  # fmt: skip
     """Fit the template to frames of ``count`` times; ``timesteps`` are indices of their times.
 
-    There may be any number of each time; for a ``network`` one, in their order. A network reads quadrupeds.
+    There may be any number of each time; for a ``network`` one, in their order. Networks read quadrupeds.
     """
     rays = mask_rays(frames, timesteps, name)
     if spread(rays.directions) < WIDE_BASELINE:  # from one side colours say nothing of depth
@@ -111,6 +114,8 @@ def fit_animal(
             local = torch.linalg.solve(working[:3, :3], (path - working[:3, 3]).T).T
             if network is not None:
                 race.said = PointEvidence.of(read(frames, timesteps, up, name, network), working)
+            if heading is not None and race.view is not None:
+                race.read = read_headings(frames, timesteps, up, name, heading).in_frame(working)
             race.begin(Hypotheses.start(body, facings(config.yaw_starts), local.float(), config.root_period))
             race.run(config.stages[0])
             races.append(race)
@@ -128,15 +133,19 @@ class KnownCameras(Race):
     Attributes:
         view: the one direction in which all cameras look, in the working frame, [3]; None where there are several.
         said: points that the network found; None without it.
+        read: headings that a network read, where cameras look one way; None without it.
     """
 
     view: Tensor | None = None
+    read: Headings | None = None
     said: PointEvidence | None = None
 
     def evidence(self) -> Tensor | float:
         cost: Tensor | float = 0.0
         if self.view is not None:
             cost = self.config.view_weight * (self.guesses.heading() @ self.view).square()
+        if self.read is not None:
+            cost = cost + self.config.heading_weight * self.read.distance(self.guesses.roots()[..., :3, 2])
         if self.said is not None:
             cost = cost + self.config.points_weight * self.said.distance(self.guesses.points(*indices()))
         return cost
@@ -150,8 +159,9 @@ class KnownCameras(Race):
         roots = best.roots().double()[0]
         local = similarity(size.expand(len(roots)), roots[:, :3, :3], roots[:, :3, 3])
         figures = {"cost": float(self.costs.min()), **self.figures}
-        colored = any(stage.colors for stage in self.config.stages)
-        return Animal(best.body, shape, self.working @ local, best.joint_angles()[0], colored, figures)
+        seen = "masks and colours" if any(stage.colors for stage in self.config.stages) else "masks"
+        seen += ", and to headings that a network reads," if self.read is not None else ""
+        return Animal(best.body, shape, self.working @ local, best.joint_angles()[0], seen, figures)
 
 
 def make_prior(animal: Animal, clip: Clip, name: str, provenance: str) -> Prior:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from calling import call, refusal
 
+from rewild4d.priors.heading import examples as heading_examples
+from rewild4d.priors.heading import training as heading_training
 from rewild4d.priors.learned import examples, training
 
 
@@ -26,13 +28,29 @@ def test_a_prior_of_something_else_than_the_clip_is_no_fit(capsys: pytest.Captur
     assert said == "rewild4d-bench: --prior rig: expected template, template:<which> or learned:<weights>.\n"
 
 
+def test_it_trains_the_network_of_headings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for module, name, value in (
+        (heading_training, "BATCH", 4),
+        (heading_examples, "SEQUENCES", 2),
+        (heading_examples, "FRAMES", 2),
+    ):
+        monkeypatch.setattr(module, name, value)
+    assert call("prior", "train", "--out", tmp_path, "--animals", 1, "--epochs", 1, "--workers", 0) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("epoch 1  loss ") and lines[1] == str(tmp_path / "weights.safetensors")
+    files = {file.name for file in tmp_path.iterdir()}
+    assert files == {"checkpoint.pt", "curve.json", "pictures", "weights.safetensors"}
+
+
 def test_it_writes_weights_and_a_curve(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name, value in (("ANIMALS", 1), ("CHECKED", 2), ("BATCH", 2)):
         monkeypatch.setattr(training, name, value)
     monkeypatch.setattr(training, "draw_sequences", lambda rng: examples.draw_sequences(rng, 2, 4))
-    assert call("prior", "train", "--out", tmp_path, "--rounds", 1, "--workers", 0) == 0
+    assert call("prior", "train", "--out", tmp_path, "--network", "points", "--rounds", 1, "--workers", 0) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("round 1  seconds ") and lines[1] == str(tmp_path / "weights.safetensors")
     assert {file.name for file in tmp_path.iterdir()} == {"checkpoint.pt", "curve.json", "weights.safetensors"}

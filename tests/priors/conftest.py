@@ -16,5 +16,5 @@ def prior() -> Prior:
     angles = 0.3 * torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(0))
     matrix = similarity(0.5, torch.eye(3, dtype=torch.float64), 0.1 * torch.ones(3, dtype=torch.float64))
     poses = matrix.expand(2, 4, 4).contiguous()
-    animal = Animal(QUADRUPED, QUADRUPED.proportions(), poses, angles, colored=False, figures={"cost": 0.25})
+    animal = Animal(QUADRUPED, QUADRUPED.proportions(), poses, angles, seen="masks", figures={"cost": 0.25})
     return make_prior(animal, two_frames(), "template", "Made by a test.")

@@ -61,7 +61,7 @@ def read(
     kept = [(time, frame) for time, frame in zip(timesteps, frames, strict=True) if mask_box(frame.mask[0] > 0.5)]
     if not kept:
         raise UserError(f"{name}: expected at least one mask that shows the animal, but all {len(frames)} are empty.")
-    views = [_view(frame, name) for _, frame in kept]
+    views = [view_of(frame, name) for _, frame in kept]
     pictures, rotations, centers, openings = (np.stack(column) for column in zip(*views, strict=True))
     upright = rotations @ _upright(up.numpy(), rotations[0, 2]) if known else np.tile(LEVEL, (len(kept), 1, 1))
     shown = Examples(
@@ -101,7 +101,7 @@ def _upright(up: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     return np.stack((x, up, np.cross(x, up)), axis=1)
 
 
-def _view(frame: Frame, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.float32]:
+def view_of(frame: Frame, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.float32]:
     """Return the network's picture of a frame, the rotation from the world, the camera's centre, and the opening."""
     camera, box = known_camera(frame, name), mask_box(frame.mask[0] > 0.5)
     assert box is not None

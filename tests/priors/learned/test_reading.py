@@ -45,7 +45,7 @@ def photographed(animal: varied.VariedAnimal, camera: Camera) -> Frame:
 def test_the_picture_is_that_of_a_camera_along_the_middle_of_the_crop() -> None:
     animal = varied.draw_animal(np.random.default_rng(4))
     frame = photographed(animal, looking(0.7, off=0.3))
-    picture, rotation, center, opening = reading._view(frame, "case")
+    picture, rotation, center, opening = reading.view_of(frame, "case")
     vertices = animal.surface.vertices - animal.surface.vertices.mean(axis=0)
     vertices /= 0.5 * np.ptp(vertices, axis=0).max()
     seen = (vertices - center) @ rotation.T

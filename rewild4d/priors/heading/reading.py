@@ -1,0 +1,89 @@
+"""What the network says of a clip's headings, as a term of the template fit."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rewild4d.errors import UserError
+from rewild4d.priors.heading.network import SECTORS, HeadingNetwork, log_shares
+from rewild4d.priors.heading.pictures import from_bytes, ground_axes, said, shrunk, to_bytes
+from rewild4d.priors.learned.reading import view_of
+from rewild4d.priors.silhouettes import mask_box
+from rewild4d.types import Frame
+
+DOUBT = 0.05
+"""Share of the answers that may be anything."""
+
+
+@dataclass(frozen=True)
+class Headings:
+    """What the network says of each frame whose mask is not empty.
+
+    Attributes:
+        timesteps: index of each frame's time, int64, [v].
+        left: direction to the camera's left on the ground, in the working frame, unit, [v, 3].
+        away: direction away from the camera on the ground, likewise, [v, 3].
+        scores: logarithm of each sector's share, in the mean over the frames 0 for the likeliest, [v, SECTORS].
+    """
+
+    timesteps: Tensor
+    left: Tensor
+    away: Tensor
+    scores: Tensor
+
+    def in_frame(self, working: Tensor) -> "Headings":
+        """Return the same in another frame, given by its similarity to the present one, [4, 4]."""
+        rotation = (working[:3, :3] / working[:3, :3].det().abs() ** (1 / 3)).to(self.left)
+        return Headings(self.timesteps, self.left @ rotation, self.away @ rotation, self.scores)
+
+    def distance(self, headings: Tensor) -> Tensor:
+        """Return how much less likely guesses are than the likeliest heading, in nats, mean over frames.
+
+        Args:
+            headings: directions from tail to head at every time, in the frame of `left` and `away`, [B, T, 3].
+
+        Returns:
+            [B].
+        """
+        own = headings[:, self.timesteps]
+        azimuths = torch.atan2((own * self.left).sum(-1), (own * self.away).sum(-1))
+        place = (azimuths + math.pi) * (SECTORS / (2 * math.pi)) - 0.5
+        lower = place.detach().floor()
+        share, row = place - lower, lower.long()
+        scores = self.scores.expand(len(own), -1, -1)
+        first, second = (scores.gather(2, ((row + k) % SECTORS)[..., None])[..., 0] for k in (0, 1))
+        return -((1 - share) * first + share * second).mean(1)
+
+
+def read_headings(
+    frames: Sequence[Frame], timesteps: Sequence[int], up: Tensor, name: str, network: HeadingNetwork
+) -> Headings:
+    """Read the headings in frames with cameras, in the world; those with an empty mask are left out.
+
+    Args:
+        frames: with cameras.
+        timesteps: indices of their times.
+        up: of the world, unit, float64, [3].
+        name: of the case, for errors.
+        network: trained.
+
+    Raises:
+        UserError: a frame has no camera, or no mask shows anything.
+    """
+    kept = [(time, frame) for time, frame in zip(timesteps, frames, strict=True) if mask_box(frame.mask[0] > 0.5)]
+    if not kept:
+        raise UserError(f"{name}: expected at least one mask that shows the animal, but all {len(frames)} are empty.")
+    views = [view_of(frame, name) for _, frame in kept]
+    pictures = torch.from_numpy(np.stack([picture for picture, *_ in views])).float()
+    rotations = torch.from_numpy(np.stack([rotation for _, rotation, *_ in views]))
+    ups = rotations @ up
+    left, away = (torch.einsum("vab,va->vb", rotations, axis).float() for axis in ground_axes(ups))
+    shown = from_bytes(to_bytes(shrunk(pictures)))
+    shares = log_shares(network, shown, said(ups, torch.ones(len(ups), dtype=torch.bool))).exp()
+    scores = ((1 - DOUBT) * shares + DOUBT / SECTORS).log()
+    times = torch.tensor([time for time, _ in kept])
+    return Headings(times, left, away, scores - scores.mean(0).max())

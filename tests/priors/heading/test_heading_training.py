@@ -1,0 +1,58 @@
+"""Training the network of headings: it learns, goes on where it was killed, and its files are checked."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from rewild4d.errors import UserError
+from rewild4d.priors.heading import examples, training
+from rewild4d.priors.heading.network import HeadingNetwork
+from rewild4d.priors.heading.training import TrainingConfig, train
+from rewild4d.priors.learned.weights import read_weights
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Parts of one animal, of which few pictures are drawn."""
+    for module, name, value in (
+        (training, "PART", 1), (training, "BATCH", 8), (examples, "SEQUENCES", 4), (examples, "FRAMES", 2),
+    ):  # fmt: skip
+        monkeypatch.setattr(module, name, value)
+
+
+def silent(_: str) -> None:
+    return None
+
+
+def test_a_killed_training_goes_on_to_the_same_weights(tmp_path: Path) -> None:
+    config = TrainingConfig(animals=3, epochs=3)
+
+    def kill(line: str) -> None:
+        if line.startswith("epoch 2"):
+            raise KeyboardInterrupt
+
+    whole = read_weights(HeadingNetwork(), train(tmp_path / "whole", config, workers=0, report=silent))
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path / "killed", config, workers=0, report=kill)
+    (tmp_path / "killed" / "pictures" / "0-00001.npz").unlink()  # drawn again
+    resumed = read_weights(HeadingNetwork(), train(tmp_path / "killed", config, workers=0, report=silent))
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, resumed.state_dict()[name]), name
+    curve = json.loads((tmp_path / "killed" / "curve.json").read_text())
+    assert [row["epoch"] for row in curve] == [1, 2, 3] and all(row["seconds"] > 0 for row in curve)
+    with pytest.raises(UserError, match=r"checkpoint.pt: expected a training with .*'epochs': 4.*, got .*'epochs': 3"):
+        train(tmp_path / "killed", TrainingConfig(animals=3, epochs=4), workers=0, report=silent)
+
+
+def test_a_checkpoint_that_cannot_be_read_is_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "checkpoint.pt").write_bytes(b"no")
+    with pytest.raises(UserError, match=r"checkpoint.pt: expected a training's checkpoint, but it cannot be read"):
+        train(tmp_path, TrainingConfig(animals=1, epochs=1), workers=0, report=silent)
+
+
+def test_the_loss_falls(tmp_path: Path) -> None:
+    train(tmp_path, TrainingConfig(animals=2, epochs=30), workers=0, report=silent)
+    losses = [row["loss"] for row in json.loads((tmp_path / "curve.json").read_text())]
+    assert losses[-1] < losses[0] - 1.0
