@@ -5,8 +5,10 @@ from typing import Any
 
 import msgspec
 
+from rewild4d.errors import UserError
 from rewild4d.leaderboard.records import RunRecord
 from rewild4d.priors.config import PriorConfig
+from rewild4d.registry import load_method
 
 LOSSES = "run before two regularizers, the times of frames and the frame filter were mended (docs/experiments/paper.md)"
 MIRRORS = "run without the mirror images that the preset has since (docs/experiments/baseline-presets.md)"
@@ -17,10 +19,17 @@ COLORS = "from priors fitted to masks alone, not to colours too (docs/experiment
 def notes_on(run: RunRecord) -> tuple[str, ...]:
     """Return notes on what was mended since a run, none where nothing was."""
     known = run.protocol.get("selection", {}).get("cameras") in ("sweep", "random")
-    fitted = run.prior.get("choice") == "template" and run.preset != "quick"
+    fitted = run.prior.get("choice") == "template" and run.preset != "quick" and _uses_prior(run.method)
     stages = (run.prior.get("config") or {}).get("stages", ())
     masks_alone = known and fitted and bool(stages) and not any("colors" in stage for stage in stages)
     return tuple(note for note in (older(run.config), COLORS if masks_alone else "") if note)
+
+
+def _uses_prior(method: str) -> bool:
+    try:
+        return load_method(method).info.uses_prior
+    except UserError:  # a plug-in that is not installed here
+        return True
 
 
 def older(settings: Any) -> str:

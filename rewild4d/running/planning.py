@@ -142,7 +142,7 @@ def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[
             without_older([r for r in found if r.method == entry.method and _equals(r.config, entry.config)])
             for found in under
         )
-        notes += tuple(dict.fromkeys(note for found in own for run in found for note in notes_on(run)))
+        notes += _notes(own)
         rows.append(Entrant(row.label, own, "", notes))
     shown = {row.method for row in spec.rows}
     # Lower bounds are shown for the cases of the other rows.
@@ -153,8 +153,13 @@ def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[
             tuple(r for r in found if r.method == floor and r.case in cases[index]) for index, found in enumerate(under)
         )
         if any(own):
-            rows.append(Entrant(floor, own))
+            rows.append(Entrant(floor, own, "", _notes(own)))
     return rows, [*left_out, *_missing(spec, cases)]
+
+
+def _notes(conditions: Sequence[Sequence[RunRecord]]) -> tuple[str, ...]:
+    """Return what was mended since the runs of a row, each once."""
+    return tuple(dict.fromkeys(note for found in conditions for run in found for note in notes_on(run)))
 
 
 def reported(spec: Spec) -> Reported | None:

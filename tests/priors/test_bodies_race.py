@@ -57,7 +57,7 @@ def test_a_walking_quadruped_is_one(one_thread: None) -> None:
     clip, total = walking_clip(6, "sweep"), []
     config = shortened(12, yaw_starts=4)
     prior = fit_template(clip, config=config, seed=0, log=lambda *told: total.append(told[:2]), bodies=KINDS)
-    assert prior.provenance.startswith("Template (quadruped) fitted to the 6 masks")
+    assert prior.provenance.startswith("Template (quadruped) fitted to masks of the clip's 6 frames")
     assert {"quadruped_cost", "biped_cost", "primate_cost", "body_margin"} <= prior.quality.keys()
     assert total[-1] == (len(total), len(total))
     alone = fit_template(clip, config=config, seed=0, log=silent)
