@@ -28,7 +28,7 @@ DESCRIPTION = """Fit a template to masked frames of unknown cameras; write the p
 IMPORT = """Import the output of a test run of 3D-Fauna, <step>_<frame>_mesh.obj, _pose.txt, _arti_params.txt, as a
 prior."""
 TRAIN = """Train a network on random four-footed animals, or go on where the folder's training was stopped. Writes
-weights.safetensors and curve.json. `headings` is the network whose weights come with the package (a quarter of an hour
+weights.safetensors and curve.json. `headings` is the network whose weights come with the package (half an hour
 on two cores); `points` is that of `run --prior learned:DIR/weights.safetensors` (about 15 seconds a round)."""
 WHOLE = Selection(cameras="unknown", size=256, framing="crop", split=5)
 """Selection that names the cases of a reader; frames are used whole and none is held out."""
