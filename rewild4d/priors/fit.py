@@ -115,7 +115,7 @@ def fit_animal(
             if network is not None:
                 race.said = PointEvidence.of(read(frames, timesteps, up, name, network), working)
             if heading is not None and race.view is not None:
-                race.read = read_headings(frames, timesteps, up, name, heading).in_frame(working)
+                race.headings = read_headings(frames, timesteps, up, name, heading).in_frame(working)
             race.begin(Hypotheses.start(body, facings(config.yaw_starts), local.float(), config.root_period))
             race.run(config.stages[0])
             races.append(race)
@@ -133,19 +133,19 @@ class KnownCameras(Race):
     Attributes:
         view: the one direction in which all cameras look, in the working frame, [3]; None where there are several.
         said: points that the network found; None without it.
-        read: headings that a network read, where cameras look one way; None without it.
+        headings: that a network read, where cameras look one way; None without it.
     """
 
     view: Tensor | None = None
-    read: Headings | None = None
+    headings: Headings | None = None
     said: PointEvidence | None = None
 
     def evidence(self) -> Tensor | float:
         cost: Tensor | float = 0.0
         if self.view is not None:
             cost = self.config.view_weight * (self.guesses.heading() @ self.view).square()
-        if self.read is not None:
-            cost = cost + self.config.heading_weight * self.read.distance(self.guesses.roots()[..., :3, 2])
+        if self.headings is not None:
+            cost = cost + self.config.heading_weight * self.headings.distance(self.guesses.roots()[..., :3, 2])
         if self.said is not None:
             cost = cost + self.config.points_weight * self.said.distance(self.guesses.points(*indices()))
         return cost
@@ -160,7 +160,7 @@ class KnownCameras(Race):
         local = similarity(size.expand(len(roots)), roots[:, :3, :3], roots[:, :3, 3])
         figures = {"cost": float(self.costs.min()), **self.figures}
         seen = "masks and colours" if any(stage.colors for stage in self.config.stages) else "masks"
-        seen += ", and to headings that a network reads," if self.read is not None else ""
+        seen += ", and to headings that a network reads," if self.headings is not None else ""
         return Animal(best.body, shape, self.working @ local, best.joint_angles()[0], seen, figures)
 
 

@@ -12,17 +12,24 @@ from rewild4d.registry import load_method
 
 LOSSES = "run before two regularizers, the times of frames and the frame filter were mended (docs/experiments/paper.md)"
 MIRRORS = "run without the mirror images that the preset has since (docs/experiments/baseline-presets.md)"
-
 COLORS = "from priors fitted to masks alone, not to colours too (docs/experiments/prior-colors.md)"
+HEADINGS = "from priors fitted to masks alone, not to headings too (docs/experiments/headings.md)"
 
 
 def notes_on(run: RunRecord) -> tuple[str, ...]:
     """Return notes on what was mended since a run, none where nothing was."""
-    known = run.protocol.get("selection", {}).get("cameras") in ("sweep", "random")
-    fitted = run.prior.get("choice") == "template" and run.preset != "quick" and _uses_prior(run.method)
-    stages = (run.prior.get("config") or {}).get("stages", ())
-    masks_alone = known and fitted and bool(stages) and not any("colors" in stage for stage in stages)
-    return tuple(note for note in (older(run.config), COLORS if masks_alone else "") if note)
+    return tuple(note for note in (older(run.config), _older_prior(run)) if note)
+
+
+def _older_prior(run: RunRecord) -> str:
+    """Return a note on what the prior's fit did not see yet, "" where it saw all or the method uses none."""
+    cameras, settings = run.protocol.get("selection", {}).get("cameras"), run.prior.get("config") or {}
+    if run.prior.get("choice") != "template" or not settings or not _uses_prior(run.method):
+        return ""
+    if cameras == "fixed":
+        return "" if "heading_weight" in settings else HEADINGS
+    masks_alone = not any("colors" in stage for stage in settings["stages"])
+    return COLORS if masks_alone and cameras in ("sweep", "random") and run.preset != "quick" else ""
 
 
 def _uses_prior(method: str) -> bool:

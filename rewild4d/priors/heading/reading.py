@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rewild4d.errors import UserError
 from rewild4d.priors.heading.network import SECTORS, HeadingNetwork, log_shares
 from rewild4d.priors.heading.pictures import from_bytes, ground_axes, said, shrunk, to_bytes
 from rewild4d.priors.learned.reading import view_of
-from rewild4d.priors.silhouettes import mask_box
+from rewild4d.priors.silhouettes import mask_box, require_mask
 from rewild4d.types import Frame
 
 DOUBT = 0.05
@@ -74,9 +73,8 @@ def read_headings(
     Raises:
         UserError: a frame has no camera, or no mask shows anything.
     """
+    require_mask(frames, name)
     kept = [(time, frame) for time, frame in zip(timesteps, frames, strict=True) if mask_box(frame.mask[0] > 0.5)]
-    if not kept:
-        raise UserError(f"{name}: expected at least one mask that shows the animal, but all {len(frames)} are empty.")
     views = [view_of(frame, name) for _, frame in kept]
     pictures = torch.from_numpy(np.stack([picture for picture, *_ in views])).float()
     rotations = torch.from_numpy(np.stack([rotation for _, rotation, *_ in views]))

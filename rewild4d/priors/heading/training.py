@@ -5,7 +5,6 @@ Both halves go on where they were stopped, and the result is the same as without
 
 import json
 import math
-import pickle
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,12 +15,12 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from rewild4d.errors import UserError
 from rewild4d.files import atomic
 from rewild4d.priors.heading.examples import drawn
 from rewild4d.priors.heading.network import HeadingNetwork, likeliest, log_shares, shares_around, wrapped
 from rewild4d.priors.heading.pictures import Pictures, from_bytes, joined
 from rewild4d.priors.heading.weights import FILE
+from rewild4d.priors.learned.going_on import read_checkpoint, warmth
 from rewild4d.priors.learned.weights import save_weights
 
 PART = 16
@@ -129,15 +128,9 @@ class _Progress:
         self.network, self.epoch = HeadingNetwork(), 0
         self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
         self.curve: list[dict[str, float]] = []
-        path = folder / "checkpoint.pt"
-        if not path.is_file():
+        kept = read_checkpoint(folder / "checkpoint.pt", config)
+        if kept is None:
             return
-        try:
-            kept = torch.load(path, weights_only=True)
-        except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-            raise UserError(f"{path}: expected a training's checkpoint, but it cannot be read; remove it.") from error
-        if kept.get("config") != msgspec.to_builtins(config):
-            raise UserError(f"{path}: expected a training with {msgspec.to_builtins(config)}, got {kept['config']}.")
         self.network.load_state_dict(kept["network"])
         self.optimizer.load_state_dict(kept["optimizer"])
         self.epoch, self.curve = kept["epoch"], kept["curve"]
@@ -151,7 +144,7 @@ class _Progress:
         for index, chosen in enumerate(batches):
             step = self.epoch * len(batches) + index
             for group in self.optimizer.param_groups:
-                group["lr"] = LEARNING_RATE * _warmth(step, total)
+                group["lr"] = LEARNING_RATE * warmth(step, total, warmup=WARMUP, cooling=COOLING)
             shown = given.chosen(chosen)
             shown = shown.mirrored(torch.rand(len(shown), generator=rows) < 0.5)
             value = _loss(self.network, shown, torch.rand(len(shown), generator=rows) < BLIND)
@@ -173,11 +166,6 @@ class _Progress:
             torch.save(kept, scratch)
         with atomic(self.folder / "curve.json") as scratch:
             scratch.write_text(json.dumps(self.curve, indent=1))
-
-
-def _warmth(step: int, total: int) -> float:
-    left = min(1.0, (1 - step / total) / COOLING)
-    return min(1.0, (step + 1) / WARMUP) * max(left, 0.01)
 
 
 def _loss(network: HeadingNetwork, shown: Pictures, blind: Tensor) -> Tensor:

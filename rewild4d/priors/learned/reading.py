@@ -9,11 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rewild4d.errors import UserError
 from rewild4d.priors.learned.network import PointNetwork, found
 from rewild4d.priors.learned.pictures import LENGTH, LEVEL, MARGIN, SIZE, Examples, looking_at, normalised
 from rewild4d.priors.learned.points import NAMES, OTHER_SIDE
-from rewild4d.priors.silhouettes import known_camera, mask_box
+from rewild4d.priors.silhouettes import known_camera, mask_box, require_mask
 from rewild4d.types import Frame
 
 FINEST = 4
@@ -58,9 +57,8 @@ def read(
     Raises:
         UserError: a frame has no camera, or no mask shows anything.
     """
+    require_mask(frames, name)
     kept = [(time, frame) for time, frame in zip(timesteps, frames, strict=True) if mask_box(frame.mask[0] > 0.5)]
-    if not kept:
-        raise UserError(f"{name}: expected at least one mask that shows the animal, but all {len(frames)} are empty.")
     views = [view_of(frame, name) for _, frame in kept]
     pictures, rotations, centers, openings = (np.stack(column) for column in zip(*views, strict=True))
     upright = rotations @ _upright(up.numpy(), rotations[0, 2]) if known else np.tile(LEVEL, (len(kept), 1, 1))

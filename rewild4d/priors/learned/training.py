@@ -1,7 +1,6 @@
 """Train the network on rounds of fresh random animals, with a learning curve and a checkpoint from which it goes on."""
 
 import json
-import pickle
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,9 +12,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from rewild4d.errors import UserError
 from rewild4d.files import atomic
 from rewild4d.priors.learned.examples import draw_sequences
+from rewild4d.priors.learned.going_on import read_checkpoint, warmth
 from rewild4d.priors.learned.network import PointNetwork, found, loss
 from rewild4d.priors.learned.pictures import Examples, joined
 from rewild4d.priors.learned.weights import save_weights
@@ -134,7 +133,7 @@ def _round(progress: Training, animals: Examples, config: TrainingConfig) -> flo
     for index, rows in enumerate(order.split(BATCH)):
         step = progress.round * steps + index
         for group in progress.optimizer.param_groups:
-            group["lr"] = LEARNING_RATE * _warmth(step, config.rounds * steps)
+            group["lr"] = LEARNING_RATE * warmth(step, config.rounds * steps, warmup=WARMUP, cooling=COOLING)
         value = loss(found(progress.network, both.chosen(rows)), both.points[rows])
         progress.optimizer.zero_grad()
         value.backward()  # type: ignore[no-untyped-call]
@@ -143,11 +142,6 @@ def _round(progress: Training, animals: Examples, config: TrainingConfig) -> flo
         losses.append(float(value.detach()))
         _average(progress.mean, progress.network, min(AVERAGE, (1 + step) / (10 + step)))
     return float(np.mean(losses))
-
-
-def _warmth(step: int, total: int) -> float:
-    left = min(1.0, (1 - step / total) / COOLING)
-    return min(1.0, (step + 1) / WARMUP) * max(left, 0.01)
 
 
 @torch.no_grad()
@@ -179,15 +173,9 @@ def _resumed(folder: Path, config: TrainingConfig) -> Training:
     mean.load_state_dict(network.state_dict())
     optimizer = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
     progress = Training(network, mean, optimizer, 0, [])
-    path = folder / "checkpoint.pt"
-    if not path.is_file():
+    kept = read_checkpoint(folder / "checkpoint.pt", config)
+    if kept is None:
         return progress
-    try:
-        kept = torch.load(path, weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise UserError(f"{path}: expected a checkpoint of a training, but it cannot be read; remove it.") from error
-    if kept["config"] != msgspec.to_builtins(config):
-        raise UserError(f"{path}: expected a training with {msgspec.to_builtins(config)}, got {kept['config']}.")
     network.load_state_dict(kept["network"])
     mean.load_state_dict(kept["mean"])
     optimizer.load_state_dict(kept["optimizer"])

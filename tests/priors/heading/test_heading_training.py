@@ -48,7 +48,7 @@ def test_a_killed_training_goes_on_to_the_same_weights(tmp_path: Path) -> None:
 
 def test_a_checkpoint_that_cannot_be_read_is_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "checkpoint.pt").write_bytes(b"no")
-    with pytest.raises(UserError, match=r"checkpoint.pt: expected a training's checkpoint, but it cannot be read"):
+    with pytest.raises(UserError, match=r"checkpoint.pt: expected a checkpoint of a training, but it cannot be read"):
         train(tmp_path, TrainingConfig(animals=1, epochs=1), workers=0, report=silent)
 
 
