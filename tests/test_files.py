@@ -6,12 +6,12 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from threading import Thread
 
 import pytest
 import torch
+from listening import Errors
 from small_files import largest_file
 
 from rewild4d.errors import DiskFull, UserError
@@ -27,8 +27,9 @@ def test_tensors_on_a_full_disk_are_one_sentence_and_leave_what_was_there(tmp_pa
     assert [path.name for path in tmp_path.iterdir()] == ["state.pt"]
 
 
-def test_a_held_folder_makes_others_wait(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    order = []
+def test_a_held_folder_makes_others_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    order, errors = [], Errors("waiting")
+    monkeypatch.setattr(sys, "stderr", errors)
 
     def second() -> None:
         with held(tmp_path / "run", "waiting"):
@@ -38,8 +39,7 @@ def test_a_held_folder_makes_others_wait(tmp_path: Path, capsys: pytest.CaptureF
         assert (tmp_path / "run").is_dir()
         other = Thread(target=second)
         other.start()
-        while not capsys.readouterr().err:
-            time.sleep(0.01)
+        assert errors.said.wait(60)
         order.append("first")
     other.join()
     assert order == ["first", "second"]

@@ -1,5 +1,6 @@
 """Two commands that make the same run: the second waits, says so, and takes what the first has made."""
 
+import sys
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 import torch
+from listening import Errors
 from one_case import OneCase
 
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig
@@ -21,9 +23,7 @@ from rewild4d.running.conformance import tiny_case
 pytest.importorskip("fcntl", reason="no locks of folders here")
 
 
-def test_the_second_waits_for_the_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_second_waits_for_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     case = tiny_case(frames=3)
     save_prior(case.prior, tmp_path / "prior.npz")
     plan = runner.Plan(
@@ -41,15 +41,15 @@ def test_the_second_waits_for_the_first(
         assert waiting.wait(60)
         return fit(*given, **named)
 
+    errors = Errors("waiting for another process that makes prior-only-quick-seed0-")
+    monkeypatch.setattr(sys, "stderr", errors)
     monkeypatch.setattr(PriorOnly, "fit", slow)
     first, second = (Thread(target=lambda: made.append(runner.execute(plan))) for _ in range(2))
     first.start()
     assert fitting.wait(60)
     second.start()
-    said = ""
-    while "waiting for another process that makes prior-only-quick-seed0-" not in said and second.is_alive():
-        said += capsys.readouterr().err
+    said = errors.said.wait(60)
     waiting.set()
     first.join()
     second.join()
-    assert len(fits) == 1 and made[0] == made[1] and made[0][0].status == "ok"
+    assert said and len(fits) == 1 and made[0] == made[1] and made[0][0].status == "ok"
