@@ -189,7 +189,7 @@ def _fit(arguments: list[str]) -> int:
     evidence = Evidence(given, clip.travel)
     prior = fit_footage(
         clip, config=choice.settings_under(known_cameras=False), seed=options.seed, log=progress, said=evidence,
-        network=choice.network(), bodies=choice.bodies(),
+        networks=choice.networks(), bodies=choice.bodies(),
     )  # fmt: skip
     progress.close()
     if scored is not None:

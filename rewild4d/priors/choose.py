@@ -19,13 +19,12 @@ from rewild4d.priors.coarse import coarse_prior
 from rewild4d.priors.config import FOOTAGE, PriorConfig, Use, with_points, without_colors
 from rewild4d.priors.fit import fit_template
 from rewild4d.priors.footage import Evidence, fit_footage
-from rewild4d.priors.heading.network import HeadingNetwork
 from rewild4d.priors.heading.weights import package_digest, package_weights
 from rewild4d.priors.io import load_prior, save_prior, seal
 from rewild4d.priors.judge import doubts, joint_scores, measured
 from rewild4d.priors.landmarks import Marks, load_mapping, marks
-from rewild4d.priors.learned.network import PointNetwork
 from rewild4d.priors.learned.weights import load_weights
+from rewild4d.priors.networks import Networks
 from rewild4d.priors.placing import has_cameras, in_world, placed
 from rewild4d.priors.rig import rig_prior
 from rewild4d.priors.steady import without_hops
@@ -82,7 +81,7 @@ class PriorChoice:
             UserError: a noise that is no number, an unknown template, or a file that is missing or damaged.
         """
         if self.is_learned:
-            self.network()
+            self.networks()
         elif self.is_fitted:
             self.bodies()
         elif not self.is_from_truth:
@@ -127,17 +126,16 @@ class PriorChoice:
             )
         return Path(path)
 
-    def network(self) -> PointNetwork | None:
-        """Return the network of a learned prior; None for others.
+    def networks(self) -> Networks:
+        """Return what takes part in the fit: of a learned prior its points, of a template headings.
 
         Raises:
-            UserError: its weights are missing or damaged.
+            UserError: weights are missing or damaged.
         """
-        return load_weights(self._weights_file) if self.is_learned else None
-
-    def heading(self) -> HeadingNetwork | None:
-        """Return the network that reads headings, of a template that is fitted to more than masks; None for others."""
-        return package_weights() if self._reads_headings else None
+        return Networks(
+            points=load_weights(self._weights_file) if self.is_learned else None,
+            headings=package_weights() if self._reads_headings else None,
+        )
 
     @property
     def _reads_headings(self) -> bool:
@@ -231,19 +229,17 @@ def _fitted(choice: PriorChoice, clip: Clip, truth: Truth, log: Log) -> Prior:
     config = choice.settings(clip)
     if choice.noise is not None:
         return coarse_prior(clip, truth.held_out, noise=choice.noise, seed=PRIOR_SEED, config=config, log=log)
-    network = choice.network()
     if choice.name == "rig" or has_cameras(clip):
         fitted = fit_template(
-            clip, config=config, seed=PRIOR_SEED, log=log, network=network, bodies=choice.bodies(),
-            heading=choice.heading(),
+            clip, config=config, seed=PRIOR_SEED, log=log, networks=choice.networks(), bodies=choice.bodies(),
         )  # fmt: skip
         return rig_prior(clip, truth.rig(), fitted) if choice.name == "rig" and truth.rig else fitted
     given, scored = choice.keypoints(clip)
     if choice.is_own_rig:  # keypoints are mapped to bones of the package's templates
         given = None
     prior = fit_footage(
-        clip, config=config, seed=PRIOR_SEED, log=log, said=Evidence(given, clip.travel), network=network,
-        bodies=choice.bodies(),
+        clip, config=config, seed=PRIOR_SEED, log=log, said=Evidence(given, clip.travel),
+        networks=choice.networks(), bodies=choice.bodies(),
     )  # fmt: skip
     return _scored(prior, clip, scored)
 

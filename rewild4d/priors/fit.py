@@ -14,14 +14,13 @@ from rewild4d.contracts import Log
 from rewild4d.priors.bodies.body import Body, Proportions, diagonal
 from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.config import PriorConfig, without_colors
-from rewild4d.priors.heading.network import HeadingNetwork
 from rewild4d.priors.heading.reading import Headings, read_headings
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.io import seal
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.learned.evidence import PointEvidence, indices
-from rewild4d.priors.learned.network import PointNetwork
 from rewild4d.priors.learned.reading import read
+from rewild4d.priors.networks import NO_NETWORKS, Networks
 from rewild4d.priors.posed import posed_prior
 from rewild4d.priors.race import Race, Steps, decided, steps_of
 from rewild4d.priors.search import (
@@ -61,14 +60,14 @@ class Animal:
 
 
 def fit_template(
-    clip: Clip, *, config: PriorConfig, seed: int, log: Log, network: PointNetwork | None = None,
-    bodies: Sequence[Body] = (QUADRUPED,), heading: HeadingNetwork | None = None,
+    clip: Clip, *, config: PriorConfig, seed: int, log: Log, networks: Networks = NO_NETWORKS,
+    bodies: Sequence[Body] = (QUADRUPED,),
 ) -> Prior:  # fmt: skip
-    """Fit the template to a clip's masks under its cameras, then to its colours too where they see several sides, and
-    to the points that a network finds if there is one.
+    """Fit the template to a clip's masks under its cameras and to what networks read in its pictures, then to its
+    colours too where cameras see several sides.
 
-    The seed is that of the frames drawn for each step. Of several ``bodies`` the one that fits best is taken. Where all
-    cameras look one way, a network of ``heading`` takes part, if there is one.
+    The seed is that of the frames drawn for each step. Of several ``bodies`` the one that fits best is taken. Headings
+    are read where all cameras look one way.
 
     Returns:
         A prior with one pose per frame; `quality` has mask_iou, cost, facing_margin, starts (their number),
@@ -78,23 +77,22 @@ def fit_template(
         UserError: a frame has no camera, or no mask shows anything.
     """
     count = len(clip.frames)
-    animal = fit_animal(clip.frames, range(count), count, clip.name, config, seed, log, network, bodies, heading)
-    points = " and to points of the body that a network finds in them" if network else ""
+    animal = fit_animal(clip.frames, range(count), count, clip.name, config, seed, log, networks, bodies)
+    points = " and to points of the body that a network finds in them" if networks.points else ""
     provenance = (
         f"Template ({animal.body.name}) fitted to {animal.seen} of the clip's {count} frames{points} "
         f"under known cameras, seed {seed}."
     )
-    return make_prior(animal, clip, "learned" if network else "template", provenance)
+    return make_prior(animal, clip, "learned" if networks.points else "template", provenance)
 
 
 def fit_animal(
     frames: Sequence[Frame], timesteps: Sequence[int], count: int, name: str, config: PriorConfig, seed: int, log: Log,
-    network: PointNetwork | None = None, bodies: Sequence[Body] = (QUADRUPED,),
-    heading: HeadingNetwork | None = None,
+    networks: Networks = NO_NETWORKS, bodies: Sequence[Body] = (QUADRUPED,),
 ) -> Animal:  # fmt: skip
     """Fit the template to frames of ``count`` times; ``timesteps`` are indices of their times.
 
-    There may be any number of each time; for a ``network`` one, in their order. Networks read quadrupeds.
+    There may be any number of each time; for the network of points one, in their order.
     """
     rays = mask_rays(frames, timesteps, name)
     if spread(rays.directions) < WIDE_BASELINE:  # from one side colours say nothing of depth
@@ -112,10 +110,10 @@ def fit_animal(
             race = KnownCameras(frames, timesteps, name, working, config, generator, steps)
             race.view = single_view(rays, working)
             local = torch.linalg.solve(working[:3, :3], (path - working[:3, 3]).T).T
-            if network is not None:
-                race.said = PointEvidence.of(read(frames, timesteps, up, name, network), working)
-            if heading is not None and race.view is not None:
-                race.headings = read_headings(frames, timesteps, up, name, heading).in_frame(working)
+            if networks.points is not None:
+                race.said = PointEvidence.of(read(frames, timesteps, up, name, networks.points), working)
+            if networks.headings is not None and race.view is not None:
+                race.headings = read_headings(frames, timesteps, up, name, networks.headings).in_frame(working)
             race.begin(Hypotheses.start(body, facings(config.yaw_starts), local.float(), config.root_period))
             race.run(config.stages[0])
             races.append(race)

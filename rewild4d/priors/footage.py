@@ -16,13 +16,14 @@ from rewild4d.contracts import Log
 from rewild4d.priors.bodies.body import Body, Proportions, diagonal
 from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.config import PriorConfig, Stage
+from rewild4d.priors.heading.reading import Headings, read_headings
 from rewild4d.priors.io import seal
 from rewild4d.priors.judge import measured
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.landmarks import Marks
 from rewild4d.priors.learned.evidence import PointEvidence, indices
-from rewild4d.priors.learned.network import PointNetwork
 from rewild4d.priors.learned.reading import read
+from rewild4d.priors.networks import NO_NETWORKS, Networks
 from rewild4d.priors.posed import posed_prior
 from rewild4d.priors.race import Race, Steps, decided, steps_of
 from rewild4d.priors.search import facings
@@ -70,6 +71,7 @@ class FixedCamera(Race):
     Attributes:
         said: marks and travel.
         points: that a network found; None without one.
+        headings: that a network read; None without one.
         boxes: windows of the frames, [T, 3].
         given: keep scale and proportions as they are.
     """
@@ -78,6 +80,7 @@ class FixedCamera(Race):
     boxes: Tensor
     guesses: Views
     points: PointEvidence | None = None
+    headings: Headings | None = None
     given: bool = False
 
     def free(self, stage: Stage) -> list[str]:
@@ -89,6 +92,8 @@ class FixedCamera(Race):
         cost = cost + self.config.carriage_weight * self.guesses.carriage()
         if self.said.marks is not None and len(self.said.marks):
             cost = cost + self.config.keypoint_weight * self._off_marks(self.said.marks)
+        if self.headings is not None:
+            cost = cost + self.config.heading_weight * self.headings.distance(self.guesses.roots()[..., :3, 2])
         if self.points is not None:
             cost = cost + self.config.points_weight * self.points.distance(self.guesses.points(*indices()))
         return cost
@@ -134,12 +139,12 @@ class FixedCamera(Race):
 
 def fit_footage(
     clip: Clip, *, config: PriorConfig, seed: int, log: Log, said: Evidence = NOTHING,
-    network: PointNetwork | None = None, bodies: Sequence[Body] = (QUADRUPED,),
+    networks: Networks = NO_NETWORKS, bodies: Sequence[Body] = (QUADRUPED,),
 ) -> Prior:  # fmt: skip
-    """Fit the template to a clip's masks under unknown cameras, and to the points that a network finds if there is one.
+    """Fit the template to a clip's masks under unknown cameras, and to what networks read in its pictures.
 
     The seed is that of the frames drawn for each step of a long clip. Of several ``bodies`` the one that fits the clip
-    best is taken. A network reads quadrupeds.
+    best is taken.
 
     Returns:
         A prior with one camera and pose per frame and for its mirror image; `quality` has the figures of
@@ -152,20 +157,20 @@ def fit_footage(
     require_mask(clip.frames, clip.name)
     total = steps_of(config.stages, len(bodies)) + sum(stage.steps for stage in config.stages)
     steps = Steps(log, total)
-    races = [_race(clip.name, clip.frames, said, config, seed, steps, body, network) for body in bodies]
+    races = [_race(clip.name, clip.frames, said, config, seed, steps, body, networks) for body in bodies]
     race = decided(races, config.stages)
     flipped = tuple(replace(f, rgb=f.rgb.flip(-1), mask=f.mask.flip(-1)) for f in clip.frames)
     mirrored = said.mirrored(clip.frames[0].mask.shape[2])
     body = race.guesses.body
-    race_flip = _race(clip.name, flipped, mirrored, config, seed, steps, body, network, known=race.guesses)
+    race_flip = _race(clip.name, flipped, mirrored, config, seed, steps, body, networks, known=race.guesses)
     for stage in config.stages:
         race_flip.run(stage)
-    return _prior(clip, race, race_flip, "learned" if network else "template", seed)
+    return _prior(clip, race, race_flip, "learned" if networks.points else "template", seed)
 
 
 def _race(
     case: str, frames: tuple[Frame, ...], said: Evidence, config: PriorConfig, seed: int, steps: Steps, body: Body,
-    network: PointNetwork | None, known: Views | None = None,
+    networks: Networks, known: Views | None = None,
 ) -> FixedCamera:  # fmt: skip
     """Return a race with all its starts; scale and proportions are those of ``known``, if given."""
     boxes = windows(frames)
@@ -176,9 +181,11 @@ def _race(
     working, generator = torch.eye(4, dtype=torch.float64), torch.Generator().manual_seed(seed)
     race = FixedCamera(seen, range(len(frames)), case, working, config, generator, steps)
     race.said, race.boxes = said, boxes.float()
-    if network is not None:
-        found = read(seen, range(len(seen)), UP, case, network, known=False)
+    if networks.points is not None:
+        found = read(seen, range(len(seen)), UP, case, networks.points, known=False)
         race.points = PointEvidence.of(found, working)
+    if networks.headings is not None:
+        race.headings = read_headings(seen, range(len(seen)), UP, case, networks.headings, known=False)
     # known proportions need fewer starts
     count = config.yaw_starts if known is None else max(4, config.yaw_starts // 2)
     starts = Views.start(body, facings(count), torch.zeros(len(frames), 3), config.root_period)
@@ -206,6 +213,7 @@ def _prior(clip: Clip, race: FixedCamera, race_flip: FixedCamera, name: str, see
     prior = posed_prior(
         template, transforms, world, object_cameras(race), times, name=name,
         provenance=f"Template ({body.name}) fitted to the {count} masks of the clip and of its mirror image, "
+        f"{'and to headings that a network reads, ' if race.headings is not None else ''}"
         f"cameras unknown, {race.said}seed {seed}.",
     )  # fmt: skip
     prior = replace(prior, cameras_flip=object_cameras(race_flip), transforms_flip=transforms_flip)

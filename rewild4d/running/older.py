@@ -26,7 +26,7 @@ def _older_prior(run: RunRecord) -> str:
     cameras, settings = run.protocol.get("selection", {}).get("cameras"), run.prior.get("config") or {}
     if run.prior.get("choice") != "template" or not settings or not _uses_prior(run.method):
         return ""
-    if cameras == "fixed":
+    if cameras in ("fixed", "unknown"):
         return "" if "heading_weight" in settings else HEADINGS
     masks_alone = not any("colors" in stage for stage in settings["stages"])
     return COLORS if masks_alone and cameras in ("sweep", "random") and run.preset != "quick" else ""

@@ -8,7 +8,7 @@ from records_for_tests import PROTOCOL, psnr, record, spec
 from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.specs import Line
 from rewild4d.leaderboard.tables import Entrant
-from rewild4d.priors.config import QUICK, STANDARD, without_colors
+from rewild4d.priors.config import FOOTAGE, QUICK, STANDARD, without_colors
 from rewild4d.running import planning
 from rewild4d.running.older import COLORS, HEADINGS, LOSSES, MIRRORS
 
@@ -88,3 +88,6 @@ def test_runs_from_priors_of_masks_alone_stand_for_their_row_with_a_note_until_t
     assert [r.run_id for r in fixed.records[0]] == ["0"] and not fixed.notes, "one camera: no colours today either"
     assert [r.run_id for r in unread.records[0]] == ["0"] and unread.notes == (HEADINGS,)
     assert row(before, then, cameras="fixed").records[0][0].run_id == "1"
+    films = [msgspec.to_builtins(FOOTAGE)]
+    films.insert(0, {name: value for name, value in films[0].items() if name != "heading_weight"})
+    assert row(films[0], cameras="unknown").notes == (HEADINGS,) and not row(*films, cameras="unknown").notes

@@ -59,8 +59,9 @@ class Headings:
 
 
 def read_headings(
-    frames: Sequence[Frame], timesteps: Sequence[int], up: Tensor, name: str, network: HeadingNetwork
-) -> Headings:
+    frames: Sequence[Frame], timesteps: Sequence[int], up: Tensor, name: str, network: HeadingNetwork, *,
+    known: bool = True,
+) -> Headings:  # fmt: skip
     """Read the headings in frames with cameras, in the world; those with an empty mask are left out.
 
     Args:
@@ -69,6 +70,7 @@ def read_headings(
         up: of the world, unit, float64, [3].
         name: of the case, for errors.
         network: trained.
+        known: whether the cameras' directions are; the network is not told those of made-up ones.
 
     Raises:
         UserError: a frame has no camera, or no mask shows anything.
@@ -81,7 +83,7 @@ def read_headings(
     ups = rotations @ up
     left, away = (torch.einsum("vab,va->vb", rotations, axis).float() for axis in ground_axes(ups))
     shown = from_bytes(to_bytes(shrunk(pictures)))
-    shares = log_shares(network, shown, said(ups, torch.ones(len(ups), dtype=torch.bool))).exp()
+    shares = log_shares(network, shown, said(ups, torch.full((len(ups),), known))).exp()
     scores = ((1 - DOUBT) * shares + DOUBT / SECTORS).log()
     times = torch.tensor([time for time, _ in kept])
     return Headings(times, left, away, scores - scores.mean(0).max())

@@ -11,7 +11,9 @@ from torch import Tensor
 from walking import shortened, silent, walking_clip, world
 
 from rewild4d.errors import UserError
+from rewild4d.priors.config import FOOTAGE
 from rewild4d.priors.fit import fit_template
+from rewild4d.priors.footage import fit_footage
 from rewild4d.priors.heading.examples import FRAMES, SEQUENCES, drawn
 from rewild4d.priors.heading.network import (
     SECTORS,
@@ -25,6 +27,7 @@ from rewild4d.priors.heading.network import (
 from rewild4d.priors.heading.pictures import from_bytes, ground_axes, said, to_bytes
 from rewild4d.priors.heading.reading import Headings, read_headings
 from rewild4d.priors.heading.weights import package_weights
+from rewild4d.priors.networks import Networks
 
 DEGREES = 2 * math.pi / 360
 UP = torch.tensor((0.0, 1.0, 0.0), dtype=torch.float64)
@@ -137,14 +140,38 @@ def test_under_one_camera_the_template_turns_to_the_heading_that_is_read() -> No
         network = Sure(azimuth).eval()
         said_of_it = float(likeliest(read_headings(clip.frames, range(2), up, "case", network).scores.mean(0)[None]))
         assert abs(said_of_it) == pytest.approx(abs(azimuth), abs=2 * DEGREES)
-        made = fit_template(clip, config=config, seed=0, log=silent, heading=network)
+        made = fit_template(clip, config=config, seed=0, log=silent, networks=Networks(headings=network))
         ahead = view @ made.object_to_world[0, :3, 2]
         turned = torch.atan2(ahead @ left, ahead @ away)
         assert abs(wrapped(turned - said_of_it)) < 10 * DEGREES
         assert "and to headings that a network reads" in made.provenance
 
 
+def test_in_a_film_both_halves_turn_to_the_heading_that_is_read_and_the_network_is_told_no_cameras() -> None:
+    clip, told = walking_clip(2, "fixed"), list[Tensor]()
+    film = replace(clip, frames=tuple(replace(frame, camera=None) for frame in clip.frames))
+    stages = tuple(msgspec.structs.replace(stage, steps=25, frames=2, size=32) for stage in FOOTAGE.stages[:2])
+    config = msgspec.structs.replace(FOOTAGE, stages=stages, yaw_starts=6, view_weight=0.0, heading_weight=1.0)
+    azimuth = -2.2
+    network = Sure(azimuth).eval()
+    network.register_forward_pre_hook(lambda _, inputs: told.append(inputs[1]))
+    made = fit_footage(film, config=config, seed=0, log=silent, networks=Networks(headings=network))
+    assert "and to headings that a network reads" in made.provenance
+    assert made.cameras_flip is not None
+    ahead, flipped = (
+        [camera.world_to_camera[:3, 2] for camera in half] for half in (made.cameras, made.cameras_flip)
+    )  # the object heads along its z axis
+    side = math.copysign(1.0, -float(ahead[0][0]) * azimuth)  # whether the network sees it or its mirror image
+    for half, sign in ((ahead, side), (flipped, -side)):
+        for axis in half:
+            assert abs(wrapped(torch.atan2(-axis[0], axis[2]) - sign * azimuth)) < 12 * DEGREES
+    assert len(told) == 4 and not any(cameras.any() for cameras in told)
+
+
 def test_where_cameras_see_several_sides_headings_are_not_read() -> None:
     clip, config = walking_clip(3, "sweep"), shortened(1)
-    plain, read = (fit_template(clip, config=config, seed=0, log=silent, heading=net) for net in (None, Sure(1.0)))
+    plain, read = (
+        fit_template(clip, config=config, seed=0, log=silent, networks=Networks(headings=network))
+        for network in (None, Sure(1.0))
+    )
     assert torch.equal(plain.transforms, read.transforms) and "headings" not in read.provenance
