@@ -1,6 +1,6 @@
 """`prior fit` and `prior import`: a posed template for real footage, as an npz and as overlays to check it by.
 
-`prior train` makes the weights of the networks that help the fit.
+`prior train` makes what the fit knows of animals.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ if TYPE_CHECKING:
 
 USAGE = """usage: rewild4d-bench prior fit --frames DIR --masks DIR --out prior.npz [--keypoints FILE --mapping NAME]
        rewild4d-bench prior import --files DIR --out prior.npz
-       rewild4d-bench prior train --out DIR [--network points]"""
+       rewild4d-bench prior train --out DIR [--part headings|shapes|points]"""
 DESCRIPTION = """Fit a template to masked frames of unknown cameras; write the prior and an overlay
 (<out>.png and <out>.mp4): mask green, template magenta, agreement grey, left legs orange, right legs blue, head red."""
 IMPORT = """Import the output of a test run of 3D-Fauna, <step>_<frame>_mesh.obj, _pose.txt, _arti_params.txt, as a
 prior."""
-TRAIN = """Train a network on random four-footed animals, or go on where the folder's training was stopped. Writes
-weights.safetensors and curve.json. `headings` is the network whose weights come with the package (half an hour
-on two cores); `points` is that of `run --prior learned:DIR/weights.safetensors` (about 15 seconds a round)."""
+TRAIN = """Learn a part of the prior from random four-footed animals, or go on where the folder's training was stopped.
+`headings` (a network, weights.safetensors and curve.json, half an hour on two cores) and `shapes`
+(density.safetensors, an hour) come with the package; `points` is the network of
+`run --prior learned:DIR/weights.safetensors` (about 15 seconds a round)."""
 WHOLE = Selection(cameras="unknown", size=256, framing="crop", split=5)
 """Selection that names the cases of a reader; frames are used whole and none is held out."""
 
@@ -46,8 +47,9 @@ class FitOptions:
         keypoints: BADJA or COCO-like .json, DeepLabCut or SLEAP .csv.
         mapping: from names of keypoints to points of the template: aptv2, badja, superanimal-quadruped or a .toml file.
         use: frames whose keypoints the fit sees: all; every other one (the rest is scored); none (all are scored).
-        prior: "template" (masks alone; a quadruped, biped or primate, whichever fits best), "template:<which>" (one of
-            these) or "learned:<weights>" (also points of the body that a network finds).
+        prior: "template" (a quadruped, biped or primate, whichever fits best), "template:<which>" (one of these),
+            "masks" (the same from masks alone, without what was learned of headings and shapes) or "learned:<weights>"
+            (masks, and points of the body that a network finds).
         rig: a rig of your own, .glb or .gltf with a skinned mesh and a clip, y up, as the template.
         fps: frames per second as for `run`: DAVIS has 24, other folders 25 where it is left out, videos their own.
         seed: of the fit.
@@ -92,18 +94,19 @@ class TrainOptions:
     """Flags of `prior train`.
 
     Attributes:
-        out: folder of the weights, the learning curve and the checkpoint.
-        network: headings (which way an animal heads) or points (of the body, in 3D).
-        animals: of headings: to learn from.
+        out: folder of what is learned and of what is needed to go on.
+        part: headings (which way an animal heads), shapes (proportions and cross sections) or points (of the body, in
+            3D).
+        animals: of headings and shapes: to learn from; 1600 and 275 where it is left out.
         epochs: of headings: how often their pictures are gone through.
         rounds: of points: of eight animals each; the learning rate falls over all of them.
         seed: of the animals and of the first weights.
-        workers: processes that draw animals; of points beside the one that trains; 0 draws in the same.
+        workers: processes that draw (of shapes: fit) animals; of points beside the one that trains; 0 takes the same.
     """
 
     out: Path
-    network: Literal["headings", "points"] = "headings"
-    animals: int = 1600
+    part: Literal["headings", "shapes", "points"] = "headings"
+    animals: int | None = None
     epochs: int = 10
     rounds: int = 2000
     seed: int = 0
@@ -132,21 +135,30 @@ def _import(arguments: list[str]) -> int:
 def _train(arguments: list[str]) -> int:
     options = parse_flags(TrainOptions, arguments, prog="rewild4d-bench prior train", description=TRAIN)
     for name in ("animals", "epochs", "rounds"):
-        if getattr(options, name) < 1:
-            raise UserError(f"--{name}: expected 1 or more, got {getattr(options, name)}.")
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise UserError(f"--{name}: expected 1 or more, got {value}.")
     if options.workers < 0:
         raise UserError(f"--workers: expected 0 or more, got {options.workers}.")
     require_writable_file(options.out / "weights.safetensors")
+    print(_trained(options))
+    return 0
+
+
+def _trained(options: TrainOptions) -> Path:
     from rewild4d.priors.heading import training as headings
     from rewild4d.priors.learned import training as points
+    from rewild4d.priors.shapes import training as shapes
 
-    if options.network == "points":
+    animals = {} if options.animals is None else {"animals": options.animals}
+    if options.part == "points":
         rounds = points.TrainingConfig(rounds=options.rounds, seed=options.seed)
-        print(points.train(options.out, rounds, workers=options.workers, report=print))
-    else:
-        epochs = headings.TrainingConfig(animals=options.animals, epochs=options.epochs, seed=options.seed)
-        print(headings.train(options.out, epochs, workers=options.workers, report=print))
-    return 0
+        return points.train(options.out, rounds, workers=options.workers, report=print)
+    if options.part == "shapes":
+        samples = shapes.TrainingConfig(seed=options.seed, **animals)
+        return shapes.train(options.out, samples, workers=options.workers, report=print)
+    epochs = headings.TrainingConfig(epochs=options.epochs, seed=options.seed, **animals)
+    return headings.train(options.out, epochs, workers=options.workers, report=print)
 
 
 def _fit(arguments: list[str]) -> int:
@@ -172,7 +184,7 @@ def _fit(arguments: list[str]) -> int:
         raise UserError(f"--rig {options.rig}: expected a .glb or .gltf file.")
     choice = PriorChoice(options.prior if options.rig is None else f"template:{options.rig}", STANDARD)
     if not choice.is_fitted:
-        raise UserError(f"--prior {options.prior}: expected template, template:<which> or learned:<weights>.")
+        raise UserError(f"--prior {options.prior}: expected template, template:<which>, masks or learned:<weights>.")
     if choice.is_own_rig and options.keypoints is not None:
         raise UserError("--rig and --keypoints: expected one of them; keypoints are mapped to the package's templates.")
     choice.require()
@@ -189,7 +201,7 @@ def _fit(arguments: list[str]) -> int:
     evidence = Evidence(given, clip.travel)
     prior = fit_footage(
         clip, config=choice.settings_under(known_cameras=False), seed=options.seed, log=progress, said=evidence,
-        networks=choice.networks(), bodies=choice.bodies(),
+        trained=choice.trained(), bodies=choice.bodies(),
     )  # fmt: skip
     progress.close()
     if scored is not None:

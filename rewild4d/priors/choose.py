@@ -24,10 +24,11 @@ from rewild4d.priors.io import load_prior, save_prior, seal
 from rewild4d.priors.judge import doubts, joint_scores, measured
 from rewild4d.priors.landmarks import Marks, load_mapping, marks
 from rewild4d.priors.learned.weights import load_weights
-from rewild4d.priors.networks import Networks
 from rewild4d.priors.placing import has_cameras, in_world, placed
 from rewild4d.priors.rig import rig_prior
+from rewild4d.priors.shapes.weights import package_density, package_density_digest
 from rewild4d.priors.steady import without_hops
+from rewild4d.priors.trained import UNTRAINED, Trained
 from rewild4d.types import Clip, Prior, Truth
 
 PRIOR_SEED = 0
@@ -81,7 +82,7 @@ class PriorChoice:
             UserError: a noise that is no number, an unknown template, or a file that is missing or damaged.
         """
         if self.is_learned:
-            self.networks()
+            self.trained()
         elif self.is_fitted:
             self.bodies()
         elif not self.is_from_truth:
@@ -126,20 +127,15 @@ class PriorChoice:
             )
         return Path(path)
 
-    def networks(self) -> Networks:
-        """Return what takes part in the fit: of a learned prior its points, of a template headings.
+    def trained(self) -> Trained:
+        """Return what takes part in the fit: of a learned prior its points, of a template headings and shapes.
 
         Raises:
             UserError: weights are missing or damaged.
         """
-        return Networks(
-            points=load_weights(self._weights_file) if self.is_learned else None,
-            headings=package_weights() if self._reads_headings else None,
-        )
-
-    @property
-    def _reads_headings(self) -> bool:
-        return self._kind == "template"
+        if self._kind == "template":
+            return Trained(headings=package_weights(), shapes=package_density())
+        return Trained(points=load_weights(self._weights_file)) if self.is_learned else UNTRAINED
 
     @property
     def is_from_truth(self) -> bool:
@@ -157,7 +153,7 @@ class PriorChoice:
         parts: list[str | bytes] = [clip.digest, str(code_version())]
         if self.is_fitted:
             parts += ["template", msgspec.json.encode(self.settings(clip)), repr(self._pairs), self.use]
-            parts += [package_digest()] if self._reads_headings else []
+            parts += [package_digest(), package_density_digest()] if self._kind == "template" else []
             if self.is_learned:
                 parts += ["learned", self._weights_file.read_bytes()]
             else:
@@ -231,7 +227,7 @@ def _fitted(choice: PriorChoice, clip: Clip, truth: Truth, log: Log) -> Prior:
         return coarse_prior(clip, truth.held_out, noise=choice.noise, seed=PRIOR_SEED, config=config, log=log)
     if choice.name == "rig" or has_cameras(clip):
         fitted = fit_template(
-            clip, config=config, seed=PRIOR_SEED, log=log, networks=choice.networks(), bodies=choice.bodies(),
+            clip, config=config, seed=PRIOR_SEED, log=log, trained=choice.trained(), bodies=choice.bodies(),
         )  # fmt: skip
         return rig_prior(clip, truth.rig(), fitted) if choice.name == "rig" and truth.rig else fitted
     given, scored = choice.keypoints(clip)
@@ -239,7 +235,7 @@ def _fitted(choice: PriorChoice, clip: Clip, truth: Truth, log: Log) -> Prior:
         given = None
     prior = fit_footage(
         clip, config=config, seed=PRIOR_SEED, log=log, said=Evidence(given, clip.travel),
-        networks=choice.networks(), bodies=choice.bodies(),
+        trained=choice.trained(), bodies=choice.bodies(),
     )  # fmt: skip
     return _scored(prior, clip, scored)
 

@@ -47,6 +47,8 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         learning_rate: of Adam at the start of each round, per standard deviation of a parameter.
         shape_weight: mean squared deviation of the proportions from the average animal, in standard deviations.
         relief_weight: mean squared relief of the cross sections, in standard deviations.
+        density_weight: mean squared deviation from the shapes of random animals, where these are known; instead of the
+            two before.
         angle_weight: squared joint angles, in standard deviations; fast motion counts more.
         root_weight: squared motion and tilt of the root, in standard deviations; fast motion counts more.
         view_weight: squared cosine between heading and viewing direction, where all cameras look one way: an animal at
@@ -68,6 +70,7 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     learning_rate: float = 0.06
     shape_weight: float = 0.02
     relief_weight: float = 0.015
+    density_weight: float = 0.03
     angle_weight: float = 0.15
     root_weight: float = 0.2
     view_weight: float = 0.01

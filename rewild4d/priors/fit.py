@@ -20,7 +20,6 @@ from rewild4d.priors.io import seal
 from rewild4d.priors.kinematics import pose
 from rewild4d.priors.learned.evidence import PointEvidence, indices
 from rewild4d.priors.learned.reading import read
-from rewild4d.priors.networks import NO_NETWORKS, Networks
 from rewild4d.priors.posed import posed_prior
 from rewild4d.priors.race import Race, Steps, decided, steps_of
 from rewild4d.priors.search import (
@@ -34,6 +33,7 @@ from rewild4d.priors.search import (
     working_frame,
 )
 from rewild4d.priors.silhouettes import known_camera, overlap
+from rewild4d.priors.trained import UNTRAINED, Trained
 from rewild4d.transforms import camera_in_object, similarity, skin_points
 from rewild4d.types import OBJECT_DIAGONAL, Clip, Frame, Prior
 
@@ -60,7 +60,7 @@ class Animal:
 
 
 def fit_template(
-    clip: Clip, *, config: PriorConfig, seed: int, log: Log, networks: Networks = NO_NETWORKS,
+    clip: Clip, *, config: PriorConfig, seed: int, log: Log, trained: Trained = UNTRAINED,
     bodies: Sequence[Body] = (QUADRUPED,),
 ) -> Prior:  # fmt: skip
     """Fit the template to a clip's masks under its cameras and to what networks read in its pictures, then to its
@@ -77,18 +77,18 @@ def fit_template(
         UserError: a frame has no camera, or no mask shows anything.
     """
     count = len(clip.frames)
-    animal = fit_animal(clip.frames, range(count), count, clip.name, config, seed, log, networks, bodies)
-    points = " and to points of the body that a network finds in them" if networks.points else ""
+    animal = fit_animal(clip.frames, range(count), count, clip.name, config, seed, log, trained, bodies)
+    points = " and to points of the body that a network finds in them" if trained.points else ""
     provenance = (
         f"Template ({animal.body.name}) fitted to {animal.seen} of the clip's {count} frames{points} "
         f"under known cameras, seed {seed}."
     )
-    return make_prior(animal, clip, "learned" if networks.points else "template", provenance)
+    return make_prior(animal, clip, "learned" if trained.points else "template", provenance)
 
 
 def fit_animal(
     frames: Sequence[Frame], timesteps: Sequence[int], count: int, name: str, config: PriorConfig, seed: int, log: Log,
-    networks: Networks = NO_NETWORKS, bodies: Sequence[Body] = (QUADRUPED,),
+    trained: Trained = UNTRAINED, bodies: Sequence[Body] = (QUADRUPED,),
 ) -> Animal:  # fmt: skip
     """Fit the template to frames of ``count`` times; ``timesteps`` are indices of their times.
 
@@ -108,12 +108,12 @@ def fit_animal(
         for up in ups:
             working = working_frame(rays, path, up)
             race = KnownCameras(frames, timesteps, name, working, config, generator, steps)
-            race.view = single_view(rays, working)
+            race.view, race.shapes = single_view(rays, working), trained.shapes_of(body)
             local = torch.linalg.solve(working[:3, :3], (path - working[:3, 3]).T).T
-            if networks.points is not None:
-                race.said = PointEvidence.of(read(frames, timesteps, up, name, networks.points), working)
-            if networks.headings is not None and race.view is not None:
-                race.headings = read_headings(frames, timesteps, up, name, networks.headings).in_frame(working)
+            if trained.points is not None:
+                race.said = PointEvidence.of(read(frames, timesteps, up, name, trained.points), working)
+            if trained.headings is not None and race.view is not None:
+                race.headings = read_headings(frames, timesteps, up, name, trained.headings).in_frame(working)
             race.begin(Hypotheses.start(body, facings(config.yaw_starts), local.float(), config.root_period))
             race.run(config.stages[0])
             races.append(race)

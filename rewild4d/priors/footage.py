@@ -23,11 +23,11 @@ from rewild4d.priors.kinematics import pose
 from rewild4d.priors.landmarks import Marks
 from rewild4d.priors.learned.evidence import PointEvidence, indices
 from rewild4d.priors.learned.reading import read
-from rewild4d.priors.networks import NO_NETWORKS, Networks
 from rewild4d.priors.posed import posed_prior
 from rewild4d.priors.race import Race, Steps, decided, steps_of
 from rewild4d.priors.search import facings
 from rewild4d.priors.silhouettes import require_mask
+from rewild4d.priors.trained import UNTRAINED, Trained
 from rewild4d.priors.views import FIELD_OF_VIEW, Views, fauna_camera, windows
 from rewild4d.transforms import nearest_rotation, rigid
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Prior
@@ -139,7 +139,7 @@ class FixedCamera(Race):
 
 def fit_footage(
     clip: Clip, *, config: PriorConfig, seed: int, log: Log, said: Evidence = NOTHING,
-    networks: Networks = NO_NETWORKS, bodies: Sequence[Body] = (QUADRUPED,),
+    trained: Trained = UNTRAINED, bodies: Sequence[Body] = (QUADRUPED,),
 ) -> Prior:  # fmt: skip
     """Fit the template to a clip's masks under unknown cameras, and to what networks read in its pictures.
 
@@ -157,20 +157,20 @@ def fit_footage(
     require_mask(clip.frames, clip.name)
     total = steps_of(config.stages, len(bodies)) + sum(stage.steps for stage in config.stages)
     steps = Steps(log, total)
-    races = [_race(clip.name, clip.frames, said, config, seed, steps, body, networks) for body in bodies]
+    races = [_race(clip.name, clip.frames, said, config, seed, steps, body, trained) for body in bodies]
     race = decided(races, config.stages)
     flipped = tuple(replace(f, rgb=f.rgb.flip(-1), mask=f.mask.flip(-1)) for f in clip.frames)
     mirrored = said.mirrored(clip.frames[0].mask.shape[2])
     body = race.guesses.body
-    race_flip = _race(clip.name, flipped, mirrored, config, seed, steps, body, networks, known=race.guesses)
+    race_flip = _race(clip.name, flipped, mirrored, config, seed, steps, body, trained, known=race.guesses)
     for stage in config.stages:
         race_flip.run(stage)
-    return _prior(clip, race, race_flip, "learned" if networks.points else "template", seed)
+    return _prior(clip, race, race_flip, "learned" if trained.points else "template", seed)
 
 
 def _race(
     case: str, frames: tuple[Frame, ...], said: Evidence, config: PriorConfig, seed: int, steps: Steps, body: Body,
-    networks: Networks, known: Views | None = None,
+    trained: Trained, known: Views | None = None,
 ) -> FixedCamera:  # fmt: skip
     """Return a race with all its starts; scale and proportions are those of ``known``, if given."""
     boxes = windows(frames)
@@ -180,12 +180,12 @@ def _race(
     ]
     working, generator = torch.eye(4, dtype=torch.float64), torch.Generator().manual_seed(seed)
     race = FixedCamera(seen, range(len(frames)), case, working, config, generator, steps)
-    race.said, race.boxes = said, boxes.float()
-    if networks.points is not None:
-        found = read(seen, range(len(seen)), UP, case, networks.points, known=False)
+    race.said, race.boxes, race.shapes = said, boxes.float(), trained.shapes_of(body)
+    if trained.points is not None:
+        found = read(seen, range(len(seen)), UP, case, trained.points, known=False)
         race.points = PointEvidence.of(found, working)
-    if networks.headings is not None:
-        race.headings = read_headings(seen, range(len(seen)), UP, case, networks.headings, known=False)
+    if trained.headings is not None:
+        race.headings = read_headings(seen, range(len(seen)), UP, case, trained.headings, known=False)
     # known proportions need fewer starts
     count = config.yaw_starts if known is None else max(4, config.yaw_starts // 2)
     starts = Views.start(body, facings(count), torch.zeros(len(frames), 3), config.root_period)

@@ -11,6 +11,7 @@ from rewild4d.contracts import Log
 from rewild4d.priors.config import PriorConfig, Stage
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.search import match_areas
+from rewild4d.priors.shapes.density import ShapeDensity
 from rewild4d.priors.silhouettes import Targets, color_mismatch, crop_targets, mean_color, mismatch
 from rewild4d.types import Frame
 
@@ -49,7 +50,10 @@ class Race:
         misfits: the same without `verdict`, which may be negative, [B].
         start_costs: of every start after the first round.
         figures: named figures of the race (facing_margin, ...).
+        shapes: where shapes of this kind of body lie; None takes every proportion on its own.
     """
+
+    shapes: ShapeDensity | None = None
 
     def __init__(
         self, frames: Sequence[Frame], timesteps: Sequence[int], name: str, working: Tensor, config: PriorConfig,
@@ -62,8 +66,11 @@ class Race:
         self.guesses: Hypotheses
 
     def begin(self, guesses: Hypotheses) -> None:
-        """Take the starts, scaled to the masks' area."""
+        """Take the starts, of mean shape and scaled to the masks' area."""
         self.guesses = guesses
+        if self.shapes is not None:
+            shape, relief = self.shapes.start(guesses.body.measures)
+            guesses.shape, guesses.relief = shape.repeat(len(guesses), 1), relief.repeat(len(guesses), 1, 1)
         match_areas(self.guesses, self._targets(self.config.stages[0].size), self.config.stages[0])
 
     def free(self, stage: Stage) -> list[str]:
@@ -134,6 +141,8 @@ class Race:
         shape, relief, swing, root = self.guesses.penalties()
         config = self.config
         penalty = config.shape_weight * shape + config.relief_weight * relief
+        if self.shapes is not None:
+            penalty = config.density_weight * self.shapes.penalty(self.guesses.shape, self.guesses.relief)
         penalty = penalty + config.angle_weight * swing + config.root_weight * root + self.evidence()
         if not stage.colors:
             return mismatch(self.guesses.silhouettes(targets, stage), targets, sigma) + penalty

@@ -12,8 +12,7 @@ from rewild4d.registry import load_method
 
 LOSSES = "run before two regularizers, the times of frames and the frame filter were mended (docs/experiments/paper.md)"
 MIRRORS = "run without the mirror images that the preset has since (docs/experiments/baseline-presets.md)"
-COLORS = "from priors fitted to masks alone, not to colours too (docs/experiments/prior-colors.md)"
-HEADINGS = "from priors fitted to masks alone, not to headings too (docs/experiments/headings.md)"
+PRIOR = "from priors fitted without {parts}, which take part since (docs/prior.md)"
 
 
 def notes_on(run: RunRecord) -> tuple[str, ...]:
@@ -22,14 +21,17 @@ def notes_on(run: RunRecord) -> tuple[str, ...]:
 
 
 def _older_prior(run: RunRecord) -> str:
-    """Return a note on what the prior's fit did not see yet, "" where it saw all or the method uses none."""
+    """Return a note on what had no part in the prior's fit yet, "" where nothing is missing or the method uses none."""
     cameras, settings = run.protocol.get("selection", {}).get("cameras"), run.prior.get("config") or {}
     if run.prior.get("choice") != "template" or not settings or not _uses_prior(run.method):
         return ""
+    missing = []
     if cameras in ("fixed", "unknown"):
-        return "" if "heading_weight" in settings else HEADINGS
-    masks_alone = not any("colors" in stage for stage in settings["stages"])
-    return COLORS if masks_alone and cameras in ("sweep", "random") and run.preset != "quick" else ""
+        missing += [] if "heading_weight" in settings else ["headings"]
+    elif run.preset != "quick" and not any("colors" in stage for stage in settings["stages"]):
+        missing.append("colours")
+    missing += [] if "density_weight" in settings else ["the shapes of random animals"]
+    return PRIOR.format(parts=" and ".join(missing)) if missing else ""
 
 
 def _uses_prior(method: str) -> bool:

@@ -25,7 +25,7 @@ def test_wrong_numbers_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_a_prior_of_something_else_than_the_clip_is_no_fit(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     flags = ("--frames", tmp_path, "--out", tmp_path / "p.npz", "--prior", "rig")
     said = refusal(capsys, "prior", "fit", *flags)
-    assert said == "rewild4d-bench: --prior rig: expected template, template:<which> or learned:<weights>.\n"
+    assert said == "rewild4d-bench: --prior rig: expected template, template:<which>, masks or learned:<weights>.\n"
 
 
 def test_it_trains_the_network_of_headings(
@@ -50,7 +50,7 @@ def test_it_writes_weights_and_a_curve(
     for name, value in (("ANIMALS", 1), ("CHECKED", 2), ("BATCH", 2)):
         monkeypatch.setattr(training, name, value)
     monkeypatch.setattr(training, "draw_sequences", lambda rng: examples.draw_sequences(rng, 2, 4))
-    assert call("prior", "train", "--out", tmp_path, "--network", "points", "--rounds", 1, "--workers", 0) == 0
+    assert call("prior", "train", "--out", tmp_path, "--part", "points", "--rounds", 1, "--workers", 0) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("round 1  seconds ") and lines[1] == str(tmp_path / "weights.safetensors")
     assert {file.name for file in tmp_path.iterdir()} == {"checkpoint.pt", "curve.json", "weights.safetensors"}

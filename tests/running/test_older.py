@@ -10,7 +10,7 @@ from rewild4d.leaderboard.specs import Line
 from rewild4d.leaderboard.tables import Entrant
 from rewild4d.priors.config import FOOTAGE, QUICK, STANDARD, without_colors
 from rewild4d.running import planning
-from rewild4d.running.older import COLORS, HEADINGS, LOSSES, MIRRORS
+from rewild4d.running.older import LOSSES, MIRRORS, PRIOR
 
 
 def test_runs_from_before_the_losses_were_mended_stand_for_their_row_until_there_are_later_ones() -> None:
@@ -79,15 +79,20 @@ def test_runs_from_priors_of_masks_alone_stand_for_their_row_with_a_note_until_t
         ]  # fmt: skip
         return planning.entrants("t", found, runs)[0][0]
 
-    before = {name: value for name, value in then.items() if name != "heading_weight"}
+    shapeless = {name: value for name, value in then.items() if name != "density_weight"}
+    before = {name: value for name, value in shapeless.items() if name != "heading_weight"}
     old, new, none = row(then), row(then, now), row(masks)
     fixed, unread = row(then, cameras="fixed"), row(before, cameras="fixed")
-    assert [r.run_id for r in old.records[0]] == ["0"] and old.notes == (COLORS,)
+    assert [r.run_id for r in old.records[0]] == ["0"] and old.notes == (PRIOR.format(parts="colours"),)
+    assert row(shapeless).notes == (PRIOR.format(parts="colours and the shapes of random animals"),)
+    assert row(shapeless, cameras="fixed").notes == (PRIOR.format(parts="the shapes of random animals"),)
     assert [r.run_id for r in new.records[0]] == ["1"] and not new.notes
     assert none.records == ((),), "a run that was asked to have masks alone is another row"
     assert [r.run_id for r in fixed.records[0]] == ["0"] and not fixed.notes, "one camera: no colours today either"
-    assert [r.run_id for r in unread.records[0]] == ["0"] and unread.notes == (HEADINGS,)
+    assert [r.run_id for r in unread.records[0]] == ["0"]
+    assert unread.notes == (PRIOR.format(parts="headings and the shapes of random animals"),)
     assert row(before, then, cameras="fixed").records[0][0].run_id == "1"
     films = [msgspec.to_builtins(FOOTAGE)]
     films.insert(0, {name: value for name, value in films[0].items() if name != "heading_weight"})
-    assert row(films[0], cameras="unknown").notes == (HEADINGS,) and not row(*films, cameras="unknown").notes
+    assert row(films[0], cameras="unknown").notes == (PRIOR.format(parts="headings"),)
+    assert not row(*films, cameras="unknown").notes

@@ -27,7 +27,7 @@ from rewild4d.priors.heading.network import (
 from rewild4d.priors.heading.pictures import from_bytes, ground_axes, said, to_bytes
 from rewild4d.priors.heading.reading import Headings, read_headings
 from rewild4d.priors.heading.weights import package_weights
-from rewild4d.priors.networks import Networks
+from rewild4d.priors.trained import Trained
 
 DEGREES = 2 * math.pi / 360
 UP = torch.tensor((0.0, 1.0, 0.0), dtype=torch.float64)
@@ -140,7 +140,7 @@ def test_under_one_camera_the_template_turns_to_the_heading_that_is_read() -> No
         network = Sure(azimuth).eval()
         said_of_it = float(likeliest(read_headings(clip.frames, range(2), up, "case", network).scores.mean(0)[None]))
         assert abs(said_of_it) == pytest.approx(abs(azimuth), abs=2 * DEGREES)
-        made = fit_template(clip, config=config, seed=0, log=silent, networks=Networks(headings=network))
+        made = fit_template(clip, config=config, seed=0, log=silent, trained=Trained(headings=network))
         ahead = view @ made.object_to_world[0, :3, 2]
         turned = torch.atan2(ahead @ left, ahead @ away)
         assert abs(wrapped(turned - said_of_it)) < 10 * DEGREES
@@ -155,7 +155,7 @@ def test_in_a_film_both_halves_turn_to_the_heading_that_is_read_and_the_network_
     azimuth = -2.2
     network = Sure(azimuth).eval()
     network.register_forward_pre_hook(lambda _, inputs: told.append(inputs[1]))
-    made = fit_footage(film, config=config, seed=0, log=silent, networks=Networks(headings=network))
+    made = fit_footage(film, config=config, seed=0, log=silent, trained=Trained(headings=network))
     assert "and to headings that a network reads" in made.provenance
     assert made.cameras_flip is not None
     ahead, flipped = (
@@ -171,7 +171,7 @@ def test_in_a_film_both_halves_turn_to_the_heading_that_is_read_and_the_network_
 def test_where_cameras_see_several_sides_headings_are_not_read() -> None:
     clip, config = walking_clip(3, "sweep"), shortened(1)
     plain, read = (
-        fit_template(clip, config=config, seed=0, log=silent, networks=Networks(headings=network))
+        fit_template(clip, config=config, seed=0, log=silent, trained=Trained(headings=network))
         for network in (None, Sure(1.0))
     )
     assert torch.equal(plain.transforms, read.transforms) and "headings" not in read.provenance

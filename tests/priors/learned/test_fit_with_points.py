@@ -17,8 +17,8 @@ from rewild4d.priors.learned.evidence import indices
 from rewild4d.priors.learned.network import PointNetwork
 from rewild4d.priors.learned.points import NAMES, ROOT
 from rewild4d.priors.learned.reading import Reading
-from rewild4d.priors.networks import Networks
 from rewild4d.priors.silhouettes import outline
+from rewild4d.priors.trained import Trained
 from rewild4d.types import Clip, Frame, Prior
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -74,7 +74,7 @@ def test_points_that_say_so_turn_the_animal_round(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(fit, "read", read)
     strong = msgspec.structs.replace(with_points(config), points_weight=1.0)
-    both = fit.fit_template(clip, config=strong, seed=0, log=silent, networks=Networks(points=PointNetwork()))
+    both = fit.fit_template(clip, config=strong, seed=0, log=silent, trained=Trained(points=PointNetwork()))
     ahead, behind = (prior.object_to_world[:, :3, 2].mean(0) for prior in (alone, both))
     assert torch.nn.functional.cosine_similarity(ahead, behind, dim=0) < -0.9
     assert both.name == "learned" and alone.name == "template" and "that a network finds" in both.provenance
@@ -87,7 +87,7 @@ def test_under_unknown_cameras_the_network_is_told_nothing_of_them(monkeypatch: 
     clip = replace(clip, frames=tuple(replace(frame, camera=None) for frame in clip.frames))
     network.register_forward_pre_hook(lambda _, inputs: known.append(inputs[3].tolist()))
     config = shortened(with_points(FOOTAGE), 1)
-    prior = footage.fit_footage(clip, config=config, seed=0, log=silent, networks=Networks(points=network))
+    prior = footage.fit_footage(clip, config=config, seed=0, log=silent, trained=Trained(points=network))
     assert prior.name == "learned" and torch.isfinite(prior.transforms).all()
     assert known == [[False]] * 4  # the clip and its mirror image, each plain and in a mirror
     alone = footage.fit_footage(clip, config=config, seed=0, log=silent)

@@ -1,0 +1,46 @@
+"""A Gaussian over the shapes of a template: its proportions and the relief of its cross sections."""
+
+from dataclasses import dataclass
+
+import torch
+from sklearn.covariance import LedoitWolf
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class ShapeDensity:
+    """Where shapes lie, all in the template's own standard deviations; D = P + 4 S.
+
+    Attributes:
+        mean: proportions, then relief, [D].
+        whitening: takes deviations from the mean to independent ones of unit spread, [D, D].
+    """
+
+    mean: Tensor
+    whitening: Tensor
+
+    @classmethod
+    def of(cls, samples: Tensor) -> "ShapeDensity":
+        """Return the density of samples [n, D]; its covariance is drawn towards a round one as Ledoit and Wolf do."""
+        values = samples.double()
+        covariance = torch.from_numpy(LedoitWolf().fit(values.numpy()).covariance_)
+        lower = torch.linalg.cholesky(covariance)
+        whitening = torch.linalg.solve_triangular(lower, torch.eye(len(lower), dtype=torch.float64), upper=False)
+        return cls(values.mean(0).float(), whitening.float())
+
+    def start(self, measures: int) -> tuple[Tensor, Tensor]:
+        """Return the mean proportions, ``measures`` of them, and the mean relief, [P] and [S, 4]."""
+        return self.mean[:measures].clone(), self.mean[measures:].reshape(-1, 4).clone()
+
+    def penalty(self, shape: Tensor, relief: Tensor) -> Tensor:
+        """Return the mean square of the whitened deviations.
+
+        Args:
+            shape: proportions, [B, P].
+            relief: of the cross sections, [B, S, 4].
+
+        Returns:
+            About 1 for shapes of the density itself, [B].
+        """
+        away = torch.cat((shape, relief.flatten(1)), dim=1) - self.mean
+        return (away @ self.whitening.T).square().mean(1)
