@@ -67,7 +67,7 @@ def fit_template(
     colours too where cameras see several sides.
 
     The seed is that of the frames drawn for each step. Of several ``bodies`` the one that fits best is taken. Headings
-    are read where all cameras look one way.
+    are read, and shapes learned from random animals are followed, where all cameras look one way.
 
     Returns:
         A prior with one pose per frame; `quality` has mask_iou, cost, facing_margin, starts (their number),
@@ -108,7 +108,9 @@ def fit_animal(
         for up in ups:
             working = working_frame(rays, path, up)
             race = KnownCameras(frames, timesteps, name, working, config, generator, steps)
-            race.view, race.shapes = single_view(rays, working), trained.shapes_of(body)
+            race.view = single_view(rays, working)
+            if race.view is not None:
+                race.shapes = trained.shapes_of(body)
             local = torch.linalg.solve(working[:3, :3], (path - working[:3, 3]).T).T
             if trained.points is not None:
                 race.said = PointEvidence.of(read(frames, timesteps, up, name, trained.points), working)

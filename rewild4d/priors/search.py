@@ -19,6 +19,8 @@ SILHOUETTE_SIDE = 1.5
 """Square root of the average template's mean silhouette area, template units."""
 WIDE_BASELINE = 0.2
 """Spread of viewing directions in radians above which they determine the animal's depth."""
+LOOKS_AT_ORIGIN = 0.5
+"""Cosine of the angle between a camera's view and the world's origin above which the camera looks there."""
 STILLNESS = 0.5
 """Damping of the path's cosine terms, per observation and squared order."""
 
@@ -77,7 +79,8 @@ def trajectory(rays: Rays, count: int) -> Tensor:
     """Return the smooth path that comes closest to all rays, in the world, float64, [count, 3].
 
     Where the rays hardly differ in direction, depth is unknown: then the path lies in the plane across the view that
-    contains the world's origin (or, if that is behind the camera, one unit away), since recordings are mostly centred.
+    contains the world's origin, since recordings are mostly centred, or where the cameras do not look there, as far
+    away as the origin.
     """
     if spread(rays.directions) < WIDE_BASELINE or _same_position(rays):
         return _frontal_path(rays, count)
@@ -103,7 +106,9 @@ def _same_position(rays: Rays) -> bool:
 def _frontal_path(rays: Rays, count: int) -> Tensor:
     """Return the path in a plane across the view; see `trajectory`."""
     forward = normalize(rays.directions.mean(0), dim=0)
-    distance = -(rays.centers @ forward)
+    away = rays.centers.norm(dim=1)
+    ahead = -(rays.centers @ forward)
+    distance = torch.where(ahead > LOOKS_AT_ORIGIN * away, ahead, away)
     distance = torch.where(distance > 1e-6, distance, torch.ones_like(distance)) / (rays.directions @ forward)
     points = rays.centers + distance[:, None] * rays.directions
     terms = min(4, max(1, count // 4))

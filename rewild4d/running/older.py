@@ -25,12 +25,12 @@ def _older_prior(run: RunRecord) -> str:
     cameras, settings = run.protocol.get("selection", {}).get("cameras"), run.prior.get("config") or {}
     if run.prior.get("choice") != "template" or not settings or not _uses_prior(run.method):
         return ""
-    missing = []
     if cameras in ("fixed", "unknown"):
-        missing += [] if "heading_weight" in settings else ["headings"]
-    elif run.preset != "quick" and not any("colors" in stage for stage in settings["stages"]):
-        missing.append("colours")
-    missing += [] if "density_weight" in settings else ["the shapes of random animals"]
+        parts = {"heading_weight": "headings", "density_weight": "shapes of random animals"}
+        missing = [part for name, part in parts.items() if name not in settings]
+    else:
+        coloured = run.preset == "quick" or any("colors" in stage for stage in settings["stages"])
+        missing = [] if coloured else ["colours"]
     return PRIOR.format(parts=" and ".join(missing)) if missing else ""
 
 

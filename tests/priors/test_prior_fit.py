@@ -92,6 +92,16 @@ def test_one_camera_that_does_not_move_leaves_several_ups_and_a_finite_path() ->
     assert torch.isfinite(trajectory(rays, 4)).all()
 
 
+def test_a_camera_that_does_not_look_at_the_origin_sees_the_animal_as_far_away_as_the_origin() -> None:
+    clip = walking_clip(4, "fixed")
+    rays = mask_rays(clip.frames, list(range(4)), clip.name)
+    sight, aside = rays.directions.mean(0), rays.downs.mean(0)
+    for start, depth in ((-3 * sight, 3.0), (-0.1 * sight - 2 * aside, 0.01**0.5 * 401**0.5), (2 * sight, 2.0)):
+        moved = replace(rays, centers=start.expand(4, 3))
+        path = trajectory(moved, 4)
+        assert float(((path - start) @ sight).mean()) == pytest.approx(depth, rel=0.02)
+
+
 def test_only_a_single_direction_of_view_is_a_gaze_and_it_is_told_in_the_working_frame() -> None:
     truth = world()[0]
     still, ring = (mask_rays(walking_clip(4, kind).frames, list(range(4)), "") for kind in ("fixed", "sweep"))

@@ -20,7 +20,7 @@ from rewild4d.priors.shapes.density import ShapeDensity
 from rewild4d.priors.shapes.examples import MOMENTS, VIEWS, Seen, drawn, fitted
 from rewild4d.priors.shapes.training import TrainingConfig, train
 from rewild4d.priors.shapes.weights import package_density, read_density, save_density
-from rewild4d.priors.trained import Trained
+from rewild4d.priors.trained import UNTRAINED, Trained
 from rewild4d.types import Frame
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -47,7 +47,7 @@ def narrow(mean: Tensor) -> ShapeDensity:
 
 
 def test_a_fit_stays_with_the_shapes_that_it_is_told_and_other_bodies_are_told_none() -> None:
-    clip, config = walking_clip(3, "sweep"), shortened(4)
+    clip, config = walking_clip(3, "fixed"), shortened(4)
     mean = torch.zeros(SIZE)
     mean[0], mean[MEASURES + 9 * 4 + 2] = -1.5, 2.0
     told = Trained(shapes=narrow(mean))
@@ -58,6 +58,11 @@ def test_a_fit_stays_with_the_shapes_that_it_is_told_and_other_bodies_are_told_n
     free = msgspec.structs.replace(config, density_weight=0.0)
     longer = fit_animal(clip.frames, range(3), 3, "case", free, 0, silent, told)
     assert longer.shape.deviations[0] > animal.shape.deviations[0], "the animal of the clip has a body of 2.0"
+    ring = walking_clip(3, "sweep")
+    plain, asked = (fit_animal(ring.frames, range(3), 3, "case", config, 0, silent, each) for each in (UNTRAINED, told))
+    assert torch.equal(plain.shape.deviations, asked.shape.deviations), (
+        "where several sides are seen they are not asked"
+    )
 
 
 def test_an_animal_of_known_shape_is_found_from_all_around(monkeypatch: pytest.MonkeyPatch) -> None:
