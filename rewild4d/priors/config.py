@@ -74,7 +74,7 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     angle_weight: float = 0.15
     root_weight: float = 0.2
     view_weight: float = 0.01
-    heading_weight: float = 0.01
+    heading_weight: float = 0.03
     gait_weight: float = 0.015
     travel_weight: float = 0.08
     carriage_weight: float = 1.0

@@ -161,6 +161,7 @@ class KnownCameras(Race):
         figures = {"cost": float(self.costs.min()), **self.figures}
         seen = "masks and colours" if any(stage.colors for stage in self.config.stages) else "masks"
         seen += ", and to headings that a network reads," if self.headings is not None else ""
+        seen += " near the shapes of random animals" if self.shapes is not None else ""
         return Animal(best.body, shape, self.working @ local, best.joint_angles()[0], seen, figures)
 
 

@@ -143,6 +143,8 @@ def fit_footage(
 ) -> Prior:  # fmt: skip
     """Fit the template to a clip's masks under unknown cameras, and to what networks read in its pictures.
 
+    Shapes of random animals are not followed: in films they were no help (docs/experiments/shapes.md).
+
     The seed is that of the frames drawn for each step of a long clip. Of several ``bodies`` the one that fits the clip
     best is taken.
 
@@ -180,7 +182,7 @@ def _race(
     ]
     working, generator = torch.eye(4, dtype=torch.float64), torch.Generator().manual_seed(seed)
     race = FixedCamera(seen, range(len(frames)), case, working, config, generator, steps)
-    race.said, race.boxes, race.shapes = said, boxes.float(), trained.shapes_of(body)
+    race.said, race.boxes = said, boxes.float()
     if trained.points is not None:
         found = read(seen, range(len(seen)), UP, case, trained.points, known=False)
         race.points = PointEvidence.of(found, working)

@@ -26,8 +26,8 @@ def _older_prior(run: RunRecord) -> str:
     if run.prior.get("choice") != "template" or not settings or not _uses_prior(run.method):
         return ""
     if cameras in ("fixed", "unknown"):
-        parts = {"heading_weight": "headings", "density_weight": "shapes of random animals"}
-        missing = [part for name, part in parts.items() if name not in settings]
+        missing = [] if "heading_weight" in settings else ["headings"]
+        missing += ["shapes of random animals"] if cameras == "fixed" and "density_weight" not in settings else []
     else:
         coloured = run.preset == "quick" or any("colors" in stage for stage in settings["stages"])
         missing = [] if coloured else ["colours"]

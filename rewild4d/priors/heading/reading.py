@@ -14,8 +14,8 @@ from rewild4d.priors.learned.reading import view_of
 from rewild4d.priors.silhouettes import mask_box, require_mask
 from rewild4d.types import Frame
 
-DOUBT = 0.05
-"""Share of the answers that may be anything."""
+DOUBT = 0.5
+"""Share of the answers that may be anything: so much that no answer counts for more than 2.5 nats."""
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,7 @@ def test_a_fit_stays_with_the_shapes_that_it_is_told_and_other_bodies_are_told_n
     mean[0], mean[MEASURES + 9 * 4 + 2] = -1.5, 2.0
     told = Trained(shapes=narrow(mean))
     animal = fit_animal(clip.frames, range(3), 3, "case", config, 0, silent, told)
+    assert animal.seen == "masks near the shapes of random animals"
     assert float(animal.shape.deviations[0]) == pytest.approx(-1.5, abs=0.2)
     assert animal.shape.relief is not None and float(animal.shape.relief[9, 2]) == pytest.approx(2.0, abs=0.3)
     assert told.shapes_of(QUADRUPED) is told.shapes and told.shapes_of(BIPED) is None
