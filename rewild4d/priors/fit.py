@@ -21,7 +21,7 @@ from rewild4d.priors.kinematics import pose
 from rewild4d.priors.learned.evidence import PointEvidence, indices
 from rewild4d.priors.learned.reading import read
 from rewild4d.priors.posed import posed_prior
-from rewild4d.priors.race import Race, Steps, decided, steps_of
+from rewild4d.priors.race import ONE_SIDE_HANDICAP, Race, Steps, decided, steps_of
 from rewild4d.priors.search import (
     WIDE_BASELINE,
     facings,
@@ -110,7 +110,7 @@ def fit_animal(
             race = KnownCameras(frames, timesteps, name, working, config, generator, steps)
             race.view = single_view(rays, working)
             if race.view is not None:
-                race.shapes = trained.shapes_of(body)
+                race.shapes, race.handicap = trained.shapes_of(body), ONE_SIDE_HANDICAP
             local = torch.linalg.solve(working[:3, :3], (path - working[:3, 3]).T).T
             if trained.points is not None:
                 race.said = PointEvidence.of(read(frames, timesteps, up, name, trained.points), working)

@@ -15,8 +15,9 @@ from rewild4d.priors.shapes.density import ShapeDensity
 from rewild4d.priors.silhouettes import Targets, color_mismatch, crop_targets, mean_color, mismatch
 from rewild4d.types import Frame
 
-HANDICAP = 1.4
-"""The costs of all kinds of body but the usual one are multiplied by this where they are compared."""
+HANDICAP, ONE_SIDE_HANDICAP = 1.4, 1.65
+"""The costs of all kinds of body but the usual one are multiplied by this where they are compared: by the second where
+one side is seen (a dog that sits has the outline of a biped)."""
 COLOR_RATE = 0.05
 """Learning rate of the surface's colours."""
 STILL_PARAMETERS = ("scale", "rotation", "shift", "shape")
@@ -51,9 +52,11 @@ class Race:
         start_costs: of every start after the first round.
         figures: named figures of the race (facing_margin, ...).
         shapes: where shapes of this kind of body lie; None takes every proportion on its own.
+        handicap: factor of the costs of all kinds of body but the usual one.
     """
 
     shapes: ShapeDensity | None = None
+    handicap: float = HANDICAP
 
     def __init__(
         self, frames: Sequence[Frame], timesteps: Sequence[int], name: str, working: Tensor, config: PriorConfig,
@@ -167,7 +170,7 @@ R = TypeVar("R", bound=Race)
 def decided(races: Sequence[R], stages: Sequence[Stage]) -> R:
     """Run races of one kind of body each until joints have been fitted; let the best run the stages that are left.
 
-    The first is the usual one: the misfit of another has to be lower by a factor of `HANDICAP`, for it bends more
+    The first is the usual one: the misfit of another has to be lower by a factor of its `handicap`, for it bends more
     freely. Of several, `figures` has <body>_cost of each and body_margin, the lead of the best over the next as a
     share, handicap included.
     """
@@ -178,7 +181,7 @@ def decided(races: Sequence[R], stages: Sequence[Stage]) -> R:
     best = races[0]
     if len(races) > 1:
         found = [float(race.misfits[race.costs.argmin()]) for race in races]
-        costs = [cost * (HANDICAP if index else 1.0) for index, cost in enumerate(found)]
+        costs = [cost * (races[0].handicap if index else 1.0) for index, cost in enumerate(found)]
         best = races[costs.index(min(costs))]
         best.figures |= {f"{race.guesses.body.name}_cost": cost for race, cost in zip(races, found, strict=True)}
         best.figures["body_margin"] = sorted(costs)[1] / min(costs) - 1

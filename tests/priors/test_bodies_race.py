@@ -9,11 +9,12 @@ import torch
 from walking import shortened, silent, walking_clip
 
 from rewild4d.errors import UserError
+from rewild4d.priors import fit
 from rewild4d.priors.bodies.choice import KINDS
 from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import STANDARD, Stage
 from rewild4d.priors.fit import fit_template
-from rewild4d.priors.race import HANDICAP, Race, decided, steps_of
+from rewild4d.priors.race import HANDICAP, ONE_SIDE_HANDICAP, Race, decided, steps_of
 
 STAGES = tuple(Stage(size=32, steps=steps, blur=(0.1, 0.1), keep=1, joints=steps > 1) for steps in (1, 2, 4))
 
@@ -21,7 +22,8 @@ STAGES = tuple(Stage(size=32, steps=steps, blur=(0.1, 0.1), keep=1, joints=steps
 class Told:
     """A race that costs what it is told to, and remembers the rounds that it ran."""
 
-    def __init__(self, name: str, cost: float) -> None:
+    def __init__(self, name: str, cost: float, handicap: float) -> None:
+        self.handicap = handicap
         self.guesses = SimpleNamespace(body=SimpleNamespace(name=name))
         self.misfits, self.figures, self.ran = torch.tensor([9.0, cost]), cast(dict[str, float], {}), 0
         self.costs = self.misfits - torch.tensor([0.0, 0.6])  # the verdict may be negative, and names no body
@@ -30,8 +32,8 @@ class Told:
         self.ran += stage.steps
 
 
-def run(*costs: float) -> tuple[list[Any], Any]:
-    races = [Told(name, cost) for name, cost in zip(("usual", "other", "third"), costs, strict=False)]
+def run(*costs: float, handicap: float = HANDICAP) -> tuple[list[Any], Any]:
+    races = [Told(name, cost, handicap) for name, cost in zip(("usual", "other", "third"), costs, strict=False)]
     return races, decided(cast(list[Race], races), STAGES)
 
 
@@ -46,6 +48,23 @@ def test_all_run_until_joints_were_fitted_and_the_best_runs_on() -> None:
 def test_the_usual_one_has_an_advantage() -> None:
     races, best = run(0.5, 0.5 / 1.2)
     assert best is races[0] and best.figures["body_margin"] == pytest.approx(HANDICAP / 1.2 - 1)
+    between = 0.5 * (HANDICAP + ONE_SIDE_HANDICAP)
+    for handicap, winner in ((HANDICAP, 1), (ONE_SIDE_HANDICAP, 0)):
+        races, best = run(0.5, 0.5 / between, handicap=handicap)
+        assert best is races[winner]
+
+
+def test_where_one_side_is_seen_the_usual_one_has_a_greater_advantage(monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[float] = []
+
+    def told(races: list[Race], stages: Any) -> Race:
+        found.append(races[0].handicap)
+        return decided(races, stages)
+
+    monkeypatch.setattr(fit, "decided", told)
+    for cameras in ("sweep", "fixed"):
+        fit_template(walking_clip(3, cameras), config=shortened(1), seed=0, log=silent)
+    assert found == [HANDICAP, ONE_SIDE_HANDICAP]
 
 
 def test_one_alone_runs_all_and_says_nothing() -> None:
