@@ -45,12 +45,12 @@ class PriorChoice:
     """The prior that a run asks for.
 
     Attributes:
-        name: "template" (fitted to the clip's masks, and to its colours where known cameras see several sides; of the
-            package's templates the one that fits best), "template:<which>" (a template's name or a rig file), "masks"
-            and "masks:<which>" (the same from masks alone), "learned:<weights>" (the quadruped, fitted to masks and to
-            points of the body that a network finds), "coarse" or "coarse:<noise>" (from the truth, plus noise; for
-            studies of prior quality only), "rig" (the data set's own shape and skeleton: a bound) or the path of an npz
-            file.
+        name: "template" (fitted to the clip's masks, to its colours where known cameras see several sides, else to
+            headings and, under known cameras, shapes; of the package's templates the one that fits best),
+            "template:<which>" (a template's name or a rig file), "masks" and "masks:<which>" (the same from masks
+            alone), "learned:<weights>" (the quadruped, fitted to masks and to points of the body that a network finds),
+            "coarse" or "coarse:<noise>" (from the truth, plus noise; for studies of prior quality only), "rig" (the
+            data set's own shape and skeleton: a bound) or the path of an npz file.
         config: settings of the template fit under known cameras.
         mapping: names the template's point of each keypoint (`landmarks.load_mapping`); None ignores keypoints.
         use: frames whose keypoints a fit under unknown cameras sees.

@@ -143,7 +143,7 @@ def fit_footage(
 ) -> Prior:  # fmt: skip
     """Fit the template to a clip's masks under unknown cameras, and to what networks read in its pictures.
 
-    Shapes of random animals are not followed: in films they were no help (docs/experiments/shapes.md).
+    Shapes of random animals take no part: in films they move joints away (docs/experiments/headings.md).
 
     The seed is that of the frames drawn for each step of a long clip. Of several ``bodies`` the one that fits the clip
     best is taken.

@@ -143,8 +143,9 @@ class Race:
     def _cost(self, targets: Targets, sigma: float, stage: Stage) -> Tensor:
         shape, relief, swing, root = self.guesses.penalties()
         config = self.config
-        penalty = config.shape_weight * shape + config.relief_weight * relief
-        if self.shapes is not None:
+        if self.shapes is None:
+            penalty = config.shape_weight * shape + config.relief_weight * relief
+        else:
             penalty = config.density_weight * self.shapes.penalty(self.guesses.shape, self.guesses.relief)
         penalty = penalty + config.angle_weight * swing + config.root_weight * root + self.evidence()
         if not stage.colors:

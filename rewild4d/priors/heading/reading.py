@@ -15,7 +15,7 @@ from rewild4d.priors.silhouettes import mask_box, require_mask
 from rewild4d.types import Frame
 
 DOUBT = 0.5
-"""Share of the answers that may be anything: so much that no answer counts for more than 2.5 nats."""
+"""Share of the answers that may be anything: so much that none counts for more than 3 nats."""
 
 
 @dataclass(frozen=True)

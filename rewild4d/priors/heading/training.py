@@ -7,20 +7,20 @@ import json
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
 
 from rewild4d.files import atomic
 from rewild4d.priors.heading.examples import drawn
 from rewild4d.priors.heading.network import HeadingNetwork, likeliest, log_shares, shares_around, wrapped
 from rewild4d.priors.heading.pictures import Pictures, from_bytes, joined
 from rewild4d.priors.heading.weights import FILE
-from rewild4d.priors.learned.going_on import read_checkpoint, warmth
+from rewild4d.priors.learned.going_on import Arrays, making, read_checkpoint, warmth
 from rewild4d.priors.learned.weights import save_weights
 
 PART = 16
@@ -54,26 +54,6 @@ class TrainingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: int = 0
 
 
-class _Parts(Dataset[Path]):
-    """Files of pictures; asking for one makes it."""
-
-    def __init__(self, folder: Path, config: TrainingConfig) -> None:
-        self.folder, self.config = folder, config
-
-    def __len__(self) -> int:
-        return math.ceil(self.config.animals / PART)
-
-    def __getitem__(self, row: int) -> Path:
-        path = self.folder / f"{self.config.seed}-{row:05d}.npz"
-        if not path.is_file():
-            torch.set_num_threads(1)
-            numbers = range(row * PART, min((row + 1) * PART, self.config.animals))
-            made = joined([drawn(np.random.default_rng((STREAM, self.config.seed, number))) for number in numbers])
-            with atomic(path) as scratch, scratch.open("wb") as file:
-                np.savez_compressed(file, **{name: value.numpy() for name, value in vars(made).items()})
-        return path
-
-
 def train(folder: Path, config: TrainingConfig, *, workers: int, report: Callable[[str], None]) -> Path:
     """Draw what is missing, then train, or go on from the folder's checkpoint, until all epochs are done.
 
@@ -105,14 +85,17 @@ def train(folder: Path, config: TrainingConfig, *, workers: int, report: Callabl
 
 
 def _drawn(folder: Path, config: TrainingConfig, workers: int, report: Callable[[str], None]) -> list[Path]:
-    folder.mkdir(parents=True, exist_ok=True)
-    loader = DataLoader(_Parts(folder, config), batch_size=None, num_workers=workers)
-    paths, began = [], time.monotonic()
-    for path in loader:
-        paths.append(path)
-        if len(paths) % 20 == 0:
-            report(f"drawn {len(paths) * PART} of {config.animals} animals, {time.monotonic() - began:.0f} s")
+    paths = [folder / f"{config.seed}-{row:05d}.npz" for row in range(math.ceil(config.animals / PART))]
+    for count, seconds in making(paths, partial(_part, config), workers):
+        if count % 20 == 0:
+            report(f"drawn {count * PART} of {config.animals} animals, {seconds:.0f} s")
     return paths
+
+
+def _part(config: TrainingConfig, row: int) -> Arrays:
+    numbers = range(row * PART, min((row + 1) * PART, config.animals))
+    made = joined([drawn(np.random.default_rng((STREAM, config.seed, number))) for number in numbers])
+    return {name: value.numpy() for name, value in vars(made).items()}
 
 
 def _read(path: Path) -> Pictures:

@@ -1,13 +1,56 @@
-"""What trainings of networks share: a learning rate that warms up and cools down, and checkpoints to go on from."""
+"""What trainings share: files that are made once, a learning rate that warms up and cools down, and checkpoints."""
 
 import pickle
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import torch
+from torch.utils.data import DataLoader, Dataset
 
 from rewild4d.errors import UserError
+from rewild4d.files import atomic
+
+Arrays = dict[str, np.ndarray]
+
+
+class _Files(Dataset[Path]):
+    """Asking for a file makes it where it is not there."""
+
+    def __init__(self, paths: Sequence[Path], make: Callable[[int], Arrays]) -> None:
+        self.paths, self.make = paths, make
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, row: int) -> Path:
+        path = self.paths[row]
+        if not path.is_file():
+            torch.set_num_threads(1)
+            arrays = self.make(row)
+            with atomic(path) as scratch, scratch.open("wb") as file:
+                np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+        return path
+
+
+def making(paths: Sequence[Path], make: Callable[[int], Arrays], workers: int) -> Iterator[tuple[int, float]]:
+    """Make the npz files that are not there yet, one after another in ``workers`` processes; 0 makes them in this one.
+
+    Args:
+        paths: of the files, all in one folder.
+        make: returns the arrays of a file, by its index.
+        workers: processes.
+
+    Yields:
+        How many files there are, and the seconds so far.
+    """
+    paths[0].parent.mkdir(parents=True, exist_ok=True)
+    began = time.monotonic()
+    for count, _ in enumerate(DataLoader(_Files(paths, make), batch_size=None, num_workers=workers), start=1):
+        yield count, time.monotonic() - began
 
 
 def warmth(step: int, total: int, *, warmup: int, cooling: float) -> float:

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import torch
-from sklearn.covariance import LedoitWolf
 from torch import Tensor
 
 
@@ -18,15 +17,6 @@ class ShapeDensity:
 
     mean: Tensor
     whitening: Tensor
-
-    @classmethod
-    def of(cls, samples: Tensor) -> "ShapeDensity":
-        """Return the density of samples [n, D]; its covariance is drawn towards a round one as Ledoit and Wolf do."""
-        values = samples.double()
-        covariance = torch.from_numpy(LedoitWolf().fit(values.numpy()).covariance_)
-        lower = torch.linalg.cholesky(covariance)
-        whitening = torch.linalg.solve_triangular(lower, torch.eye(len(lower), dtype=torch.float64), upper=False)
-        return cls(values.mean(0).float(), whitening.float())
 
     def start(self, measures: int) -> tuple[Tensor, Tensor]:
         """Return the mean proportions, ``measures`` of them, and the mean relief, [P] and [S, 4]."""

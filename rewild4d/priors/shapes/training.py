@@ -3,18 +3,18 @@
 A run that was stopped goes on with the animals that are missing, and its result is the same.
 """
 
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import torch
+from sklearn.covariance import LedoitWolf
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
 
 from rewild4d.errors import UserError
-from rewild4d.files import atomic
+from rewild4d.priors.learned.going_on import Arrays, making
 from rewild4d.priors.shapes.density import ShapeDensity
 from rewild4d.priors.shapes.examples import drawn
 from rewild4d.priors.shapes.weights import FILE, save_density
@@ -40,25 +40,6 @@ class TrainingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: int = 0
 
 
-class _Samples(Dataset[Path]):
-    """Files of one animal's shape each; asking for one makes it."""
-
-    def __init__(self, folder: Path, config: TrainingConfig) -> None:
-        self.folder, self.config = folder, config
-
-    def __len__(self) -> int:
-        return self.config.animals
-
-    def __getitem__(self, row: int) -> Path:
-        path = self.folder / f"{self.config.seed}-{row:05d}.npz"
-        if not path.is_file():
-            torch.set_num_threads(1)
-            shape, cost = drawn(np.random.default_rng((STREAM, OWN + self.config.seed, row)))
-            with atomic(path) as scratch, scratch.open("wb") as file:
-                np.savez(file, shape=shape.numpy(), cost=cost)
-        return path
-
-
 def train(folder: Path, config: TrainingConfig, *, workers: int, report: Callable[[str], None]) -> Path:
     """Fit the animals that are missing, then write what all of them say.
 
@@ -75,22 +56,37 @@ def train(folder: Path, config: TrainingConfig, *, workers: int, report: Callabl
         UserError: fewer than two animals can be fitted.
     """
     samples = _fitted(folder / "samples", config, workers, report)
-    save_density(ShapeDensity.of(samples), folder / FILE)
+    save_density(density_of(samples), folder / FILE)
     return folder / FILE
 
 
 def _fitted(folder: Path, config: TrainingConfig, workers: int, report: Callable[[str], None]) -> Tensor:
-    folder.mkdir(parents=True, exist_ok=True)
-    loader = DataLoader(_Samples(folder, config), batch_size=None, num_workers=workers)
-    shapes, costs, began = [], [], time.monotonic()
-    for path in loader:
-        with np.load(path) as kept:
-            shapes.append(torch.from_numpy(kept["shape"]))
-            costs.append(float(kept["cost"]))
-        if len(shapes) % TOLD == 0:
-            report(f"fitted {len(shapes)} of {config.animals} animals, {time.monotonic() - began:.0f} s")
+    paths = [folder / f"{config.seed}-{row:05d}.npz" for row in range(config.animals)]
+    for count, seconds in making(paths, partial(_sample, config), workers):
+        if count % TOLD == 0:
+            report(f"fitted {count} of {config.animals} animals, {seconds:.0f} s")
+    shapes, costs = zip(*map(_read, paths), strict=True)
     good = [shape for shape, cost in zip(shapes, costs, strict=True) if cost <= FAILED]
     report(f"{len(good)} of {config.animals} fits are good; median cost {float(np.median(costs)):.3f}")
     if len(good) < 2:
         raise UserError(f"{folder}: expected 2 good fits or more, got {len(good)}: ask for more animals.")
     return torch.stack(good)
+
+
+def _sample(config: TrainingConfig, row: int) -> Arrays:
+    shape, cost = drawn(np.random.default_rng((STREAM, OWN + config.seed, row)))
+    return {"shape": shape.numpy(), "cost": np.array(cost)}
+
+
+def _read(path: Path) -> tuple[Tensor, float]:
+    with np.load(path) as kept:
+        return torch.from_numpy(kept["shape"]), float(kept["cost"])
+
+
+def density_of(samples: Tensor) -> ShapeDensity:
+    """Return the density of samples [n, D]; its covariance is drawn towards a round one as Ledoit and Wolf do."""
+    values = samples.double()
+    covariance = torch.from_numpy(LedoitWolf().fit(values.numpy()).covariance_)
+    lower = torch.linalg.cholesky(covariance)
+    whitening = torch.linalg.solve_triangular(lower, torch.eye(len(lower), dtype=torch.float64), upper=False)
+    return ShapeDensity(values.mean(0).float(), whitening.float())

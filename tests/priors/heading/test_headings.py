@@ -124,6 +124,8 @@ def test_frames_without_a_mask_are_left_out_and_a_clip_without_any_is_refused() 
     found = read_headings([clip.frames[0], bare, clip.frames[2]], range(3), up, "case", network)
     assert found.timesteps.tolist() == [0, 2] and found.scores.shape == (2, SECTORS)
     assert float(found.scores.mean(0).max()) == pytest.approx(0.0, abs=1e-6)
+    sure = read_headings(clip.frames, range(3), up, "case", Sure(float(middles()[20])).eval())
+    assert 2.5 < float(sure.scores.mean(0).max() - sure.scores.mean(0).min()) < 3.0, "as sure as it learns to be"
     assert torch.allclose(found.left @ up.float(), torch.zeros(2), atol=1e-5)
     with pytest.raises(UserError, match="case: expected at least one mask that shows the animal, but all 1 are empty"):
         read_headings([bare], range(1), up, "case", network)

@@ -18,7 +18,7 @@ from rewild4d.priors.fit import fit_animal
 from rewild4d.priors.shapes import examples, training
 from rewild4d.priors.shapes.density import ShapeDensity
 from rewild4d.priors.shapes.examples import MOMENTS, VIEWS, Seen, drawn, fitted
-from rewild4d.priors.shapes.training import TrainingConfig, train
+from rewild4d.priors.shapes.training import TrainingConfig, density_of, train
 from rewild4d.priors.shapes.weights import package_density, read_density, save_density
 from rewild4d.priors.trained import UNTRAINED, Trained
 from rewild4d.types import Frame
@@ -31,7 +31,7 @@ SIZE = MEASURES + 4 * SECTIONS
 def test_the_penalty_is_the_exponent_of_a_gaussian() -> None:
     torch.manual_seed(0)
     samples = torch.randn(400, 6) @ (torch.eye(6) + 0.3 * torch.randn(6, 6)) + torch.arange(6.0)
-    density = ShapeDensity.of(samples)
+    density = density_of(samples)
     covariance = torch.linalg.inv(density.whitening.T @ density.whitening).double().numpy()
     assert np.allclose(covariance, np.cov(samples.double().numpy().T, bias=True), rtol=0.05, atol=0.2)
     oracle = multivariate_normal(density.mean.double().numpy(), covariance)
