@@ -18,8 +18,8 @@ help:  ## list the targets
 bench: setup  ## make the built-in animals, fit and score them: under 10 minutes on two cores
 	$(BIN)/rewild4d-bench run --method ours --dataset artemis
 
-test: setup  ## run the tests
-	$(BIN)/python -m pytest
+test: setup  ## run the tests, one process a core
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile
 
 faults: setup  ## try every reader on 2,000 damaged files
 	REWILD4D_MUTATIONS=2000 $(BIN)/python -m pytest -s tests/faults
