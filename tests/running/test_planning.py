@@ -32,6 +32,7 @@ def test_every_table_that_ships_can_be_planned() -> None:
     assert set(specs) == {
         "ablation", "artemis", "input-view", "novel-view", "prior-mismatch", "protocols", "sweep-random",
         "reproduction", "reproduction-films", "reproduction-fixed", "reproduction-prior", "tuning",
+        "unseen",
     }  # fmt: skip
     for name, found in specs.items():
         for preset in ("quick", "standard", "paper", "paper-short"):
