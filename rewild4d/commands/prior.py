@@ -99,6 +99,7 @@ class TrainOptions:
             3D).
         animals: of headings and shapes: to learn from; 1600 and 275 where it is left out.
         epochs: of headings: how often their pictures are gone through.
+        two_legged: of headings: share of the animals that have two legs, 0 to 1.
         rounds: of points: of eight animals each; the learning rate falls over all of them.
         seed: of the animals and of the first weights.
         workers: processes that draw (of shapes: fit) animals; of points beside the one that trains; 0 takes the same.
@@ -108,6 +109,7 @@ class TrainOptions:
     part: Literal["headings", "shapes", "points"] = "headings"
     animals: int | None = None
     epochs: int = 10
+    two_legged: float = 0.0
     rounds: int = 2000
     seed: int = 0
     workers: int = 2
@@ -138,6 +140,8 @@ def _train(arguments: list[str]) -> int:
         value = getattr(options, name)
         if value is not None and value < 1:
             raise UserError(f"--{name}: expected 1 or more, got {value}.")
+    if not 0 <= options.two_legged <= 1:
+        raise UserError(f"--two-legged: expected a share from 0 to 1, got {options.two_legged:g}.")
     if options.workers < 0:
         raise UserError(f"--workers: expected 0 or more, got {options.workers}.")
     require_writable_file(options.out / "weights.safetensors")
@@ -157,7 +161,7 @@ def _trained(options: TrainOptions) -> Path:
     if options.part == "shapes":
         samples = shapes.TrainingConfig(seed=options.seed, **animals)
         return shapes.train(options.out, samples, workers=options.workers, report=print)
-    epochs = headings.TrainingConfig(epochs=options.epochs, seed=options.seed, **animals)
+    epochs = headings.TrainingConfig(epochs=options.epochs, seed=options.seed, two_legged=options.two_legged, **animals)
     return headings.train(options.out, epochs, workers=options.workers, report=print)
 
 

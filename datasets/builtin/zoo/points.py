@@ -13,7 +13,7 @@ JOINTS = {"top": 0, "upper": 1, "lower": 2}
 
 
 def body_points(skeleton: Skeleton, plan: Proportions) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """Return points of a four-footed animal at rest.
+    """Return points of an animal at rest; one on two legs lacks those of forelegs.
 
     Args:
         skeleton: at rest in the body frame, metres.
@@ -24,6 +24,8 @@ def body_points(skeleton: Skeleton, plan: Proportions) -> tuple[tuple[str, ...],
     """
     found = _spine(skeleton, plan)
     for end, limb in LEGS.items():
+        if f"{limb}.0.L" not in skeleton.names:
+            continue
         for side, mark in (("left", "L"), ("right", "R")):
             for joint, bone in JOINTS.items():
                 found[f"{end}_{side}_{joint}"] = _start(skeleton, f"{limb}.{bone}.{mark}")

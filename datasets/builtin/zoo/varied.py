@@ -1,10 +1,10 @@
-"""Four-footed animals and motions to train on, drawn anew each time: of neither set of the zoo's seeds.
+"""Animals and motions to train on, drawn anew each time: of neither set of the zoo's seeds.
 
 They are wider than the zoo: kinds are mixed, extras exchanged, gaits have any footfall, stride and speed, and slow
 waves move every chain.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 
@@ -23,11 +23,17 @@ COARSER = 1.6
 SPREAD = 0.16
 """Spread of the proportions about their kinds'; see `bodies.jittered`."""
 FOUR_FOOTED = tuple(name for name, kind in KINDS.items() if kind.proportions.stance == "four")
-EXTRAS = sorted({extra for name in FOUR_FOOTED for extra in KINDS[name].proportions.extras} - {"trunk", "tusks"})
+TWO_LEGGED = tuple(name for name in KINDS if name not in FOUR_FOOTED)
+"""Kinds that animals are mixed of."""
+ADDED = sorted({extra for name in FOUR_FOOTED for extra in KINDS[name].proportions.extras} - {"trunk", "tusks"})
 FOOTFALLS = ((0.0, 0.25, 0.5, 0.75), (0.0, 0.5, 0.5, 0.0), (0.0, 0.0, 0.5, 0.5), (0.0, 0.42, 0.1, 0.54),
              (0.0, 0.5, 0.0, 0.5))  # fmt: skip
 """Touchdown of the feet in a walk, trot, pace, gallop and bound."""
 PLACED = ("stand", "graze", "sit", "rear", "turn", "shake", "jump")
+UPRIGHT = {"two": ("stride", "peck", "hop", "stand"), "wings": ("fly",)}
+"""Motions by stance."""
+LIMBS = ("arms", "wings")
+"""Extras that no animal of such a kind lacks."""
 WAVES = {
     "neck": (9.0, 6.0, 2.0), "head": (9.0, 8.0, 3.0), "tail": (9.0, 8.0, 2.0), "spine": (2.5, 3.0, 2.0),
 }  # fmt: skip
@@ -41,6 +47,7 @@ class VariedAnimal:
     Attributes:
         skeleton: its bones.
         surface: skinned and coloured.
+        stance: as in `bodies.Proportions`.
         size: hip height.
         names: of its points.
         point_bones: bone of each point, int64, [L].
@@ -49,29 +56,30 @@ class VariedAnimal:
 
     skeleton: anatomy.Skeleton
     surface: Surface
+    stance: str
     size: float
     names: tuple[str, ...]
     point_bones: np.ndarray
     points: np.ndarray
 
 
-def draw_animal(rng: np.random.Generator) -> VariedAnimal:
-    """Draw an animal."""
-    plan = _proportions(rng)
+def draw_animal(rng: np.random.Generator, kinds: Sequence[str] = FOUR_FOOTED) -> VariedAnimal:
+    """Draw an animal between two of some kinds, of the stance and with extras of the first."""
+    plan = _proportions(rng, kinds)
     palettes, patterns = (tuple(coats.PALETTES), tuple(coats.PATTERNS))
     coat, _ = coats.draw(rng, palettes, patterns, 0.3 * plan.size * float(np.exp(rng.normal(0, 0.4))))
     body = bodies.body(plan)
     skeleton, surface = building.dressed(replace(body, cell=COARSER * body.cell), coat, PAINTS)
-    return VariedAnimal(skeleton, surface, plan.size, *body_points(skeleton, plan))
+    return VariedAnimal(skeleton, surface, plan.stance, plan.size, *body_points(skeleton, plan))
 
 
-def _proportions(rng: np.random.Generator) -> bodies.Proportions:
-    one, two = (KINDS[str(name)].proportions for name in rng.choice(FOUR_FOOTED, 2))
+def _proportions(rng: np.random.Generator, kinds: Sequence[str]) -> bodies.Proportions:
+    one, two = (KINDS[str(name)].proportions for name in rng.choice(kinds, 2))
     amount = float(rng.uniform(0.0, 0.6)) if rng.random() < 0.6 else 0.0
     plan = bodies.jittered(mixed(one, two, amount), rng, SPREAD)
-    extras = [extra for extra in one.extras if rng.random() < 0.8]
-    if rng.random() < 0.15:
-        extras.append(str(rng.choice(EXTRAS)))
+    extras = [extra for extra in one.extras if extra in LIMBS or rng.random() < 0.8]
+    if one.stance == "four" and rng.random() < 0.15:
+        extras.append(str(rng.choice(ADDED)))
     paws = float(np.clip(plan.paws + rng.normal(0, 0.15), 0.0, 1.0))
     pitch = plan.pitch + float(rng.normal(0, 3.0))
     tail = plan.tail * float(np.exp(rng.normal(0, 0.3)))
@@ -93,7 +101,7 @@ def mixed(one: bodies.Proportions, two: bodies.Proportions, amount: float) -> bo
 def draw_clip(animal: VariedAnimal, frames: int, rng: np.random.Generator) -> np.ndarray:
     """Draw a motion and return rest-to-posed transforms of all bones in the body frame, float64, [frames, J, 4, 4]."""
     steps = _timeline(frames, rng)
-    first, second = _motion(rng), _motion(rng)
+    first, second = _motion(animal.stance, rng), _motion(animal.stance, rng)
     change = _change(frames, rng)
     adding = _waves(frames, rng)
     postures = []
@@ -124,7 +132,11 @@ def _change(frames: int, rng: np.random.Generator) -> np.ndarray:
     return np.asarray(share * share * (3 - 2 * share))
 
 
-def _motion(rng: np.random.Generator) -> Motion:
+def _motion(stance: str, rng: np.random.Generator) -> Motion:
+    if stance == "two" and rng.random() < 0.3:
+        return _gait(rng)
+    if stance != "four":
+        return motions.MOTIONS[str(rng.choice(UPRIGHT[stance]))]
     kind = rng.random()
     if kind < 0.35:
         name = str(rng.choice(("walk", "trot", "gallop")))

@@ -3,19 +3,24 @@
 import numpy as np
 import torch
 
+from rewild4d.datasets.builtin.zoo.varied import FOUR_FOOTED, TWO_LEGGED
 from rewild4d.priors.heading.pictures import Pictures, ground_axes, said, shrunk, to_bytes
 from rewild4d.priors.learned.examples import draw_sequences
-from rewild4d.priors.learned.points import NAMES
+from rewild4d.priors.learned.points import SPINE
 
 SEQUENCES, FRAMES = 16, 4
 """Drawn of each animal."""
 
 
-def drawn(rng: np.random.Generator) -> Pictures:
-    """Draw pictures of one random animal under random cameras, `SEQUENCES` * `FRAMES`."""
-    found = draw_sequences(rng, SEQUENCES, FRAMES)
+def drawn(rng: np.random.Generator, two_legged: float = 0.0) -> Pictures:
+    """Draw pictures of one random animal under random cameras, `SEQUENCES` * `FRAMES`.
+
+    A share ``two_legged`` of the animals has two legs.
+    """
+    kinds = TWO_LEGGED if two_legged and rng.random() < two_legged else FOUR_FOOTED
+    found = draw_sequences(rng, SEQUENCES, FRAMES, kinds=kinds, names=SPINE)
     rotations, points = (value.flatten(0, 1).double() for value in (found.rotations, found.points))
-    ahead = points[:, NAMES.index("withers")] - points[:, NAMES.index("hips")]
+    ahead = points[:, SPINE.index("withers")] - points[:, SPINE.index("hips")]
     left, away = ground_axes(rotations[:, :, 1])
     known = found.known.repeat_interleave(FRAMES)
     azimuths = torch.atan2((ahead * left).sum(1), (ahead * away).sum(1))

@@ -1,4 +1,4 @@
-"""A network that reads from one small masked picture which way a four-footed animal heads.
+"""A network that reads from one small masked picture which way an animal heads.
 
 Headings are angles about the up direction, from the direction in which the camera looks (0: away from it) to the
 camera's left (a quarter turn), in (-pi, pi]. The network gives the share of each of `SECTORS` even sectors, since a

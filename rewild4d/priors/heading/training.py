@@ -47,11 +47,13 @@ class TrainingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         animals: to learn from.
         epochs: how often their pictures are gone through.
         seed: of the animals and of the weights.
+        two_legged: share of the animals that have two legs.
     """
 
     animals: int = 1600
     epochs: int = 10
     seed: int = 0
+    two_legged: float = 0.0
 
 
 def train(folder: Path, config: TrainingConfig, *, workers: int, report: Callable[[str], None]) -> Path:
@@ -94,7 +96,8 @@ def _drawn(folder: Path, config: TrainingConfig, workers: int, report: Callable[
 
 def _part(config: TrainingConfig, row: int) -> Arrays:
     numbers = range(row * PART, min((row + 1) * PART, config.animals))
-    made = joined([drawn(np.random.default_rng((STREAM, config.seed, number))) for number in numbers])
+    streams = [np.random.default_rng((STREAM, config.seed, number)) for number in numbers]
+    made = joined([drawn(stream, config.two_legged) for stream in streams])
     return {name: value.numpy() for name, value in vars(made).items()}
 
 

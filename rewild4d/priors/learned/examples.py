@@ -1,12 +1,14 @@
 """Draw examples to train on: sequences of random animals under random cameras, and where their points are."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter
 
 from rewild4d.datasets import surface_nets
 from rewild4d.datasets.builtin.gait import rotation
-from rewild4d.datasets.builtin.zoo.varied import VariedAnimal, draw_animal, draw_clip
+from rewild4d.datasets.builtin.zoo.varied import FOUR_FOOTED, VariedAnimal, draw_animal, draw_clip
 from rewild4d.datasets.rigs.animal import Surface
 from rewild4d.priors.learned.drawing import draw
 from rewild4d.priors.learned.pictures import LENGTH, LEVEL, MARGIN, SIZE, Examples, joined, looking_at, normalised
@@ -17,16 +19,23 @@ CLIPS = 8
 """Sequences of each animal."""
 
 
-def draw_sequences(rng: np.random.Generator, count: int = CLIPS, length: int = LENGTH) -> Examples:
-    """Draw ``count`` sequences of one random animal."""
-    animal = draw_animal(rng)
-    return joined([_sequence(animal, length, rng) for _ in range(count)])
+def draw_sequences(
+    rng: np.random.Generator,
+    count: int = CLIPS,
+    length: int = LENGTH,
+    *,
+    kinds: Sequence[str] = FOUR_FOOTED,
+    names: Sequence[str] = NAMES,
+) -> Examples:
+    """Draw ``count`` sequences of one random animal between two of some kinds, with the named points."""
+    animal = draw_animal(rng, kinds)
+    return joined([_sequence(animal, length, names, rng) for _ in range(count)])
 
 
-def _sequence(animal: VariedAnimal, length: int, rng: np.random.Generator) -> Examples:
+def _sequence(animal: VariedAnimal, length: int, names: Sequence[str], rng: np.random.Generator) -> Examples:
     transforms = draw_clip(animal, length, rng)
     vertices = [animal.surface.posed(moved) for moved in transforms]
-    order = [animal.names.index(name) for name in NAMES]
+    order = [animal.names.index(name) for name in names]
     homogeneous = np.concatenate((animal.points, np.ones((len(animal.points), 1))), axis=1)[order]
     points = np.einsum("tlab,lb->tla", transforms[:, animal.point_bones[order], :3], homogeneous)
     shades = _shades(animal.surface, rng)

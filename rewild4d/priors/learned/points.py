@@ -6,6 +6,8 @@ from rewild4d.priors.landmarks import LANDMARKS
 
 NAMES = tuple(name for name in LANDMARKS if name not in ("jaw", "eye"))
 """Points of `LANDMARKS`."""
+SPINE = NAMES[:9]
+"""Those that animals on two legs have too."""
 MIRRORED = {
     name: name.replace("_left_", "_?_").replace("_right_", "_left_").replace("_?_", "_right_") for name in NAMES
 }

@@ -86,6 +86,13 @@ def test_random_animals_are_drawn_with_their_headings() -> None:
     assert solid[aside < 0.4].mean() < solid[aside > 0.9].mean() or (aside < 0.4).sum() < 3
 
 
+def test_animals_on_two_legs_are_drawn_where_a_share_is_asked_for() -> None:
+    four, two = drawn(np.random.default_rng(3)), drawn(np.random.default_rng(3), two_legged=1.0)
+    assert two.shown.shape == four.shown.shape and not torch.equal(two.shown, four.shown)
+    assert torch.equal(four.shown, drawn(np.random.default_rng(3), two_legged=0.0).shown)
+    assert two.azimuths.isfinite().all()
+
+
 def test_the_network_of_the_package_reads_animals_that_it_did_not_learn_from() -> None:
     shown = [drawn(np.random.default_rng((1, k))) for k in range(4)]
     away = torch.cat(

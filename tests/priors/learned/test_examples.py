@@ -14,7 +14,7 @@ from rewild4d.datasets.builtin.zoo.points import body_points
 from rewild4d.priors.landmarks import LANDMARKS
 from rewild4d.priors.learned import examples, pictures
 from rewild4d.priors.learned.drawing import draw
-from rewild4d.priors.learned.points import MIRRORED, NAMES, root_of
+from rewild4d.priors.learned.points import MIRRORED, NAMES, SPINE, root_of
 
 SQUARE = (np.array(((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))), np.array(((0, 1, 2), (0, 2, 3)), np.int32))
 """The whole picture as two triangles: columns and rows, and faces."""
@@ -77,7 +77,7 @@ def test_a_sequence_is_drawn_alike_for_one_seed_and_differs_for_another() -> Non
 def test_an_animal_is_the_same_in_every_process() -> None:
     """Python's hashes differ from process to process, and with them the order of a set."""
     code = "import numpy; from rewild4d.datasets.builtin.zoo import varied as v; "
-    code += "print([v._proportions(numpy.random.default_rng(k)) for k in range(20)])"
+    code += "print([v._proportions(numpy.random.default_rng(k), v.FOUR_FOOTED) for k in range(20)])"
     said = {
         subprocess.run(
             [sys.executable, "-c", code], env=os.environ | {"PYTHONHASHSEED": seed}, capture_output=True, check=True
@@ -94,6 +94,16 @@ def test_points_lie_on_the_animal_where_the_camera_sees_them() -> None:
     masks = torch.nn.functional.max_pool2d(made.pictures[:, :, 0], 7, 1, 3)
     rows = torch.arange(4)[:, None, None], torch.arange(4)[None, :, None]
     assert masks[(*rows, pixels[..., 1], pixels[..., 0])].mean() > 0.9
+    assert root_of(made.points.numpy())[..., 2] == pytest.approx(0, abs=1e-5)
+
+
+def test_an_animal_on_two_legs_has_the_points_of_the_spine_alone() -> None:
+    rng = np.random.default_rng(2)
+    animals_drawn = [varied.draw_animal(rng, varied.TWO_LEGGED) for _ in range(4)]
+    assert {animal.stance for animal in animals_drawn} <= {"two", "wings"}
+    assert all({*SPINE} <= {*animal.names} and "front_left_foot" not in animal.names for animal in animals_drawn)
+    made = examples.draw_sequences(rng, 2, 3, kinds=varied.TWO_LEGGED, names=SPINE)
+    assert made.points.shape == (2, 3, len(SPINE), 3)
     assert root_of(made.points.numpy())[..., 2] == pytest.approx(0, abs=1e-5)
 
 
