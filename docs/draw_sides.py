@@ -1,16 +1,18 @@
-"""Draw a contact sheet of fits: each animal from four sides, as two methods made it.
+"""Draw a contact sheet of fits: each animal from four sides, as several methods made it.
 
-    python docs/draw_sides.py runs --protocol artemis-fixed-256-v4 --methods prior-only ours --out docs/sides.webp
+    python docs/draw_sides.py runs --protocol artemis-fixed-256-v4 --methods prior-only ours --out sides.webp
 
-takes orbit.png of every run below `runs`, a row a case and a column a method; of several seeds the first.
+takes orbit.png of the runs below `runs`, a row a case and a column a method; of several seeds the lowest.
 """
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
+
+from rewild4d.errors import UserError
+from rewild4d.leaderboard.records import find_records
 
 WIDTH = 640
 """Of one picture, pixels."""
@@ -25,44 +27,51 @@ def main() -> int:
     parser.add_argument("--methods", nargs="+", default=["prior-only", "ours"])
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
-    found = pictures(given.runs, given.protocol, given.methods)
-    if not found:
-        wanted = " and ".join(given.methods)
-        print(f"{given.runs}: expected finished runs of {wanted} under {given.protocol}, found none.", file=sys.stderr)
+    try:
+        found = pictures(given.runs, given.protocol, given.methods)
+    except UserError as error:
+        print(error, file=sys.stderr)
         return 2
-    sheet([[row[method] for method in given.methods] for row in found.values()], list(found), given.methods).save(
-        given.out, quality=80
-    )
+    sheet(found).save(given.out)
     print(f"{len(found)} cases: {given.out}")
     return 0
 
 
 def pictures(runs: Path, protocol: str, methods: list[str]) -> dict[str, dict[str, Path]]:
-    """Return each case's picture by method, of cases that all methods have."""
-    found: dict[str, dict[str, tuple[int, Path]]] = {}
-    for path in sorted(runs.rglob("record.json")):
-        record, picture = json.loads(path.read_text()), path.parent / "orbit.png"
-        if record["protocol"]["name"] != protocol or record["method"] not in methods or not picture.is_file():
-            continue
-        case = found.setdefault(record["case"], {})
-        case[record["method"]] = min(case.get(record["method"], (record["seed"], picture)), (record["seed"], picture))
-    whole = {case: each for case, each in sorted(found.items()) if len(each) == len(methods)}
-    return {case: {method: picture for method, (_, picture) in each.items()} for case, each in whole.items()}
+    """Return each case's picture by method, of the cases that all methods have.
+
+    Raises:
+        UserError: there is no such case, or a record cannot be read.
+    """
+    found: dict[str, dict[str, Path]] = {}
+    for folder, record in sorted(find_records(runs), key=lambda each: -each[1].seed):
+        picture = folder / "orbit.png"
+        if record.protocol["name"] == protocol and record.method in methods and picture.is_file():
+            found.setdefault(record.case, {})[record.method] = picture
+    whole = {case: {m: found[case][m] for m in methods} for case in sorted(found) if {*methods} == {*found[case]}}
+    if not whole:
+        wanted = " and ".join(methods)
+        raise UserError(f"{runs}: expected pictures of {wanted} under {protocol} of one case or more, found none.")
+    return whole
 
 
-def sheet(rows: list[list[Path]], cases: list[str], methods: list[str]) -> Image.Image:
-    """Lay pictures out, a row a case."""
-    images = [[Image.open(path).convert("RGB") for path in row] for row in rows]
-    images = [[image.resize((WIDTH, image.height * WIDTH // image.width)) for image in row] for row in images]
-    heights = [TITLE + max(image.height for image in row) for row in images]
-    page = Image.new("RGB", (WIDTH * len(methods), sum(heights)), "white")
+def sheet(found: dict[str, dict[str, Path]]) -> Image.Image:
+    """Lay pictures out, a row a case and a column a method."""
+    rows = [(case, [(method, _fitted(path)) for method, path in each.items()]) for case, each in found.items()]
+    heights = [TITLE + max(image.height for _, image in row) for _, row in rows]
+    page = Image.new("RGB", (WIDTH * len(rows[0][1]), sum(heights)), "white")
     draw, font, top = ImageDraw.Draw(page), ImageFont.load_default(14), 0
-    for row, case, height in zip(images, cases, heights, strict=True):
-        for column, (image, method) in enumerate(zip(row, methods, strict=True)):
+    for (case, row), height in zip(rows, heights, strict=True):
+        for column, (method, image) in enumerate(row):
             page.paste(image, (column * WIDTH, top + TITLE))
             draw.text((column * WIDTH + 6, top + 2), f"{case}: {method}", "black", font)
         top += height
     return page
+
+
+def _fitted(path: Path) -> Image.Image:
+    image = Image.open(path).convert("RGB")
+    return image.resize((WIDTH, image.height * WIDTH // image.width))
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ FOUR_FOOTED = tuple(name for name, kind in KINDS.items() if kind.proportions.sta
 TWO_LEGGED = tuple(name for name in KINDS if name not in FOUR_FOOTED)
 """Kinds that animals are mixed of."""
 ADDED = sorted({extra for name in FOUR_FOOTED for extra in KINDS[name].proportions.extras} - {"trunk", "tusks"})
+"""Extras that any four-footed animal may have besides its own."""
 FOOTFALLS = ((0.0, 0.25, 0.5, 0.75), (0.0, 0.5, 0.5, 0.0), (0.0, 0.0, 0.5, 0.5), (0.0, 0.42, 0.1, 0.54),
              (0.0, 0.5, 0.0, 0.5))  # fmt: skip
 """Touchdown of the feet in a walk, trot, pace, gallop and bound."""
