@@ -92,6 +92,10 @@ class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """Fraction at which the jitter ends."""
     tied: bool = False
     """Derive the pose of a flipped image by mirroring that of the image (see baselines/presets/ours.toml)."""
+    turns: bool = False
+    """Let each frame turn its joints a little beside the network (`ours.turns`; docs/experiments/tuning.md)."""
+    turns_from: Share = 0.3
+    """Fraction from which the turns learn."""
 
     def __post_init__(self) -> None:
         _require_heads(self.width, self.heads)
@@ -195,6 +199,8 @@ class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """Logits of the field."""
     pose: Rate = (6e-4, 1e-5)
     """Anchors and pose network."""
+    turns: Weight = 1e-4
+    """Turns of each frame's joints (`pose.turns`), radians."""
     rise: Weight = 0.02
     """Fraction over which the networks' rates rise from zero, since Adam's first steps would undo the warm-up."""
     deform: Rate = (8e-4, 1.6e-6)

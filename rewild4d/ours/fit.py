@@ -48,6 +48,8 @@ class Training(GaussianTraining):
             "pose": list(model.network.parameters()),
             "deform": list(model.deform.parameters()),
         }
+        if model.turns is not None:
+            groups["turns"] = list(model.turns.parameters())
         model.field.logits.requires_grad_(config.skinning.learn)
         super().__init__(model, groups, config, supervision, generator)
         self.marks: Marks | None = None
@@ -61,6 +63,8 @@ class Training(GaussianTraining):
 
     def rate(self, name: str, progress: float) -> float:
         rates = self.config.rates
+        if name == "turns":
+            return rates.turns if progress >= self.config.pose.turns_from else 0.0
         first, last = getattr(rates, name)
         return exponential(first, last, progress) * ramp(progress, 0.0, rates.rise)
 
@@ -115,6 +119,9 @@ class Training(GaussianTraining):
         if given.blend is not None:
             poses = blend_poses(poses, *given.prior_pose, given.blend)
         pose, transforms, skeleton = posture(model, poses, given.row, config.geometry, given.gaps)
+        if model.turns is not None:
+            pose = model.turned(pose, given.codes[given.row], given.flipped[given.row])
+            transforms = model.transforms(pose)
         probabilities = model.field.probabilities()
         delta = config.geometry.tv_delta if given.varies else None
         weights, variation = model.field.sample_and_vary(probabilities, model.gaussians.means, delta)
@@ -244,7 +251,7 @@ def train(
     generator = torch.Generator().manual_seed(seed)
     supervision = Supervision(clip, prior, config.image_size, device, config.loss.mean_over)
     small = Supervision(clip, prior, min(config.image_size, config.warmup.size), device)
-    model = build_model(config, prior, generator).to(device)
+    model = build_model(config, prior, generator, supervision.frame_times()).to(device)
     warmup = WarmUp(model, small, prior, config, generator)
     main = Training(model, supervision, config, generator)
     identity = fit_digest(config, clip, prior, seed)

@@ -14,7 +14,8 @@ from rewild4d.ours.inputs import Scalar
 from rewild4d.ours.pose import Pose, PoseNetwork, joint_transforms, time_code
 from rewild4d.ours.skinning import SkinningField, build_field
 from rewild4d.ours.symmetry import Key, Supervision
-from rewild4d.transforms import skin_points, skin_quats
+from rewild4d.ours.turns import Turns
+from rewild4d.transforms import quat_multiply, skin_points, skin_quats
 from rewild4d.types import Prior
 
 
@@ -22,6 +23,7 @@ class Model(nn.Module):
     """Canonical Gaussians, skinning field, pose network and deformation network, in the object frame.
 
     Attributes:
+        turns: turns of each frame's joints beside the pose network, or None.
         pivots: inner end of each bone at rest, [J, 3].
         mirror: bone on the other side, [J].
         parents: -1 for a root, [J].
@@ -40,6 +42,7 @@ class Model(nn.Module):
         parents: Tensor,
         mirror: Tensor,
         generator: torch.Generator,
+        times: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.config = config
@@ -47,6 +50,10 @@ class Model(nn.Module):
         self.network = PoseNetwork(len(parents), config.pose, generator)
         parts = config.pose.anchor_size if config.pose.anchors else len(parents)
         self.deform = DeformNetwork(parts, config.pose.width, config.deform, generator)
+        self.turns: Turns | None = None
+        if config.pose.turns:
+            assert times is not None, "turns need the frames' times"
+            self.turns = Turns(times, len(parents), config.pose.tied)
         self.register_buffer("pivots", pivots)
         self.register_buffer("mirror", mirror)
         self.register_buffer("parents", parents)
@@ -54,21 +61,30 @@ class Model(nn.Module):
     def pose(self, times: Tensor, keys: list[Key]) -> Pose:
         """Compute poses of views at (jittered) times (i + 1) / T, [B]; where tied, mirror images share a pose."""
         codes, flipped = self.codes(times, keys)
-        return self.pose_of(codes.to(self.pivots), flipped.to(self.pivots.device))
+        codes, flipped = codes.to(self.pivots), flipped.to(self.pivots.device)
+        return self.turned(self.pose_of(codes, flipped), codes, flipped)
 
     def codes(self, times: Tensor, keys: list[Key]) -> tuple[Tensor, Tensor]:
         """Return time codes [B, E] of views at times [B], and which of them are mirror images, boolean, [B]."""
         config = self.config.pose
         view = torch.tensor([float(key.view) for key in keys])
         group = torch.tensor([float(key.group) for key in keys])
-        sign = group if config.encoding == "group" else view
+        sign, flipped = group if config.encoding == "group" else view, view < 0
         if config.tied:
             sign = view = torch.ones(len(keys))
-        return time_code(times, sign, view, config.frequencies, config.explicit_group), view < 0
+        return time_code(times, sign, view, config.frequencies, config.explicit_group), flipped
 
     def pose_of(self, codes: Tensor, flipped: Tensor) -> Pose:
-        """Compute poses of time codes [B, E]; where tied, those of mirror images are mirrored by ``flipped`` [B]."""
+        """Compute the network's poses of time codes [B, E]; where tied, those of mirror images are mirrored by
+        ``flipped`` [B]."""
         return self.network(codes, flipped, self.mirror) if self.config.pose.tied else self.network(codes)
+
+    def turned(self, pose: Pose, codes: Tensor, flipped: Tensor) -> Pose:
+        """Turn the joints of poses of time codes [B, E] by what their frames have beside the network."""
+        if self.turns is None:
+            return pose
+        turns = self.turns(codes[:, 0].abs(), flipped, self.mirror)
+        return pose._replace(quats=quat_multiply(turns, pose.quats))
 
     def transforms(self, pose: Pose) -> Tensor:
         """Return rest -> posed transforms of a batch of poses, [B, J, 4, 4]."""
@@ -115,9 +131,12 @@ def sightings(model: Model, supervision: Supervision, mirrored: float = 0.0) -> 
         yield Sighting(key, share, model.skin(weights, pose.quats[0], model.transforms(pose)[0])[1])
 
 
-def build_model(config: Config, prior: Prior, generator: torch.Generator) -> Model:
-    """Build the initial model: Gaussians on the prior's rest surface, the field filled from its weights."""
+def build_model(config: Config, prior: Prior, generator: torch.Generator, times: Tensor | None = None) -> Model:
+    """Build the initial model: Gaussians on the prior's rest surface, the field filled from its weights.
+
+    `pose.turns` needs the ``times`` of the clip's frames for the time code (`Supervision.frame_times`), [T].
+    """
     values = initial_gaussians(prior, config.canonical, generator, config.prior.shape)
     field = build_field(prior.vertices.float(), prior.weights.float(), prior.mirror.long(), config.skinning)
     skeleton = (prior.bones[:, 0].float(), prior.parents.long(), prior.mirror.long())
-    return Model(config, Gaussians(values, config.canonical.max_scale), field, *skeleton, generator)
+    return Model(config, Gaussians(values, config.canonical.max_scale), field, *skeleton, generator, times)

@@ -122,6 +122,8 @@ def _from_state(path: Path, state: dict[str, Any], config: Config, device: torch
     parts = config.pose.anchor_size if config.pose.anchors else sizes["J"]
     inputs = parts + 3 * (1 + 2 * config.deform.frequencies) + 4 + 3
     require_tensors(path, saved, {"deform.query.weight": (config.deform.width, inputs)}, {})
+    if config.pose.turns:
+        require_tensors(path, saved, {"turns.vectors": (2, "T", "J", 3), "turns.times": ("T",)}, sizes)
     require_skeleton(path, saved["parents"], saved["mirror"])
     require_skeleton(path, saved["parents"], saved["field.mirror"])
     gaussians = Gaussians.from_state(saved, config.canonical.max_scale)
@@ -130,7 +132,7 @@ def _from_state(path: Path, state: dict[str, Any], config: Config, device: torch
     if field.resolution < 2 or field.resolution**3 != len(logits):
         raise UserError(f"{path}: expected 'field.logits' of a cube of voxels, got {len(logits)} rows.")
     skeleton = (saved["pivots"], saved["parents"], saved["mirror"])
-    model = Model(config, gaussians, field, *skeleton, torch.Generator().manual_seed(0))
+    model = Model(config, gaussians, field, *skeleton, torch.Generator().manual_seed(0), saved.get("turns.times"))
     model.load_state_dict(saved)
     cameras = tuple(
         None if item is None else Camera(item["world_to_camera"], item["intrinsics"], *item["size"])

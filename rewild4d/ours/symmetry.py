@@ -110,6 +110,10 @@ class Supervision:
         last = float(self.positions[-1])
         return torch.tensor([(float(self.positions[key.frame]) + 1 + noise) / (last + 1) for key in keys])
 
+    def frame_times(self) -> Tensor:
+        """Return the times of the clip's frames for the time code, in (0, 1], [T]."""
+        return self.code_times([Key(1, 1, index) for index in range(self.frames)])
+
     def pixel(self) -> float:
         """Return the side of a pixel at the object frame's origin, median over the frames, in object units."""
         cameras = [self._targets[Key(1, 1, index)].camera for index in range(self.frames)]

@@ -62,7 +62,8 @@ def short(preset: str, **changes: Any) -> Config:
 def training(config: Config, device: torch.device = CPU) -> Training:
     case, generator = tiny_case(), torch.Generator().manual_seed(0)
     supervision = Supervision(case.clip, case.prior, config.image_size, device, config.loss.mean_over)
-    return Training(build_model(config, case.prior, generator).to(device), supervision, config, generator)
+    model = build_model(config, case.prior, generator, supervision.frame_times()).to(device)
+    return Training(model, supervision, config, generator)
 
 
 def film(config: Config) -> Config:
@@ -71,7 +72,19 @@ def film(config: Config) -> Config:
     return msgspec.structs.replace(config, prior=prior, geometry=Geometry(smooth_size=32))
 
 
-CONFIGS = {"paper": short("paper"), "standard": short("standard"), "film": film(short("paper"))}
+def turning(config: Config) -> Config:
+    """With turns of each frame's joints, and poses that mirror images share."""
+    return msgspec.structs.replace(
+        config, pose=msgspec.structs.replace(config.pose, turns=True, turns_from=0.2, tied=True)
+    )
+
+
+CONFIGS = {
+    "paper": short("paper"),
+    "standard": short("standard"),
+    "film": film(short("paper")),
+    "turns": turning(short("standard")),
+}
 
 
 @pytest.fixture
@@ -88,7 +101,8 @@ def test_recorded_steps_are_the_plain_ones(name: str, torch_alone: None) -> None
     for index in range(STEPS):
         wanted, found = plain.step(index), recorded.step(index)
         assert wanted.keys() == found.keys()
-        assert all(found[key] == pytest.approx(value, rel=1e-4, abs=1e-6) for key, value in wanted.items()), index
+        # Gradients are clipped in another order: rounding that 40 steps of Adam carry on, 1e-4 on some CPUs.
+        assert all(found[key] == pytest.approx(value, rel=1e-3, abs=1e-6) for key, value in wanted.items()), index
     assert recorder.recorded >= 2 and len(plain.gaussians) > 300, "no graph, or no change of density"
     for (key, wanted), found in zip(plain.model.named_parameters(), recorded.model.parameters(), strict=True):
         assert (wanted - found).detach().norm() <= 1e-2 * wanted.detach().norm() + 1e-6, key

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from twins import check_twins, leaves, normal, same_on_any_threads, unit
 
+from rewild4d.kernels.switch import VARIABLE
 from rewild4d.ours.canonical import Gaussians
 from rewild4d.ours.config import Config, Deform
 from rewild4d.ours.config import Pose as PoseConfig
@@ -118,6 +119,20 @@ def test_poses_of_views(tied: bool) -> None:
         return list(own.pose(times.to(dtype), keys)), dict(own.network.named_parameters())
 
     check_twins(make)
+
+
+@pytest.mark.parametrize("kernels", ["auto", "torch"])
+def test_tied_poses_of_a_mirror_image_are_those_of_the_image_mirrored(
+    kernels: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(VARIABLE, kernels)
+    own = model(pose=msgspec.structs.replace(SMALL, tied=True))
+    times = torch.tensor((0.25, 0.25))
+    for group in (1, -1):
+        pose = own.pose(times, [Key(group, 1, 0), Key(group, -1, 0)])
+        for wanted, found in zip(pose.mirrored(own.mirror), pose, strict=True):
+            torch.testing.assert_close(found[1], wanted[0])
+        assert (pose.quats[1] - pose.quats[0]).abs().max() > 1e-3, "left and right are alike"
 
 
 def batch_of_poses(dtype: torch.dtype, batch: int) -> dict[str, Tensor]:
