@@ -251,6 +251,8 @@ class Footage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """Instead of `rates.pose`."""
     deform: Rate = (2e-3, 1e-5)
     """Instead of `rates.deform`."""
+    turns: bool = False
+    """Instead of `pose.turns`."""
     cameras: Literal["both", "own"] = "own"
     """Instead of `cameras`: fits of a film and of its mirror image disagree by some pixels."""
 
@@ -274,6 +276,8 @@ class OneSide(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """Instead of `prior.untold`."""
     temporal: Weight = 5.0
     """Instead of `geometry.temporal`."""
+    turns: bool = False
+    """Instead of `pose.turns`: what one side tells of a turn may be false."""
     colors_epsilon: Positive = 1e-4
     """Instead of `rates.colors_epsilon`."""
     cap: Count = 16_000

@@ -41,7 +41,8 @@ def test_what_is_beyond_the_paper_differs_from_standard_in_these_alone() -> None
     own = msgspec.structs.replace
     assert beyond == own(
         standard,
-        geometry=own(standard.geometry, limb_plane=100.0, sideways=1000.0, temporal=2.0, still=0.0),
+        pose=own(standard.pose, turns=True),
+        geometry=own(standard.geometry, limb_plane=100.0, sideways=1000.0, temporal=0.2, still=0.0),
         loss=own(standard.loss, isolated=False),
         prior=own(standard.prior, pull_turn=0.07),
         rates=own(standard.rates, deform=(2e-3, 1e-5)),
@@ -55,9 +56,11 @@ def test_where_one_side_is_seen_beyond_keeps_what_the_prior_knows_of_the_others(
     beyond = for_clip_of_ours(load_preset("ours", Config, "beyond"), 24)
     held = for_clip_of_ours(load_preset("ours", Config, "beyond"), 24, one_sided=True)
     changed = {name for name in beyond.__struct_fields__ if getattr(beyond, name) != getattr(held, name)}
-    assert changed == {"canonical", "skin", "prior", "rates", "density", "geometry", "one_side"}
+    assert changed == {"canonical", "skin", "pose", "prior", "rates", "density", "geometry", "one_side"}
     assert (held.canonical.samples, held.density.cap, held.geometry.temporal) == (12_000, 16_000, 5.0)
     assert held.skin.holds and held.prior.untold and not beyond.skin.holds and not beyond.prior.untold
+    assert beyond.pose.turns and not held.pose.turns, "one side does not tell turns"
+    assert not for_clip_of_ours(load_preset("ours", Config, "beyond"), 24, filmed=True).pose.turns
     assert for_clip_of_ours(held, 300, one_sided=True).skin == held.skin, "a saved fit stays as it is"
 
 
