@@ -16,7 +16,7 @@ from rewild4d.machine import code_of, machine, peak_memory_mib, pick_device
 from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_dataset, load_method
 from rewild4d.running import provenance
-from rewild4d.running.runner import STAMP, fit_seconds
+from rewild4d.running.clock import STAMP, fit_seconds
 from rewild4d.running.scoring import score
 from rewild4d.running.workers import share_cores, this_process
 

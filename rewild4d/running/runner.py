@@ -1,10 +1,8 @@
 """Turn a plan into records: load, prior, fit, evaluate, write; finished runs are skipped, killed ones resume."""
 
 import contextlib
-import json
 import shutil
 import sys
-import time
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,12 +16,11 @@ import msgspec
 import torch
 
 from rewild4d.contracts import DatasetReader, Reconstruction
-from rewild4d.errors import DiskFull, UserError, bounded, reason, unknown_name
+from rewild4d.errors import DiskFull, UserError, bounded, unknown_name
 from rewild4d.evaluation.coverage import coverage
 from rewild4d.evaluation.networks import may_be_scored_now
 from rewild4d.evaluation.protocol import Protocol
-from rewild4d.files import held, not_written, remove_leftovers, write_text
-from rewild4d.foreign.texts import read_json
+from rewild4d.files import held, not_written, remove_leftovers
 from rewild4d.kernels.switch import chosen_kernels
 from rewild4d.leaderboard.records import FILE, SCHEMA, RunRecord, Timing, make_run_id, read_record, write_record
 from rewild4d.machine import code_of, machine, peak_memory_mib
@@ -33,12 +30,10 @@ from rewild4d.progress import Progress
 from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_method
 from rewild4d.running import provenance
+from rewild4d.running.clock import STAMP, Clock, fit_seconds
 from rewild4d.running.scoring import score
 from rewild4d.running.workers import Workers, share_cores, this_process, usable_cores
 from rewild4d.types import Case, Clip, Prior, Truth
-
-STAMP = "fit.json"
-"""Duration of the fit, written last, beside a saved reconstruction."""
 
 
 @dataclass(frozen=True)
@@ -268,15 +263,14 @@ class Job:
             work = self.folder / "work"
             work.mkdir(parents=True, exist_ok=True)
             progress = Progress(f"{self.title}: fit", self.folder / "log.jsonl")
-            begin = time.perf_counter()
+            clock = Clock(work)
             reconstruction = method.fit(
                 case.clip, case.prior, config=self.entry.config, seed=self.seed, device=self.plan.device,
                 log=progress, workdir=work,
             )  # fmt: skip
             progress.close()
             save_reconstruction(reconstruction, saved)
-            stamp = json.dumps({"seconds_since_last_start": time.perf_counter() - begin}) + "\n"
-            write_text(self.folder / STAMP, stamp)
+            clock.stamp(self.folder)
         return method.load(saved, self.plan.device), fit_seconds(self.folder)
 
     def _is_good(self) -> bool:
@@ -311,16 +305,6 @@ class Job:
 def run_folder(out: Path, protocol: str, case: str, method: str, preset: str, seed: int, run_id: str) -> Path:
     """Return the folder of a run below the folder of all runs."""
     return out / protocol / case.replace("/", "__") / f"{method}-{preset}-seed{seed}-{run_id[:8]}"
-
-
-def fit_seconds(folder: Path) -> float:
-    """Read how long the finished fit in a run's folder took since its last start."""
-    try:
-        return float(read_json(folder / STAMP, "the time of a finished fit")["seconds_since_last_start"])
-    except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise UserError(
-            f"{folder / STAMP}: expected the time of a finished fit, got a damaged file ({reason(error)})."
-        ) from error
 
 
 def save_reconstruction(reconstruction: Reconstruction, folder: Path) -> None:

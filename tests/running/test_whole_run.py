@@ -49,7 +49,7 @@ def kill_in_the_fit(folder: Path, out: Path) -> int:
     process = subprocess.Popen(command(folder, out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline and process.poll() is None:
-        if any(path.is_file() for path in out.rglob("ours-*/work/*")):
+        if next(out.rglob("ours-*/work/checkpoint.pt"), None):
             break
         time.sleep(0.02)
     assert process.poll() is None, "the run ended before it could be killed"
