@@ -19,7 +19,7 @@ bench: setup  ## make the built-in animals, fit and score them: under 10 minutes
 	$(BIN)/rewild4d-bench run --method ours --dataset artemis
 
 test: setup  ## run the tests, one process a core
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 faults: setup  ## try every reader on 2,000 damaged files
 	REWILD4D_MUTATIONS=2000 $(BIN)/python -m pytest -s tests/faults

@@ -20,6 +20,22 @@ except ImportError:
     pytest.exit("rewild4d is not installed: run `make test`, or `pip install -e . -c constraints.txt`.", returncode=2)
 
 
+LONG = (
+    "tests/faults/test_kills.py",
+    "tests/running/test_whole_run.py",
+    "tests/rasterizer/test_rasterizer_cuda.py",
+    "tests/rasterizer/test_rasterizer_limits.py",
+    "tests/metrics/test_networks.py",
+    "tests/leaderboard/test_wild_tables.py",
+)
+"""Files that take a minute or more."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first, so that no process has one left when the others are done."""
+    items.sort(key=lambda item: not item.path.as_posix().endswith(LONG))
+
+
 @pytest.fixture
 def shared() -> Path:
     """Folder of data outside the repository, which may be absent."""
