@@ -121,9 +121,9 @@ def test_turns_learn_late_and_the_skeletons_terms_do_not_see_them(toy: tuple[Cli
     losses, _ = made.losses(key, made.supervision.target(key), last)
     assert losses["pose_silhouette"].requires_grad
     for name in ("skeleton", "prior"):
-        if name in losses and losses[name].requires_grad:
-            (grad,) = torch.autograd.grad(losses[name], vectors, retain_graph=True, allow_unused=True)
-            assert grad is None, name
+        assert losses[name].requires_grad, name
+        (grad,) = torch.autograd.grad(losses[name], vectors, retain_graph=True, allow_unused=True)
+        assert grad is None, name
     (grad,) = torch.autograd.grad(losses["pose_silhouette"], vectors)
     rows = grad.abs().amax((-1, -2)).nonzero().tolist()
     assert [0, 2] in rows and all(side == 0 for side, _ in rows)
