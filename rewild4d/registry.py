@@ -6,6 +6,7 @@ A package scan would miss the mapped folders of an editable install; a table can
 from __future__ import annotations
 
 import importlib
+from functools import cache
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
@@ -137,8 +138,17 @@ def _load(kind: str, name: str) -> Any:
 
 def _table(kind: str) -> dict[str, str]:
     own = {"methods": METHODS, "datasets": DATASETS}[kind]
-    plugged = {entry.name: entry.value for entry in metadata.entry_points(group=f"rewild4d.{kind}")}
+    plugged = {entry.name: entry.value for entry in plugged_in(kind)}
     return own | {name: target for name, target in plugged.items() if name not in own}
+
+
+@cache
+def plugged_in(kind: str) -> tuple[metadata.EntryPoint, ...]:
+    """Return what installed packages add to "methods", "datasets" or "protocols".
+
+    Read once a process: it opens a file of every package in the environment.
+    """
+    return tuple(metadata.entry_points(group=f"rewild4d.{kind}"))
 
 
 def _resolve(target: str) -> Any:

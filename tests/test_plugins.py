@@ -1,7 +1,7 @@
 """What other packages add by entry points: methods, data sets, protocols; a broken one is a sentence."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from rewild4d.errors import UserError
 from rewild4d.evaluation.image_scores import summarize
 from rewild4d.evaluation.protocol import find_protocol, load_protocols
 from rewild4d.metrics.names import COLOR_METRICS, IMAGES
-from rewild4d.registry import load_method
+from rewild4d.registry import load_method, plugged_in
 
 PROTOCOL = """
 name = "mine-64-v1"
@@ -33,7 +33,7 @@ Install = Callable[..., None]
 
 
 @pytest.fixture
-def install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Install:
+def install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Install]:
     """Pretend that a package with these entry points and files is installed."""
 
     def call(*entries: tuple[str, str, str], files: dict[str, str]) -> None:
@@ -52,8 +52,10 @@ def install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Install:
             )
 
         monkeypatch.setattr(metadata, "entry_points", entry_points)
+        plugged_in.cache_clear()
 
-    return call
+    yield call
+    plugged_in.cache_clear()
 
 
 def test_a_package_brings_its_data_sets_protocols(install: Install) -> None:

@@ -100,6 +100,7 @@ class TrainOptions:
         animals: of headings and shapes: to learn from; 1600 and 275 where it is left out.
         epochs: of headings: how often their pictures are gone through.
         two_legged: of headings: share of the animals that have two legs, 0 to 1.
+        start: of headings: weights to start from, as an earlier training wrote them; the learning rate is a quarter.
         rounds: of points: of eight animals each; the learning rate falls over all of them.
         seed: of the animals and of the first weights.
         workers: processes that draw (of shapes: fit) animals; of points beside the one that trains; 0 takes the same.
@@ -110,6 +111,7 @@ class TrainOptions:
     animals: int | None = None
     epochs: int = 10
     two_legged: float = 0.0
+    start: Path | None = None
     rounds: int = 2000
     seed: int = 0
     workers: int = 2
@@ -142,6 +144,8 @@ def _train(arguments: list[str]) -> int:
             raise UserError(f"--{name}: expected 1 or more, got {value}.")
     if not 0 <= options.two_legged <= 1:
         raise UserError(f"--two-legged: expected a share from 0 to 1, got {options.two_legged:g}.")
+    if options.start is not None and options.part != "headings":
+        raise UserError(f"--start: expected with --part headings alone, got --part {options.part}.")
     if options.workers < 0:
         raise UserError(f"--workers: expected 0 or more, got {options.workers}.")
     require_writable_file(options.out / "weights.safetensors")
@@ -161,7 +165,10 @@ def _trained(options: TrainOptions) -> Path:
     if options.part == "shapes":
         samples = shapes.TrainingConfig(seed=options.seed, **animals)
         return shapes.train(options.out, samples, workers=options.workers, report=print)
-    epochs = headings.TrainingConfig(epochs=options.epochs, seed=options.seed, two_legged=options.two_legged, **animals)
+    start = "" if options.start is None else str(options.start)
+    epochs = headings.TrainingConfig(
+        epochs=options.epochs, seed=options.seed, two_legged=options.two_legged, start=start, **animals
+    )
     return headings.train(options.out, epochs, workers=options.workers, report=print)
 
 

@@ -1,7 +1,7 @@
 """Evaluation protocols: a TOML file states held-out frames and scores."""
 
 from collections.abc import Iterable, Mapping
-from importlib import metadata, resources
+from importlib import resources
 from importlib.resources.abc import Traversable
 from typing import Literal
 
@@ -12,6 +12,7 @@ from rewild4d.errors import UserError, reason, unknown_name
 from rewild4d.files import digest
 from rewild4d.foreign.texts import read_toml
 from rewild4d.metrics import names
+from rewild4d.registry import plugged_in
 
 
 class NovelViews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -101,7 +102,7 @@ def load_protocols() -> dict[str, Protocol]:
     """
     folder = resources.files("rewild4d.leaderboard") / "protocols"
     found = {protocol.name: protocol for protocol in map(_decode, _tomls(folder))}
-    for entry in metadata.entry_points(group="rewild4d.protocols"):
+    for entry in plugged_in("protocols"):
         try:
             added = [_decode(file) for file in _tomls(resources.files(entry.value))]
         except (ImportError, OSError, UserError) as error:

@@ -18,6 +18,10 @@ def test_wrong_numbers_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert said == "rewild4d-bench: --workers: expected 0 or more, got -1.\n"
     said = refusal(capsys, "prior", "train", "--out", tmp_path, "--two-legged", 1.5)
     assert said == "rewild4d-bench: --two-legged: expected a share from 0 to 1, got 1.5.\n"
+    said = refusal(capsys, "prior", "train", "--out", tmp_path, "--part", "shapes", "--start", tmp_path / "a")
+    assert said == "rewild4d-bench: --start: expected with --part headings alone, got --part shapes.\n"
+    said = refusal(capsys, "prior", "train", "--out", tmp_path, "--start", tmp_path / "a")
+    assert said.startswith(f"rewild4d-bench: {tmp_path / 'a'}: expected weights of the learned prior")
     (tmp_path / "file").write_text("")
     assert "expected a folder that can be written" in refusal(
         capsys, "prior", "train", "--out", tmp_path / "file" / "a"

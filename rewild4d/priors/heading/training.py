@@ -21,7 +21,7 @@ from rewild4d.priors.heading.network import HeadingNetwork, likeliest, log_share
 from rewild4d.priors.heading.pictures import Pictures, from_bytes, joined
 from rewild4d.priors.heading.weights import FILE
 from rewild4d.priors.learned.going_on import Arrays, making, read_checkpoint, warmth
-from rewild4d.priors.learned.weights import save_weights
+from rewild4d.priors.learned.weights import read_weights, save_weights
 
 PART = 16
 """Animals of a file of pictures."""
@@ -30,6 +30,8 @@ CHECKED = 0.05
 BATCH = 128
 LEARNING_RATE, WEIGHT_DECAY = 2e-3, 0.02
 """Of AdamW, the first at its highest."""
+GOING_ON = 0.25
+"""Share of that learning rate for weights that have learned before."""
 WARMUP = 200
 """Steps over which the learning rate rises."""
 COOLING = 0.5
@@ -48,12 +50,14 @@ class TrainingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         epochs: how often their pictures are gone through.
         seed: of the animals and of the weights.
         two_legged: share of the animals that have two legs.
+        start: file of weights to start from; new ones where it is empty.
     """
 
     animals: int = 1600
     epochs: int = 10
     seed: int = 0
     two_legged: float = 0.0
+    start: str = ""
 
 
 def train(folder: Path, config: TrainingConfig, *, workers: int, report: Callable[[str], None]) -> Path:
@@ -69,7 +73,7 @@ def train(folder: Path, config: TrainingConfig, *, workers: int, report: Callabl
         The file of weights.
 
     Raises:
-        UserError: the folder has the checkpoint of other settings.
+        UserError: the folder has the checkpoint of other settings, or the weights to start from cannot be read.
     """
     torch.manual_seed(config.seed)
     progress = _Progress(folder, config)
@@ -115,7 +119,10 @@ class _Progress:
         self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
         self.curve: list[dict[str, float]] = []
         kept = read_checkpoint(folder / "checkpoint.pt", config)
+        self.rate = LEARNING_RATE * (GOING_ON if config.start else 1.0)
         if kept is None:
+            if config.start:
+                read_weights(self.network, Path(config.start))
             return
         self.network.load_state_dict(kept["network"])
         self.optimizer.load_state_dict(kept["optimizer"])
@@ -130,7 +137,7 @@ class _Progress:
         for index, chosen in enumerate(batches):
             step = self.epoch * len(batches) + index
             for group in self.optimizer.param_groups:
-                group["lr"] = LEARNING_RATE * warmth(step, total, warmup=WARMUP, cooling=COOLING)
+                group["lr"] = self.rate * warmth(step, total, warmup=WARMUP, cooling=COOLING)
             shown = given.chosen(chosen)
             shown = shown.mirrored(torch.rand(len(shown), generator=rows) < 0.5)
             value = _loss(self.network, shown, torch.rand(len(shown), generator=rows) < BLIND)

@@ -52,6 +52,17 @@ def test_a_checkpoint_that_cannot_be_read_is_a_sentence(tmp_path: Path) -> None:
         train(tmp_path, TrainingConfig(animals=1, epochs=1), workers=0, report=silent)
 
 
+def test_a_training_starts_from_earlier_weights(tmp_path: Path) -> None:
+    earlier = train(tmp_path / "earlier", TrainingConfig(animals=2, epochs=8), workers=0, report=silent)
+    going_on = TrainingConfig(animals=2, epochs=1, start=str(earlier))
+    later = read_weights(HeadingNetwork(), train(tmp_path / "later", going_on, workers=0, report=silent))
+    before, new = read_weights(HeadingNetwork(), earlier).state_dict(), HeadingNetwork().state_dict()
+    name = max(before, key=lambda one: before[one].numel())
+    assert 0 < (later.state_dict()[name] - before[name]).norm() < 0.2 * (new[name] - before[name]).norm()
+    first = [json.loads((tmp_path / which / "curve.json").read_text())[0]["loss"] for which in ("earlier", "later")]
+    assert first[1] < first[0] - 0.2
+
+
 def test_the_loss_falls(tmp_path: Path) -> None:
     train(tmp_path, TrainingConfig(animals=2, epochs=30), workers=0, report=silent)
     losses = [row["loss"] for row in json.loads((tmp_path / "curve.json").read_text())]
