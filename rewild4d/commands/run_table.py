@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -88,24 +89,30 @@ def main(arguments: list[str]) -> int:
 
 
 def make_plans(options: Options, spec: Spec) -> list[Plan]:
-    """Return a plan for each protocol and prior of the table.
+    """Return a plan for each protocol and prior of the table that has any of the cases which were asked for.
 
     Raises:
-        UserError: an unknown name, or a folder that is not there or cannot be written.
+        UserError: a case that no condition has, an unknown name, or a folder that is not there or cannot be written.
     """
     check_numbers(options)
     require_name("datasets", spec.dataset)
     from rewild4d.running import planning
-    from rewild4d.running.runner import Plan
+    from rewild4d.running.runner import Plan, choose_cases
 
     protocols = {one.protocol: find_protocol(spec.dataset, one.protocol) for one in planning.own_conditions(spec)}
     entries = planning.entries(options.table, spec, tuple(dict.fromkeys(options.seeds or spec.seeds)))
     chosen = plan_fields(options)
     root, reader = open_dataset(spec.dataset, options.data, options)
+    found = {
+        (name, prior): _cases(options, reader, protocols[name], patterns)
+        for (name, prior), patterns in planning.cases_of_conditions(spec).items()
+    }
+    wanted = choose_cases(list(dict.fromkeys(itertools.chain(*found.values()))), options.case)
     plans = []
-    for (name, prior), patterns in planning.cases_of_conditions(spec).items():
-        protocol = protocols[name]
-        cases = _cases(options, reader, protocol, patterns)
+    for (name, prior), known in found.items():
+        protocol, cases = protocols[name], tuple(case for case in known if case in wanted)
+        if not cases:
+            continue
         floors = lower_bounds(protocol, [entry.method for entry in entries])
         plans.append(
             Plan(
@@ -119,7 +126,6 @@ def make_plans(options: Options, spec: Spec) -> list[Plan]:
 def _cases(options: Options, reader: DatasetReader, protocol: Protocol, patterns: Sequence[str]) -> tuple[str, ...]:
     """Return the cases of the table that the data has; where the table names none, the default cases of the data."""
     from rewild4d.commands.choice import cases_of
-    from rewild4d.running.runner import choose_cases
 
     preferred = getattr(reader, "default_cases", None)
     free = not patterns and not options.case
@@ -127,7 +133,7 @@ def _cases(options: Options, reader: DatasetReader, protocol: Protocol, patterns
     found, note = cases_of(options.table, names, patterns)
     if note:
         print(note, file=sys.stderr)
-    return choose_cases(found, options.case)
+    return found
 
 
 def _table(options: Options, spec: Spec, records: list[RunRecord]) -> Table:

@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from calling import output
+from calling import output, refusal
 from one_case import OneCase
 from records_for_tests import PROTOCOL, psnr, record, spec
 
@@ -14,6 +14,7 @@ from rewild4d import cli
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyConfig
 from rewild4d.commands import run_table, table
 from rewild4d.config import load_preset
+from rewild4d.contracts import Selection
 from rewild4d.errors import UserError
 from rewild4d.leaderboard.records import FILE, RunRecord, write_record
 from rewild4d.leaderboard.specs import Condition, Line, Spec, load_reported, load_specs
@@ -181,6 +182,25 @@ def demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Spec:
         run_table, "find_protocol", lambda *given: msgspec.structs.replace(own(*given), floors=("empty",))
     )
     return found
+
+
+def test_a_case_of_one_condition_is_planned_there_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Cases of a fixed camera have names of their own."""
+
+    class Reader:
+        def cases(self, selection: Selection) -> list[str]:
+            return ["cat/sit@side", "wolf/run@side"] if selection.cameras == "fixed" else ["cat/sit", "wolf/run"]
+
+    plans = []
+    monkeypatch.setattr(run_table, "open_dataset", lambda *_: (tmp_path, Reader()))
+    monkeypatch.setattr(run_table, "_print_plan", lambda plan, _: plans.append(plan))
+    wanted = ("run", "--table", "unseen", "--out", str(tmp_path / "runs"), "--plan", "--case")
+    output(capsys, *wanted, "wolf/run", "cat/*@side")
+    kinds = [(plan.protocol.name.split("-")[1], plan.cases) for plan in plans]
+    assert kinds == [("sweep", ("wolf/run",)), ("random", ("wolf/run",)), ("fixed", ("cat/sit@side",))]
+    assert "unknown case 'wolf/walk'. Did you mean 'wolf/run'?" in refusal(capsys, *wanted, "wolf/walk", "cat/sit")
 
 
 def test_a_table_is_run_printed_and_only_completed(
