@@ -27,7 +27,7 @@ DESCRIPTION = """Fit a template to masked frames of unknown cameras; write the p
 (<out>.png and <out>.mp4): mask green, template magenta, agreement grey, left legs orange, right legs blue, head red."""
 IMPORT = """Import the output of a test run of 3D-Fauna, <step>_<frame>_mesh.obj, _pose.txt, _arti_params.txt, as a
 prior."""
-TRAIN = """Learn a part of the prior from random four-footed animals, or go on where the folder's training was stopped.
+TRAIN = """Learn a part of the prior from random animals, or go on where the folder's training was stopped.
 `headings` (a network, weights.safetensors and curve.json, half an hour on two cores) and `shapes`
 (density.safetensors, an hour) come with the package; `points` is the network of
 `run --prior learned:DIR/weights.safetensors` (about 15 seconds a round)."""
