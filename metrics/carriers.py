@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.errors import UserError
+from rewild4d.metrics.onnx_files import read_convolutions
 
 Tensors = dict[str, Tensor]
 
@@ -253,6 +254,7 @@ READERS: dict[str, Callable[[bytes, str], Tensors]] = {
     "pickle": read_pickle,
     "torch": read_torch,
     "torchscript": read_torchscript,
+    "onnx": read_convolutions,
 }
 LAYOUTS: dict[str, Callable[[Tensors], Tensors]] = {
     "flax-lpips": from_flax_lpips,
@@ -262,6 +264,7 @@ LAYOUTS: dict[str, Callable[[Tensors], Tensors]] = {
     "ordered-i3d": from_ordered_i3d,
     "inception-towers": from_inception_towers,
     "inception-branches": from_inception_branches,
+    "in-order": dict,
 }
 
 

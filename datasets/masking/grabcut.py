@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
+from rewild4d.datasets.masking.flow import Flow, carried
 from rewild4d.datasets.masking.makers import Box, Unmasked
 from rewild4d.errors import UserError
 
@@ -35,7 +36,7 @@ def rough_masks(source: Unmasked) -> Iterator[np.ndarray]:
         raise UserError("--box: the rough masks need a box around the animal: --box left,top,width,height (pixels).")
     scale = min(1.0, WORK_SIDE / max(source.size))
     size = (max(1, round(source.size[0] * scale)), max(1, round(source.size[1] * scale)))
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    flow = Flow()
     before: np.ndarray | None = None
     mask: np.ndarray | None = None
     looks: np.ndarray | None = None
@@ -47,7 +48,7 @@ def rough_masks(source: Unmasked) -> Iterator[np.ndarray]:
             mask, areas = from_box(small, source.boxes[index], scale), []
             looks = colors(small, mask)
         elif mask is not None and before is not None:
-            mask = from_mask(small, _carried(mask, flow.calc(grey, before, np.zeros((*grey.shape, 2), np.float32))))
+            mask = from_mask(small, carried(mask, flow(grey, before), cv2.INTER_NEAREST))
         if mask is not None:
             areas.append(int(mask.sum()))
             strange = looks is not None and cv2.compareHist(looks, colors(small, mask), cv2.HISTCMP_BHATTACHARYYA)
@@ -120,11 +121,3 @@ def _largest(mask: np.ndarray) -> np.ndarray:
         return closed
     areas = stats[1:, cv2.CC_STAT_AREA]
     return np.isin(labels, 1 + np.flatnonzero(areas >= 0.1 * areas.max())).astype(np.uint8)
-
-
-def _carried(mask: np.ndarray, flow: np.ndarray) -> np.ndarray:
-    """Return the mask of the frame before, seen from this one: ``flow`` leads from here to there, [h, w, 2]."""
-    height, width = mask.shape
-    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
-    moved = grid + flow
-    return cv2.remap(mask, moved[..., 0], moved[..., 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)

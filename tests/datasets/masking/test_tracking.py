@@ -1,0 +1,228 @@
+"""`masks --tool track`: boxes on any frame or none, both directions, neighbours, losses; and the network's plumbing."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import moving
+import numpy as np
+import pytest
+import torch
+from calling import call, refusal
+from films import iou
+
+from rewild4d.datasets.masking import tracking
+from rewild4d.datasets.masking.flow import Flow, carried
+from rewild4d.datasets.masking.following import Follower
+from rewild4d.datasets.masking.makers import Unmasked
+from rewild4d.datasets.masking.saliency import SIDE, Saliency, SaliencyNetwork
+from rewild4d.datasets.masking.tracking import track_masks
+from rewild4d.errors import UserError
+from rewild4d.metrics.weights import LoadedWeights, is_here, load_weights
+
+SIZE = (192, 128)
+BOX = (8.0, 40.0, 64.0, 56.0)
+"""Around the animal in frame 0."""
+
+
+def red(image: np.ndarray) -> np.ndarray:
+    """A network to which red things stand out."""
+    return cv2.GaussianBlur((image[..., 0] > 150).astype(np.float32), (0, 0), 1.0)
+
+
+@pytest.fixture
+def network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Red things stand out, and no weights are needed."""
+    monkeypatch.setattr(tracking, "is_here", lambda _: True)
+    monkeypatch.setattr(tracking, "load_weights", lambda _: None)
+    monkeypatch.setattr(tracking, "Saliency", lambda _: red)
+
+
+def film(pictures: list[np.ndarray], **boxes: tuple[float, float, float, float]) -> Unmasked:
+    stems = tuple(f"{100 + number:05d}" for number in range(len(pictures)))
+    known = {int(name.removeprefix("at")): box for name, box in boxes.items()}
+    return Unmasked("film", stems, SIZE, lambda: iter(pictures), known)
+
+
+def walking(count: int = 8) -> list[np.ndarray]:
+    return [textured(moving.image(number, SIZE)) for number in range(count)]
+
+
+def textured(image: np.ndarray) -> np.ndarray:
+    """Something for flow to hold on to, which stands still."""
+    noise = np.random.default_rng(0).integers(0, 30, image.shape[:2])[..., None]
+    return np.clip(image.astype(int) + noise, 0, 255).astype(np.uint8)
+
+
+def found(source: Unmasked) -> list[np.ndarray]:
+    masks = list(track_masks(source))
+    assert all(mask.shape == SIZE[::-1] and set(np.unique(mask)) <= {0, 255} for mask in masks)
+    return [mask > 0 for mask in masks]
+
+
+@pytest.mark.usefixtures("network")
+@pytest.mark.parametrize("boxes", [{"at0": BOX}, {"at5": (18.0, 40.0, 64.0, 56.0)}, {}])
+def test_an_animal_is_followed_from_a_box_on_any_frame_and_from_none(
+    boxes: dict[str, tuple[float, float, float, float]],
+) -> None:
+    masks = found(film(walking(), **boxes))
+    assert len(masks) == 8
+    for number, mask in enumerate(masks):
+        assert iou(mask, moving.mask(number, SIZE) > 0) > 0.9, number
+
+
+@pytest.mark.usefixtures("network")
+def test_frames_before_a_box_come_first_and_each_box_starts_anew() -> None:
+    starts: list[int] = []
+
+    class Spy(Follower):
+        def __init__(self, *given: object) -> None:
+            starts.append(1)
+            super().__init__(*given)  # type: ignore[arg-type]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tracking, "Follower", Spy)
+        masks = found(film(walking(), at3=(14.0, 40.0, 64.0, 56.0), at6=(20.0, 40.0, 64.0, 56.0)))
+    assert len(starts) == 3, "on and back from the first box, on from the second"
+    places = [float(np.nonzero(mask)[1].mean()) for mask in masks]
+    assert places == sorted(places), "the animal walks to the right"
+
+
+@pytest.mark.usefixtures("network")
+def test_two_animals_ask_for_a_box_and_none_says_so() -> None:
+    two = textured(moving.image(0, SIZE))
+    two[40:96, 120:180] = (210, 40, 30)
+    with pytest.raises(
+        UserError, match=r"film: 2 things stand out in frame 00100; choose: --box 00100:120,40,60,56 or "
+    ):
+        found(film([two]))
+    small = textured(moving.image(0, SIZE))
+    small[10:20, 170:180] = (210, 40, 30)
+    assert iou(found(film([small]))[0], moving.mask(0, SIZE) > 0) > 0.9, "a small thing does not compete"
+    meadow = textured(np.full((*SIZE[::-1], 3), 60, np.uint8))
+    with pytest.raises(
+        UserError, match="film: nothing in it stands out; give a box: --box frame:left,top,width,height"
+    ):
+        found(film([meadow] * 2))
+    with pytest.raises(UserError, match=r"--box: expected a box inside the frame of 192 x 128 pixels, got 200,1,5,5\."):
+        found(film([meadow], at0=(200, 1, 5, 5)))
+
+
+@pytest.mark.usefixtures("network")
+def test_an_animal_that_leaves_is_lost_and_found_again() -> None:
+    meadow = textured(moving.image(0, SIZE, left=-60))
+    masks = found(film([*walking(3), *[meadow] * 2, *walking(3)], at0=BOX))
+    assert masks[2].any() and not masks[3].any() and not masks[4].any()
+    assert iou(masks[7], moving.mask(2, SIZE) > 0) > 0.9
+    other = meadow.copy()
+    other[40:96, 100:160] = (250, 250, 40)  # stands out too, in other colours
+    assert not found(film([*walking(3), meadow, other], at0=BOX))[4].any()
+
+
+@pytest.mark.usefixtures("network")
+def test_a_neighbour_that_was_covered_is_no_part_of_the_animal() -> None:
+    """A stripe of the animal's colours comes out from behind it as it walks, and comes loose."""
+    wide, high = 640, 320
+    noise = cv2.GaussianBlur(np.random.default_rng(1).normal(0, 60, (high, wide, 3)), (0, 0), 2.0) * 2
+    still = np.clip(np.array((200, 60, 40)) + noise, 0, 255)
+    pictures, truth = [], []
+    for number in range(24):
+        picture = np.clip(np.array((60, 110, 60)) + noise[::-1], 0, 255)
+        picture[130:210, 190:230] = still[::-1][130:210, 190:230]  # the neighbour
+        animal = np.zeros((high, wide), bool)
+        animal[100:240, 80 + 10 * number : 240 + 10 * number] = True
+        picture[animal] = np.roll(still, 10 * number, axis=1)[animal]
+        pictures.append(picture.astype(np.uint8))
+        truth.append(animal)
+    stems = tuple(map(str, range(24)))
+    masks = list(track_masks(Unmasked("film", stems, (wide, high), lambda: iter(pictures), {0: (80, 100, 160, 140)})))
+    assert iou(masks[-1] > 0, truth[-1]) > 0.9
+    assert not masks[-1][130:210, 190:230].any()
+
+
+def test_flow_says_where_pixels_came_from_and_where_it_is_not_sure() -> None:
+    rng = np.random.default_rng(0)
+    ground = cv2.GaussianBlur(rng.integers(0, 255, (80, 120)).astype(np.uint8), (0, 0), 1.5)
+    before, after = np.roll(ground, 0, 1), np.roll(ground, 4, 1)
+    flow, sure = Flow().checked(after, before)
+    inside = np.s_[16:-16, 16:-16]
+    assert np.abs(flow[inside] - (-4, 0)).mean() < 0.3 and sure[inside].mean() > 0.95
+    mark = np.zeros((80, 120), np.float32)
+    mark[30:50, 40:60] = 1
+    assert iou(carried(mark, flow) > 0.5, np.roll(mark, 4, 1) > 0.5) > 0.9
+    unlike = rng.integers(0, 255, (80, 120)).astype(np.uint8)
+    assert Flow().checked(after, unlike)[1].mean() < 0.5
+
+
+def test_without_weights_masks_are_rough_and_a_line_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tracking, "is_here", lambda _: False)
+        moving.frames(tmp_path / "clip", size=SIZE)
+        words = ("masks", "--video", str(tmp_path / "clip"), "--out", str(tmp_path / "m"))
+        assert call(*words, "--box", "8,40,64,56") == 0
+        out, err = capsys.readouterr()
+        assert "12 masks by 'track', 0 of them without the animal" in out
+        assert "the network 'u2netp' is not here, so these are rough masks, from flow and colours alone" in err
+        assert "the rough masks need a box around the animal" in refusal(capsys, *words)
+
+
+def test_the_network_keeps_sizes_and_has_the_published_number_of_convolutions() -> None:
+    network = SaliencyNetwork().eval()
+    used = [one for one in network.modules() if isinstance(one, torch.nn.Conv2d)]
+    assert len(used) == (14 + 12 + 10 + 8 + 8 + 8) + (8 + 8 + 10 + 12 + 14) + 6 + 1
+    assert sum(one.weight.numel() + one.bias.numel() for one in used if one.bias is not None) == 1_125_485
+    with torch.inference_mode():
+        assert network(torch.rand(1, 3, 70, 90)).shape == (1, 1, 70, 90), "sizes that halve unevenly"
+
+
+def test_weights_go_to_convolutions_in_the_order_in_which_they_are_used() -> None:
+    plain = SaliencyNetwork().eval()
+    order: list[torch.nn.Conv2d] = []
+
+    def note(module: torch.nn.Module, *_: object) -> None:
+        order.append(module)  # type: ignore[arg-type]
+
+    used = [one for one in plain.modules() if isinstance(one, torch.nn.Conv2d)]
+    for one in used:
+        one.register_forward_hook(note)
+    with torch.inference_mode():
+        plain(torch.rand(1, 3, 64, 64))
+    inner = [one for one in order if one.in_channels != 64 or one.out_channels != 1]
+    assert inner[:-1] == [one for one in used[:-1] if one.in_channels != 64 or one.out_channels != 1]
+    assert order[-1] is used[-1] is plain.last
+    tensors = {f"{k:03d}.{part}": getattr(one, part).data for k, one in enumerate(used) for part in ("weight", "bias")}
+    image = np.random.default_rng(0).integers(0, 255, (SIDE, SIDE, 3)).astype(np.uint8)
+    first, again = (Saliency(LoadedWeights(tensors, ""))(image) for _ in range(2))
+    assert np.array_equal(first, again) and first.shape == (SIDE, SIDE)
+
+
+def published() -> Saliency:
+    if not is_here("u2netp"):
+        pytest.skip("no weights of u2netp: rewild4d-bench weights fetch u2netp")
+    return Saliency(load_weights("u2netp"))
+
+
+def test_with_the_published_weights_an_animal_stands_out() -> None:
+    image = textured(moving.image(20, SIZE))
+    assert iou(published()(image) > 0.5, moving.mask(20, SIZE) > 0) > 0.8
+
+
+def test_a_real_camel_is_followed(davis: Path) -> None:
+    """Ten frames of DAVIS from a box around the first mask; all ninety: docs/experiments/tracking.md."""
+    published()
+    files = sorted((davis / "JPEGImages" / "480p" / "camel").glob("*.jpg"))[:10]
+    truth = [cv2.imread(str(davis / "Annotations/480p/camel" / f"{file.stem}.png"), 0) for file in files]
+    assert truth[0] is not None
+
+    def images() -> Iterator[np.ndarray]:
+        for file in files:
+            image = cv2.imread(str(file))
+            assert image is not None
+            yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+    left, top, width, height = cv2.boundingRect(truth[0])
+    source = Unmasked("camel", tuple(file.stem for file in files), (854, 480), images, {0: (left, top, width, height)})
+    scores = [
+        iou(mask > 0, true > 127) for mask, true in zip(track_masks(source), truth, strict=True) if true is not None
+    ]
+    assert np.mean(scores) > 0.93
