@@ -14,8 +14,10 @@ from rewild4d.datasets.masking.grabcut import LOST, STRANGE, colors
 from rewild4d.datasets.masking.makers import Box
 from rewild4d.datasets.masking.saliency import Saliency
 
-WINDOW = 0.25
+WINDOW = 0.6
 """Share of the animal's box by which the window around it is wider and higher."""
+STARTS = (0.6, 2.0)
+"""The same of the windows in which the first frame is read: a narrow one can miss a head, a wide one edges."""
 OUTSTANDING, OUTSTANDING_RANGE = 0.6, (-3.0, 5.0)
 """Weight and range of the log odds of standing out."""
 CARRIED, CARRIED_RANGE, SOFT = 0.6, 4.0, 2.0
@@ -30,6 +32,8 @@ YOUNG = 0.5
 """A loose part is dropped where it was first seen less than this share of the largest part's frames ago."""
 LEAST_PART, TOUCHING = 0.02, 0.3
 """Least area of a part, of the largest one's, and the least share of it where flow carries the mask, or near."""
+ALIKE = 0.5
+"""What stands out elsewhere is the lost animal where its colours are this near (Bhattacharyya) those at the start."""
 LEAST_AREA = 0.01
 """Least share of a frame that stands out as an animal."""
 
@@ -56,7 +60,8 @@ class Follower:
         inside = np.zeros(self._grey.shape, bool)
         left, top, right, bottom = _clipped(box, self._grey.shape)
         inside[top:bottom, left:right] = True
-        odds = np.where(inside, self._outstanding(image, inside), -9.0)
+        odds = np.mean([self._outstanding(image, inside, wider) for wider in STARTS], axis=0)
+        odds = np.where(inside, odds, -9.0).astype(np.float32)
         self.mask = _main_parts(odds > 0, inside)
         if not self.mask.any():  # nothing stands out: the box itself is the best guess
             self.mask = inside
@@ -98,23 +103,25 @@ class Follower:
         if mask.any():
             self._colours.learn(lab, self._chance, LEARNED)
 
-    def _outstanding(self, image: np.ndarray, near: np.ndarray) -> np.ndarray:
+    def _outstanding(self, image: np.ndarray, near: np.ndarray, wider: float = WINDOW) -> np.ndarray:
         """Return the weighted log odds of standing out in the window around ``near``, [h, w]; the lowest outside."""
         low, high = OUTSTANDING_RANGE
         odds = np.full(near.shape, OUTSTANDING * low, np.float32)
         if near.any():
-            left, top, right, bottom = _window(near)
+            left, top, right, bottom = _window(near, wider)
             found = _odds(self._saliency(image[top:bottom, left:right]), max(-low, high))
             odds[top:bottom, left:right] = OUTSTANDING * found.clip(low, high)
         return odds
 
     def _find_again(self, image: np.ndarray) -> None:
-        """Start again from what stands out in the whole frame and looks as the animal did."""
+        """Start again from what stands out in the whole frame and looks most as the animal did, if anything does."""
+        found = []
         for box, mask in standing_out(self._saliency(image)):
             away = cv2.compareHist(self._looks, colors(image, mask.astype(np.uint8)), cv2.HISTCMP_BHATTACHARYYA)
-            if away < STRANGE and mask.sum() > LOST * np.median(self._areas):
-                self._start(image, box)
-                return
+            if away < ALIKE and mask.sum() > LOST * np.median(self._areas):
+                found.append((away, box))
+        if found:
+            self._start(image, min(found)[1])
 
 
 class _Colours:
@@ -167,10 +174,11 @@ def _clipped(box: Box, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
     )  # fmt: skip
 
 
-def _window(mask: np.ndarray) -> tuple[int, int, int, int]:
+def _window(mask: np.ndarray, wider: float = WINDOW) -> tuple[int, int, int, int]:
+    """Return left, top, right and bottom of the box around a mask, made larger by a share of its size."""
     left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    wider, higher = WINDOW * width / 2, WINDOW * height / 2
-    return _clipped((left - wider, top - higher, width + 2 * wider, height + 2 * higher), mask.shape)
+    x, y = wider * width / 2, wider * height / 2
+    return _clipped((left - x, top - y, width + 2 * x, height + 2 * y), mask.shape)
 
 
 def _window_of(mask: np.ndarray) -> np.ndarray:
