@@ -116,6 +116,8 @@ def named_table(frame: Frame, entrants: Sequence[Entrant], reported: Reported | 
         entrants: rows with their records; the cases of a condition are those that any entrant was run on.
         reported: what the paper printed, below the others.
     """
+    if reported is None:
+        frame, entrants = _begun(frame, entrants)
     columns = columns_of(runs_of(entrants), frame.scores, frame.conditions)
     cases = [cases_of(entrants, index) for index in range(len(frame.conditions))]
     rows = ranked([
@@ -144,6 +146,8 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
     reference = next((entrant for entrant in entrants if entrant.label.lower() == against.lower()), None)
     if reference is None:
         raise unknown_name("row", against, [entrant.label for entrant in entrants])
+    frame, entrants = _begun(frame, entrants)
+    reference = next(entrant for entrant in entrants if entrant.label == reference.label)
     columns = columns_of(runs_of(entrants), frame.scores, frame.conditions)
     rows = []
     for entrant in entrants:
@@ -156,6 +160,17 @@ def difference_table(frame: Frame, entrants: Sequence[Entrant], against: str) ->
     caption = _difference_caption(reference.label, entrants)
     remarks = tuple(filter(None, [_over(frame, entrants), *frame.remarks]))
     return Table(f"{frame.name}-difference", title, caption, ("method",), columns, tuple(_apart(rows)), remarks)
+
+
+def _begun(frame: Frame, entrants: Sequence[Entrant]) -> tuple[Frame, Sequence[Entrant]]:
+    """Leave out the conditions that no row has a record of, and say which; all stay where none has one."""
+    kept = [index for index in range(len(frame.conditions)) if cases_of(entrants, index)]
+    if len(kept) in (0, len(frame.conditions)):
+        return frame, entrants
+    absent = "; ".join(title for index, title in enumerate(frame.conditions) if index not in kept)
+    remarks = (f"Without any record, and so without columns: {absent}.", *frame.remarks)
+    frame = replace(frame, conditions=tuple(frame.conditions[index] for index in kept), remarks=remarks)
+    return frame, [replace(one, records=tuple(one.records[index] for index in kept)) for one in entrants]
 
 
 def runs_of(entrants: Sequence[Entrant]) -> list[RunRecord]:

@@ -135,6 +135,17 @@ def test_what_has_no_number_says_why() -> None:
     )
 
 
+def test_a_condition_without_any_record_has_no_columns_and_is_named() -> None:
+    frame = replace(FRAME, conditions=("fixed", "sweep", "random"))
+    one, other = runs({"a": [20.0]}), runs({"a": [22.0]})
+    entrants = [Entrant("ours", ((), one, ())), Entrant("gart", ((), other, ()))]
+    for made in (named_table(frame, entrants), difference_table(frame, entrants, "ours")):
+        assert [column.group for column in made.columns] == ["sweep"] * len(FRAME.scores)
+        assert "Without any record, and so without columns: fixed; random." in made.remarks
+    nothing = named_table(frame, [Entrant("ours", ((), (), ()))])
+    assert len(nothing.columns) == 3 * len(FRAME.scores), "before anything was run it shows what there will be"
+
+
 def test_a_failed_seed_is_told_and_does_not_count() -> None:
     some = (*runs({"a": [20.0, 22.0]}), record(case="a", seed=2, status="failed", error="it diverged", scores={}))
     made = table(ours=some)
