@@ -65,10 +65,8 @@ class Follower:
         self.mask = _main_parts(odds > 0, inside)
         if not self.mask.any():  # nothing stands out: the box itself is the best guess
             self.mask = inside
-        self._chance, self._seen = (
-            _share(np.where(self.mask, np.maximum(odds, 1.0), odds)),
-            self.mask.astype(np.float32),
-        )
+        self._chance = _share(np.where(self.mask, np.maximum(odds, 1.0), odds))
+        self._seen = self.mask.astype(np.float32)  # for how many frames flow has carried each pixel
         self._colours = _Colours(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), self._chance)
 
     def step(self, image: np.ndarray) -> np.ndarray:

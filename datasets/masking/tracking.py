@@ -59,7 +59,7 @@ def _followed(source: Unmasked, saliency: Saliency, size: tuple[int, int]) -> It
         elif follower is not None:
             yield follower.step(small)
         else:
-            waiting.append(cv2.imencode(".png", small)[1].tobytes())
+            waiting.append(cv2.imencode(".jpg", small, (cv2.IMWRITE_JPEG_QUALITY, 95))[1].tobytes())
     if follower is None:
         raise UserError(f"{source.title}: nothing in it stands out; give a box: --box frame:left,top,width,height.")
 
