@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from rewild4d.errors import UserError
-from rewild4d.metrics.onnx_files import read_convolutions
 
 Tensors = dict[str, Tensor]
 
@@ -250,11 +249,16 @@ def from_inception_branches(source: Tensors) -> Tensors:
     return made
 
 
+def read_whole(data: bytes, label: str) -> Tensors:
+    """Return a file's bytes, "file": for a library that reads it by itself."""
+    return {"file": torch.frombuffer(bytearray(data), dtype=torch.uint8)}
+
+
 READERS: dict[str, Callable[[bytes, str], Tensors]] = {
     "pickle": read_pickle,
     "torch": read_torch,
     "torchscript": read_torchscript,
-    "onnx": read_convolutions,
+    "whole": read_whole,
 }
 LAYOUTS: dict[str, Callable[[Tensors], Tensors]] = {
     "flax-lpips": from_flax_lpips,
@@ -264,7 +268,7 @@ LAYOUTS: dict[str, Callable[[Tensors], Tensors]] = {
     "ordered-i3d": from_ordered_i3d,
     "inception-towers": from_inception_towers,
     "inception-branches": from_inception_branches,
-    "in-order": dict,
+    "file": dict,
 }
 
 
@@ -285,4 +289,9 @@ def convert(data: bytes, form: str, layout: str, label: str) -> Tensors:
         made = LAYOUTS[layout](source)
     except (KeyError, IndexError, ValueError) as error:
         raise UserError(f"{label}: expected tensors in the layout '{layout}', but {error} does not fit.") from error
-    return {name: made[name].float().contiguous() for name in sorted(made)}
+    return {name: _kept(made[name]).contiguous() for name in sorted(made)}
+
+
+def _kept(value: Tensor) -> Tensor:
+    """Return numbers in single precision, and bytes as they are."""
+    return value if value.dtype == torch.uint8 else value.float()

@@ -26,7 +26,6 @@ LONG = (
     "tests/rasterizer/test_rasterizer_cuda.py",
     "tests/rasterizer/test_rasterizer_limits.py",
     "tests/metrics/test_networks.py",
-    "tests/leaderboard/test_wild_tables.py",
 )
 """Files that take a minute or more."""
 

@@ -8,6 +8,7 @@ comes loose is dropped where most of it was hidden a while ago: it is a neighbou
 
 import cv2
 import numpy as np
+from scipy.special import expit, logit
 
 from rewild4d.datasets.masking.flow import Flow, carried
 from rewild4d.datasets.masking.grabcut import LOST, STRANGE, colors
@@ -65,7 +66,7 @@ class Follower:
         self.mask = _main_parts(odds > 0, inside)
         if not self.mask.any():  # nothing stands out: the box itself is the best guess
             self.mask = inside
-        self._chance = _share(np.where(self.mask, np.maximum(odds, 1.0), odds))
+        self._chance = expit(np.where(self.mask, np.maximum(odds, 1.0), odds))
         self._seen = self.mask.astype(np.float32)  # for how many frames flow has carried each pixel
         self._colours = _Colours(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), self._chance)
 
@@ -81,7 +82,8 @@ class Follower:
         near = before > 0.5
         lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
         odds = self._outstanding(image, near) + COLOURED * self._colours.odds(lab)
-        odds += CARRIED * np.where(sure, 1.0, UNSURE) * _odds(cv2.GaussianBlur(before, (0, 0), SOFT), CARRIED_RANGE)
+        soft = logit(cv2.GaussianBlur(before, (0, 0), SOFT).clip(0, 1)).clip(-CARRIED_RANGE, CARRIED_RANGE)
+        odds += CARRIED * np.where(sure, 1.0, UNSURE) * soft
         odds -= np.where(sure, 0.0, UNCOVERED)
         mask = _main_parts((odds > 0) & _window_of(near), cv2.dilate(near.astype(np.uint8), np.ones((9, 9))) > 0)
         seen = np.where(mask, np.where(sure, carried(self._seen, flow, cv2.INTER_NEAREST), 0) + 1, 0)
@@ -97,18 +99,17 @@ class Follower:
         if self._areas[-1] < max(LOST * np.median(self._areas), 1) or strange > STRANGE:
             mask = np.zeros_like(mask)
         self.mask, self._seen = mask, np.where(mask, seen, 0).astype(np.float32)
-        self._chance = _share(np.where(_window_of(mask), odds, -6.0))
+        self._chance = expit(np.where(_window_of(mask), odds, -6.0)).astype(np.float32)
         if mask.any():
             self._colours.learn(lab, self._chance, LEARNED)
 
     def _outstanding(self, image: np.ndarray, near: np.ndarray, wider: float = WINDOW) -> np.ndarray:
         """Return the weighted log odds of standing out in the window around ``near``, [h, w]; the lowest outside."""
-        low, high = OUTSTANDING_RANGE
-        odds = np.full(near.shape, OUTSTANDING * low, np.float32)
+        odds = np.full(near.shape, OUTSTANDING * OUTSTANDING_RANGE[0], np.float32)
         if near.any():
             left, top, right, bottom = _window(near, wider)
-            found = _odds(self._saliency(image[top:bottom, left:right]), max(-low, high))
-            odds[top:bottom, left:right] = OUTSTANDING * found.clip(low, high)
+            found = logit(self._saliency(image[top:bottom, left:right])).clip(*OUTSTANDING_RANGE)
+            odds[top:bottom, left:right] = OUTSTANDING * found
         return odds
 
     def _find_again(self, image: np.ndarray) -> None:
@@ -149,17 +150,6 @@ class _Colours:
 def _codes(lab: np.ndarray) -> np.ndarray:
     bins = lab.astype(np.int32) * BINS >> 8
     found: np.ndarray = (bins[..., 0] * BINS + bins[..., 1]) * BINS + bins[..., 2]
-    return found
-
-
-def _odds(share: np.ndarray, most: float) -> np.ndarray:
-    inner = share.clip(1e-4, 1 - 1e-4)
-    found: np.ndarray = np.log(inner / (1 - inner)).clip(-most, most)
-    return found
-
-
-def _share(odds: np.ndarray) -> np.ndarray:
-    found: np.ndarray = (1 / (1 + np.exp(-odds))).astype(np.float32)
     return found
 
 

@@ -89,6 +89,12 @@ def test_the_two_layouts_of_i3d_name_the_same_tensors() -> None:
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
+def test_a_file_that_a_library_reads_is_kept_byte_for_byte() -> None:
+    data = bytes(range(256)) * 3
+    (found,) = carriers.convert(data, "whole", "file", "x").items()
+    assert found[0] == "file" and found[1].dtype == torch.uint8 and found[1].numpy().tobytes() == data
+
+
 def test_the_real_table_is_whole() -> None:
     table = weights.table()
     assert list(table.networks) == ["lpips-alex", "lpips-vgg", "inception-fid", "i3d-k400", "u2netp"]

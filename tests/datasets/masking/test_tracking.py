@@ -7,7 +7,6 @@ import cv2
 import moving
 import numpy as np
 import pytest
-import torch
 from calling import call, refusal
 from films import iou
 
@@ -15,10 +14,10 @@ from rewild4d.datasets.masking import tracking
 from rewild4d.datasets.masking.flow import Flow, carried
 from rewild4d.datasets.masking.following import Follower
 from rewild4d.datasets.masking.makers import Unmasked
-from rewild4d.datasets.masking.saliency import SIDE, Saliency, SaliencyNetwork
+from rewild4d.datasets.masking.saliency import Saliency
 from rewild4d.datasets.masking.tracking import track_masks
 from rewild4d.errors import UserError
-from rewild4d.metrics.weights import LoadedWeights, is_here, load_weights
+from rewild4d.metrics.weights import is_here, load_weights
 
 SIZE = (192, 128)
 BOX = (8.0, 40.0, 64.0, 56.0)
@@ -164,36 +163,6 @@ def test_without_weights_masks_are_rough_and_a_line_says_so(tmp_path: Path, caps
         assert "12 masks by 'track', 0 of them without the animal" in out
         assert "the network 'u2netp' is not here, so these are rough masks, from flow and colours alone" in err
         assert "the rough masks need a box around the animal" in refusal(capsys, *words)
-
-
-def test_the_network_keeps_sizes_and_has_the_published_number_of_convolutions() -> None:
-    network = SaliencyNetwork().eval()
-    used = [one for one in network.modules() if isinstance(one, torch.nn.Conv2d)]
-    assert len(used) == (14 + 12 + 10 + 8 + 8 + 8) + (8 + 8 + 10 + 12 + 14) + 6 + 1
-    assert sum(one.weight.numel() + one.bias.numel() for one in used if one.bias is not None) == 1_125_485
-    with torch.inference_mode():
-        assert network(torch.rand(1, 3, 70, 90)).shape == (1, 1, 70, 90), "sizes that halve unevenly"
-
-
-def test_weights_go_to_convolutions_in_the_order_in_which_they_are_used() -> None:
-    plain = SaliencyNetwork().eval()
-    order: list[torch.nn.Conv2d] = []
-
-    def note(module: torch.nn.Module, *_: object) -> None:
-        order.append(module)  # type: ignore[arg-type]
-
-    used = [one for one in plain.modules() if isinstance(one, torch.nn.Conv2d)]
-    for one in used:
-        one.register_forward_hook(note)
-    with torch.inference_mode():
-        plain(torch.rand(1, 3, 64, 64))
-    inner = [one for one in order if one.in_channels != 64 or one.out_channels != 1]
-    assert inner[:-1] == [one for one in used[:-1] if one.in_channels != 64 or one.out_channels != 1]
-    assert order[-1] is used[-1] is plain.last
-    tensors = {f"{k:03d}.{part}": getattr(one, part).data for k, one in enumerate(used) for part in ("weight", "bias")}
-    image = np.random.default_rng(0).integers(0, 255, (SIDE, SIDE, 3)).astype(np.uint8)
-    first, again = (Saliency(LoadedWeights(tensors, ""))(image) for _ in range(2))
-    assert np.array_equal(first, again) and first.shape == (SIDE, SIDE)
 
 
 def published() -> Saliency:
