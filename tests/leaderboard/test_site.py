@@ -4,12 +4,12 @@ import base64
 import hashlib
 import re
 import shutil
-import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
 import msgspec
 import pytest
+from browser import browser, needs_chromium
 from calling import call
 from media_files import film, picture
 from records_for_tests import PROTOCOL, psnr, record
@@ -170,7 +170,6 @@ def test_a_curve_by_hand() -> None:
     assert "nan" not in curve("flat", [(0.0, [1.0]), (1.0, [1.0])])
 
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "google-chrome"))), None)
 CLICKS = """<script>
 const table = document.querySelector("section table"), head = table.querySelectorAll(".heads th")[1];
 const names = () => [...table.tBodies[0].rows].map(row => row.cells[0].firstChild.textContent).join(",");
@@ -181,7 +180,7 @@ document.title = [down, names(), shown, document.documentElement.scrollWidth <= 
 </script>"""
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no headless Chromium here: sorting and the phone's width are not tried")
+@needs_chromium
 def test_a_browser_sorts_filters_and_fits_a_phone(tmp_path: Path) -> None:
     found = (("ours", 20.0), ("gart", 5.0), ("d3dgs", 10.0), ("none", None), ("star", 30.0), ("empty", 15.0))
     for number, (method, value) in enumerate(found):
@@ -196,11 +195,10 @@ def test_a_browser_sorts_filters_and_fits_a_phone(tmp_path: Path) -> None:
     allowed = f"script-src 'sha256-{base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()}'"
     text = first.read_text()
     first.write_text(text.replace("script-src", allowed).replace("</body>", CLICKS + "</body>"))
-    dumped = subprocess.run(
-        [str(CHROMIUM), "--no-sandbox", "--disable-gpu", "--window-size=390,844", "--dump-dom", first.as_uri()],
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-    (title,) = re.findall("<title>(.*?)</title>", dumped.stdout)
+    with browser() as opened:
+        shown = opened.new_page(viewport={"width": 390, "height": 844})
+        shown.goto(first.as_uri())
+        title = shown.title()
     # What is not ranked and the floor stay below, whatever is sorted by.
     assert title == "ours,d3dgs,gart,none,star,empty ; gart,d3dgs,ours,none,star,empty ; 1 ; true"
 
