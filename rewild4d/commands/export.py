@@ -9,9 +9,7 @@ import tyro
 from rewild4d.commands.shared import require_writable
 from rewild4d.config import parse_flags
 from rewild4d.errors import UserError
-from rewild4d.evaluation.protocol import find_protocol
 from rewild4d.io import KINDS
-from rewild4d.registry import load_method
 
 DESCRIPTION = """Write a run's reconstruction as files for other programs: Gaussians of every frame (ply), an animated
 skinned mesh (glb), cameras (OpenCV axes, JSON) and films (mp4). Of a video, all frames that show the animal are
@@ -41,25 +39,16 @@ class Options:
 
 def main(arguments: list[str]) -> int:
     options = parse_flags(Options, arguments, prog="rewild4d-bench export", description=DESCRIPTION)
-    from rewild4d.cameras.recropping import add_cameras, all_moments
     from rewild4d.io.export import export, parse_kinds, why_not
-    from rewild4d.leaderboard.records import FILE, read_record
     from rewild4d.machine import pick_device
     from rewild4d.rasterizer import pick_rasterizer, set_default
-    from rewild4d.running import provenance
-    from rewild4d.running.rescoring import reader_of
+    from rewild4d.running.opening import open_run
 
     kinds = parse_kinds(options.what)
     device = pick_device(options.device)
     set_default(pick_rasterizer(options.rasterizer, device))
-    record = read_record(options.run / FILE)
-    saved = options.run / "reconstruction"
-    if not saved.is_dir():
-        raise UserError(f"{saved}: expected a saved reconstruction, but there is no such folder.")
-    protocol = find_protocol(record.dataset, record.protocol["name"])
-    clip, truth = reader_of(options.run, record, options.data).load(record.case, protocol.selection)
-    reconstruction = load_method(record.method).load(saved, device)
-    clip = all_moments(*add_cameras(reconstruction, clip, truth, provenance.shown_clip(clip, record.prior)))
+    opened = open_run(options.run, options.data, device)
+    reconstruction, clip = opened.reconstruction, opened.clip
     reasons = {kind: why_not(reconstruction, kind, clip) for kind in kinds}
     if all(reasons.values()):
         raise UserError(f"{options.run}: nothing can be written: {'; '.join(f'{k}: {r}' for k, r in reasons.items())}.")
