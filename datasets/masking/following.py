@@ -1,4 +1,4 @@
-"""Follow one animal from frame to frame, from a box around it.
+"""Follow one animal from frame to frame, from a box around it, a mask of it or strokes on it.
 
 Each frame adds three kinds of evidence for every pixel, as log odds: how far it stands out in a window around the
 animal (`saliency`), whether optical flow carries it from the mask of the frame before (`flow`), and whether its colour
@@ -6,10 +6,13 @@ is the animal's or its surroundings'. What the frame before had hidden is no par
 comes loose is dropped where most of it was hidden a while ago: it is a neighbour that the animal had covered.
 """
 
+from copy import copy
+
 import cv2
 import numpy as np
 from scipy.special import expit, logit
 
+from rewild4d.datasets.masking.correcting import corrected
 from rewild4d.datasets.masking.flow import Flow, carried
 from rewild4d.datasets.masking.grabcut import LOST, STRANGE, colors
 from rewild4d.datasets.masking.makers import Box
@@ -29,6 +32,8 @@ COLOURED, COLOURED_RANGE = 0.2, 2.5
 """The same of colours."""
 BINS, LEARNED = 16, 0.1
 """Colours a channel, and share of them that each frame teaches anew."""
+TAUGHT = 0.5
+"""The same of a frame that a person has corrected."""
 YOUNG = 0.5
 """A loose part is dropped where it was first seen less than this share of the largest part's frames ago."""
 LEAST_PART, TOUCHING = 0.02, 0.3
@@ -40,35 +45,77 @@ LEAST_AREA = 0.01
 
 
 class Follower:
-    """Follows an animal from a frame in which a box holds it.
+    """Follows an animal from a frame in which a box holds it, or marks tell where it is.
 
     Args:
         saliency: the network.
         image: the frame, uint8 [h, w, 3].
-        box: around the animal in its pixels.
+        box: around the animal in its pixels; None: around the marks on it.
+        said: marks (`marks`), int8 [h, w]; None where there are none.
 
     Attributes:
         mask: of the last frame, bool [h, w]; all False where the animal is lost.
     """
 
-    def __init__(self, saliency: Saliency, image: np.ndarray, box: Box) -> None:
+    def __init__(
+        self, saliency: Saliency, image: np.ndarray, box: Box | None = None, said: np.ndarray | None = None
+    ) -> None:
         self._saliency, self._flow = saliency, Flow()
-        self._start(image, box)
+        self._start(image, box, said)
         self._looks, self._areas = colors(image, self.mask.astype(np.uint8)), [int(self.mask.sum())]
 
-    def _start(self, image: np.ndarray, box: Box) -> None:
+    def _start(self, image: np.ndarray, box: Box | None, said: np.ndarray | None = None) -> None:
         self._grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         inside = np.zeros(self._grey.shape, bool)
-        left, top, right, bottom = _clipped(box, self._grey.shape)
-        inside[top:bottom, left:right] = True
-        odds = np.mean([self._outstanding(image, inside, wider) for wider in STARTS], axis=0)
-        odds = np.where(inside, odds, -9.0).astype(np.float32)
-        self.mask = _main_parts(odds > 0, inside)
+        if box is not None:
+            left, top, right, bottom = _clipped(box, self._grey.shape)
+            inside[top:bottom, left:right] = True
+            windows = [_window(inside, wider) for wider in STARTS]
+        else:
+            assert said is not None
+            inside[:] = True
+            windows = [(0, 0, inside.shape[1], inside.shape[0]), _window_about(said > 0)]
+        if said is not None and said.all():
+            odds = np.zeros(inside.shape)
+        else:
+            odds = np.mean([self._outstanding(image, window) for window in windows], axis=0)
+        chance = expit(np.where(inside, odds, -9.0))
+        self.mask = _main_parts(chance > 0.5, inside)
+        if said is not None:
+            chance = corrected(image, chance, said)
+            near = said > 0 if (said > 0).any() else inside
+            self.mask = _as_said(_main_parts(chance > 0.5, near, touching=0.0), said)
         if not self.mask.any():  # nothing stands out: the box itself is the best guess
             self.mask = inside
-        self._chance = expit(np.where(self.mask, np.maximum(odds, 1.0), odds))
+        self._chance = np.where(self.mask, np.maximum(chance, expit(1.0)), chance).astype(np.float32)
         self._seen = self.mask.astype(np.float32)  # for how many frames flow has carried each pixel
         self._colours = _Colours(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), self._chance)
+
+    def twin(self) -> "Follower":
+        """Return another follower that goes on from the same frame."""
+        other = copy(self)
+        other._areas, other._colours = [*self._areas], copy(self._colours)
+        return other
+
+    def correct(self, image: np.ndarray, said: np.ndarray) -> None:
+        """Change the last frame's mask as strokes say.
+
+        Args:
+            image: the last frame, uint8 [h, w, 3].
+            said: marks, int8 [h, w].
+        """
+        if not self.mask.any():
+            if (said > 0).any():
+                self._start(image, None, said)
+            return
+        chance = corrected(image, np.where(self.mask, self._chance.clip(0.6), self._chance.clip(0, 0.4)), said)
+        mask = _as_said(_main_parts(chance > 0.5, self.mask | (said > 0), touching=0.0), said)
+        oldest = float(self._seen.max())
+        self._seen = np.where(mask, np.where(self.mask, self._seen, oldest), 0).astype(np.float32)
+        self.mask, self._chance = mask, np.where(mask | (chance < 0.5), chance, 0.05).astype(np.float32)
+        if mask.any():
+            self._areas[-1] = int(mask.sum())
+            self._colours.learn(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), self._chance, TAUGHT)
 
     def step(self, image: np.ndarray) -> np.ndarray:
         """Return the mask in the next frame, bool [h, w]; all False where the animal is lost or not found again."""
@@ -81,7 +128,7 @@ class Follower:
         before = carried(self._chance, flow)
         near = before > 0.5
         lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
-        odds = self._outstanding(image, near) + COLOURED * self._colours.odds(lab)
+        odds = self._outstanding(image, _window(near)) + COLOURED * self._colours.odds(lab)
         soft = logit(cv2.GaussianBlur(before, (0, 0), SOFT).clip(0, 1)).clip(-CARRIED_RANGE, CARRIED_RANGE)
         odds += CARRIED * np.where(sure, 1.0, UNSURE) * soft
         odds -= np.where(sure, 0.0, UNCOVERED)
@@ -103,11 +150,11 @@ class Follower:
         if mask.any():
             self._colours.learn(lab, self._chance, LEARNED)
 
-    def _outstanding(self, image: np.ndarray, near: np.ndarray, wider: float = WINDOW) -> np.ndarray:
-        """Return the weighted log odds of standing out in the window around ``near``, [h, w]; the lowest outside."""
-        odds = np.full(near.shape, OUTSTANDING * OUTSTANDING_RANGE[0], np.float32)
-        if near.any():
-            left, top, right, bottom = _window(near, wider)
+    def _outstanding(self, image: np.ndarray, window: tuple[int, int, int, int]) -> np.ndarray:
+        """Return the weighted log odds of standing out in a window, [h, w]; the lowest outside."""
+        odds = np.full(image.shape[:2], OUTSTANDING * OUTSTANDING_RANGE[0], np.float32)
+        left, top, right, bottom = window
+        if right > left and bottom > top:
             found = logit(self._saliency(image[top:bottom, left:right])).clip(*OUTSTANDING_RANGE)
             odds[top:bottom, left:right] = OUTSTANDING * found
         return odds
@@ -169,6 +216,14 @@ def _window(mask: np.ndarray, wider: float = WINDOW) -> tuple[int, int, int, int
     return _clipped((left - x, top - y, width + 2 * x, height + 2 * y), mask.shape)
 
 
+def _window_about(strokes: np.ndarray) -> tuple[int, int, int, int]:
+    """Return the window about strokes that may cover little of an animal: half the frame at least."""
+    left, top, width, height = cv2.boundingRect(strokes.astype(np.uint8))
+    high, wide = strokes.shape
+    more_x, more_y = max(width, (wide / 2 - width) / 2), max(height, (high / 2 - height) / 2)
+    return _clipped((left - more_x, top - more_y, width + 2 * more_x, height + 2 * more_y), strokes.shape)
+
+
 def _window_of(mask: np.ndarray) -> np.ndarray:
     """Return the window around a mask as a mask."""
     inside = np.zeros(mask.shape, bool)
@@ -178,16 +233,22 @@ def _window_of(mask: np.ndarray) -> np.ndarray:
     return inside
 
 
-def _main_parts(mask: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Return the parts of a mask that are not small and lie mostly in ``near``."""
+def _main_parts(mask: np.ndarray, near: np.ndarray, touching: float = TOUCHING) -> np.ndarray:
+    """Return the parts of a mask that are not small and of which more than a share lies in ``near``."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     areas = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
     inside = np.bincount(labels[near], minlength=count)
-    is_kept = inside > TOUCHING * areas
+    is_kept = inside > touching * areas
     is_kept[0] = False
     if is_kept.any():
         is_kept &= areas >= LEAST_PART * areas[is_kept].max()
     found: np.ndarray = is_kept[labels]
+    return found
+
+
+def _as_said(mask: np.ndarray, said: np.ndarray) -> np.ndarray:
+    """Return a mask that keeps to the marks, however small."""
+    found: np.ndarray = (mask | (said > 0)) & (said >= 0)
     return found
 
 

@@ -8,7 +8,7 @@ import math
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -34,7 +34,8 @@ class Unmasked:
         stems: name of each frame's mask file, without suffix.
         size: width and height.
         images: every frame, uint8 [h, w, 3].
-        boxes: of the animal, by frame number; empty where nobody knows one.
+        boxes: of the animal, by the frame's place; empty where nobody knows one.
+        marks: what a person says of single frames (`marks`), by the frame's place, int8 [h, w].
     """
 
     title: str
@@ -42,6 +43,7 @@ class Unmasked:
     size: tuple[int, int]
     images: Callable[[], Iterator[np.ndarray]]
     boxes: dict[int, Box]
+    marks: dict[int, np.ndarray] = field(default_factory=dict)
 
 
 MaskMaker = Callable[[Unmasked], Iterator[np.ndarray]]
@@ -143,7 +145,7 @@ def parse_boxes(texts: tuple[str, ...], stems: Sequence[str]) -> dict[int, Box]:
     Raises:
         UserError: another form, an empty box, or a frame that is not there.
     """
-    boxes, places = {}, _places(stems)
+    boxes, places = {}, frame_places(stems)
     for text in texts:
         before, colon, numbers = text.rpartition(":")
         try:
@@ -160,7 +162,7 @@ def parse_boxes(texts: tuple[str, ...], stems: Sequence[str]) -> dict[int, Box]:
     return boxes
 
 
-def _places(stems: Sequence[str]) -> dict[str, int]:
+def frame_places(stems: Sequence[str]) -> dict[str, int]:
     """Return each frame's place by its name and by the number at its end, without leading zeros."""
     places = {stem.lstrip("0") or "0": place for place, stem in enumerate(stems)}
     for place, stem in enumerate(stems):

@@ -1,7 +1,9 @@
-"""Masks of a whole film from a box on any frame, or from nothing: `masks --tool track`."""
+"""Masks of a whole film from boxes, masks or strokes on any frames, or from nothing: `masks --tool track`."""
 
 import sys
+from bisect import bisect_right
 from collections.abc import Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -9,6 +11,7 @@ import numpy as np
 from rewild4d.datasets.masking.following import Follower, standing_out
 from rewild4d.datasets.masking.grabcut import rough_masks
 from rewild4d.datasets.masking.makers import Box, Unmasked
+from rewild4d.datasets.masking.marks import resized
 from rewild4d.datasets.masking.saliency import NAME, Saliency
 from rewild4d.errors import UserError
 from rewild4d.metrics.weights import FETCH, is_here, load_weights
@@ -20,9 +23,9 @@ RIVAL = 0.5
 
 
 def track_masks(source: Unmasked) -> Iterator[np.ndarray]:
-    """Follow the animal from each box to the next, and from the first one back to the film's start.
+    """Follow the animal on and back from each frame that somebody told about: a box, a whole mask or strokes.
 
-    Without a box it starts in the first frame in which one thing stands out. Without the network's weights the masks
+    Where nobody did it starts in the first frame in which one thing stands out. Without the network's weights the masks
     are rough ones, and a line says so.
 
     Raises:
@@ -34,7 +37,7 @@ def track_masks(source: Unmasked) -> Iterator[np.ndarray]:
             f"run: {FETCH} {NAME}",
             file=sys.stderr,
         )
-        yield from rough_masks(source)
+        yield from rough_masks(replace(source, boxes={**_boxes_of(source.marks), **source.boxes}))
         return
     saliency = Saliency(load_weights(NAME))
     scale = min(1.0, WORK_SIDE / max(source.size))
@@ -44,40 +47,96 @@ def track_masks(source: Unmasked) -> Iterator[np.ndarray]:
         yield found * np.uint8(255)
 
 
+def _boxes_of(marks: dict[int, np.ndarray]) -> dict[int, Box]:
+    """Return the boxes around whole masks, by the frame's place."""
+    whole = {place: said for place, said in marks.items() if said.all() and (said > 0).any()}
+    boxes = {place: cv2.boundingRect((said > 0).astype(np.uint8)) for place, said in whole.items()}
+    return {place: (float(x), float(y), float(wide), float(high)) for place, (x, y, wide, high) in boxes.items()}
+
+
 def _followed(source: Unmasked, saliency: Saliency, size: tuple[int, int]) -> Iterator[np.ndarray]:
-    """Yield a mask of each frame at the size at which frames are read."""
-    waiting: list[bytes] = []  # frames before the first start, compressed
-    follower: Follower | None = None
+    """Yield a mask of each frame at the size at which frames are read.
+
+    Of the frames between two that somebody told about, the nearer half is followed back from the second.
+    """
+    told = sorted({*source.boxes, *source.marks})
+    late: list[bytes] = []  # frames that are followed back, compressed
+    last, follower = -1, None
     for index, image in enumerate(source.images()):
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        box = _start_of(source, index, small, saliency, follower is None)
-        if box is not None:
-            follower = Follower(saliency, small, box)
-            yield from _backwards(waiting, Follower(saliency, small, box) if waiting else follower)
-            waiting = []
+        start = _start_of(source, index, small, saliency, follower)
+        if start is not None:
+            follower = start
+            yield from _backwards(late, follower)
+            late, last = [], index
             yield follower.mask
-        elif follower is not None:
+            continue
+        ahead = told[bisect_right(told, index) :]
+        if follower is not None and (not ahead or index - last <= ahead[0] - index):
             yield follower.step(small)
-        else:
-            waiting.append(cv2.imencode(".jpg", small, (cv2.IMWRITE_JPEG_QUALITY, 95))[1].tobytes())
+            continue
+        if follower is not None and not _is_start(source, ahead[0]):
+            follower.step(small)  # strokes will correct what it finds there
+        late.append(cv2.imencode(".jpg", small, (cv2.IMWRITE_JPEG_QUALITY, 95))[1].tobytes())
     if follower is None:
         raise UserError(f"{source.title}: nothing in it stands out; give a box: --box frame:left,top,width,height.")
 
 
-def _start_of(source: Unmasked, index: int, small: np.ndarray, saliency: Saliency, is_first: bool) -> Box | None:
-    """Return the box from which to follow the animal anew in a frame, in pixels of ``small``; None for none."""
-    across, down = small.shape[1] / source.size[0], small.shape[0] / source.size[1]
+def _is_start(source: Unmasked, index: int) -> bool:
+    """Whether the animal is followed anew from a frame; few strokes correct the mask there."""
+    return index in source.boxes or bool(source.marks[index].all() and source.marks[index].max() > 0)
+
+
+def _start_of(
+    source: Unmasked, index: int, small: np.ndarray, saliency: Saliency, follower: Follower | None
+) -> Follower | None:
+    """Return what follows the animal on from a frame that somebody told about, or in which one thing stands out first.
+
+    Args:
+        source: the film.
+        index: of the frame.
+        small: the frame as it is read.
+        saliency: the network.
+        follower: of the frames before.
+    """
+    said = source.marks.get(index)
+    if said is not None:
+        said = resized(said, (small.shape[1], small.shape[0]))
     if index in source.boxes:
-        left, top, width, height = source.boxes[index]
-        if left >= source.size[0] or top >= source.size[1] or left + width <= 0 or top + height <= 0:
-            wide, high = source.size
+        return Follower(saliency, small, _box(source, index, small), said)
+    if said is not None and follower is not None and not (said.all() and said.max() > 0):
+        follower.step(small)
+        follower.correct(small, said)
+        return follower
+    if said is not None:
+        if not (said > 0).any():
             raise UserError(
-                f"--box: expected a box inside the frame of {wide} x {high} pixels, got "
-                f"{left:g},{top:g},{width:g},{height:g}."
+                f"{source.title}: the first marked frame, {source.stems[index]}, has no stroke on the animal; "
+                "draw one, or give a box."
             )
-        return left * across, top * down, width * across, height * down
-    if source.boxes or not is_first:
+        return Follower(saliency, small, None, said)
+    if source.boxes or source.marks or follower is not None:
         return None
+    box = _outstanding(source, index, small, saliency)
+    return None if box is None else Follower(saliency, small, box)
+
+
+def _box(source: Unmasked, index: int, small: np.ndarray) -> Box:
+    """Return a frame's box in pixels of ``small``."""
+    left, top, width, height = source.boxes[index]
+    wide, high = source.size
+    if left >= wide or top >= high or left + width <= 0 or top + height <= 0:
+        raise UserError(
+            f"--box: expected a box inside the frame of {wide} x {high} pixels, got "
+            f"{left:g},{top:g},{width:g},{height:g}."
+        )
+    across, down = small.shape[1] / wide, small.shape[0] / high
+    return left * across, top * down, width * across, height * down
+
+
+def _outstanding(source: Unmasked, index: int, small: np.ndarray, saliency: Saliency) -> Box | None:
+    """Return the box of the one thing that stands out in a frame; None where nothing does."""
+    across, down = small.shape[1] / source.size[0], small.shape[0] / source.size[1]
     found = standing_out(saliency(small))
     if not found:
         return None
@@ -93,11 +152,11 @@ def _start_of(source: Unmasked, index: int, small: np.ndarray, saliency: Salienc
     return found[0][0]
 
 
-def _backwards(waiting: list[bytes], follower: Follower) -> list[np.ndarray]:
+def _backwards(late: list[bytes], follower: Follower) -> list[np.ndarray]:
     """Return the masks of the frames before a start, in the film's order."""
-    masks = []
-    for data in reversed(waiting):
+    masks, back = [], follower.twin()
+    for data in reversed(late):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
-        masks.append(follower.step(image))
+        masks.append(back.step(image))
     return masks[::-1]

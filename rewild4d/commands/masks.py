@@ -18,10 +18,11 @@ if TYPE_CHECKING:
 
     from rewild4d.datasets.masking.makers import MaskMaker
 
-DESCRIPTION = """Make masks of the animal. --tool track follows it offline from a box on any frame, or from what stands
-out in the first one (a network of 4.5 MB: `weights fetch u2netp`). --tool program runs any command that reads a folder
-of frames and writes a folder of masks; --tool grounded-sam2 uses Grounding DINO and SAM 2 (pip install -e '.[masks]';
-their weights are on Hugging Face); --tool rough is GrabCut from a box, without any network and inexact."""
+DESCRIPTION = """Make masks of the animal. --tool track follows it offline from boxes, strokes or whole masks on any
+frames, or from what stands out in the first one (a network of 4.5 MB: `weights fetch u2netp`). --tool program runs any
+command that reads a folder of frames and writes a folder of masks; --tool grounded-sam2 uses Grounding DINO and SAM 2
+(pip install -e '.[masks]'; their weights are on Hugging Face); --tool rough is GrabCut from a box, without any network
+and inexact."""
 TOOLS = ("track", "rough", "program", "grounded-sam2")
 
 
@@ -41,6 +42,9 @@ class Options:
         fps: frames per second that are used.
         box: around the animal, in pixels: left,top,width,height in the first frame; more of them as frame:left,...
             with the film's number of the frame, as in the mask's name and on the sheet of `check`.
+        marks: for track: folder of images named as the frames that you tell something about, green strokes on the
+            animal and red ones beside it, or a mask in black and white; of a data set with several cases one folder for
+            each in it.
         command: for program: a command line with {frames} and {masks} (and {boxes}) in it.
         timeout: for program: seconds that it may take; then it is killed with all that it started.
         text: for grounded-sam2: name of the animal, such as "dog".
@@ -59,6 +63,7 @@ class Options:
     end: float | None = None
     fps: float | None = None
     box: tuple[str, ...] = ()
+    marks: Path | None = None
     command: str | None = None
     timeout: float = TIMEOUT
     text: str = "animal"
@@ -71,12 +76,15 @@ def main(arguments: list[str]) -> int:
     options = parse_flags(Options, arguments, prog="rewild4d-bench masks", description=DESCRIPTION)
     check_timeout(options.timeout)
     from rewild4d.datasets.masking.makers import parse_boxes, write_masks
+    from rewild4d.datasets.masking.marks import read_marks
     from rewild4d.datasets.masking.masks import list_images
     from rewild4d.datasets.video.mask_check import SPLIT
     from rewild4d.machine import pick_device
     from rewild4d.progress import Progress
     from rewild4d.running.runner import choose_cases
 
+    if options.marks is not None and options.tool != "track":
+        raise UserError(f"--marks: only --tool track takes marks, got --tool {options.tool}.")
     device = pick_device(options.device)
     maker = make_maker(options, device)
     reader: Any = open_dataset(options.dataset, options.data, options)[1]
@@ -89,6 +97,10 @@ def main(arguments: list[str]) -> int:
         source = reader.unmasked(case)
         if options.box:
             source = replace(source, boxes=parse_boxes(options.box, source.stems))
+        if options.marks is not None:
+            told = options.marks if is_one else options.marks / case
+            if is_one or told.is_dir():
+                source = replace(source, marks=read_marks(told, source.stems, source.size))
         folder = options.out if is_one else options.out / case
         progress = Progress(f"{folder}: masks")
         try:
