@@ -74,7 +74,7 @@ class Follower:
         else:
             assert said is not None
             inside[:] = True
-            windows = [(0, 0, inside.shape[1], inside.shape[0]), _window_about(said > 0)]
+            windows = [(0, 0, image.shape[1], image.shape[0]), _window_about(said > 0)]
         if said is not None and said.all():
             odds = np.zeros(inside.shape)
         else:
