@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from rewild4d.contracts import Verdict
 from rewild4d.errors import UserError, reason
 from rewild4d.files import digest, regular_inside, write_text
 from rewild4d.foreign.texts import read_json
@@ -44,6 +45,7 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         distances: between sets of novel views and the input video, with all that decides their values.
         alignments: by which shapes were laid on the truth.
         networks: SHA-256 of the weights of the metric networks that scores leaned on.
+        verdicts: whether masks, prior and result can be trusted, and why; older records have none.
         features: SHA-256 of what `metrics.sets.FILE` beside the record holds: the features that ``distances`` were
             computed from, for scores pooled over cases; "" where there is no such file.
         diagnostics: what the method says of itself (Gaussians, joint motion, ...), and ``input_psnr_db``, the mean PSNR
@@ -79,6 +81,7 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     alignments: list[dict[str, Any]] = []
     networks: dict[str, str] = {}
     features: str = ""
+    verdicts: list[Verdict] = []
 
 
 class _Protocol(msgspec.Struct):

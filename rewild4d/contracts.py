@@ -173,6 +173,26 @@ class Finding:
     message: str
 
 
+@dataclass(frozen=True)
+class Verdict:
+    """Whether something can be trusted, in one sentence.
+
+    Attributes:
+        about: what is judged.
+        level: green: nothing speaks against it; yellow: look at it; red: do not rely on it.
+        reason: why.
+        advice: what to do; "" where nothing is to be done.
+    """
+
+    about: Literal["masks", "prior", "result"]
+    level: Literal["green", "yellow", "red"]
+    reason: str
+    advice: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.about}: {self.level}: {self.reason}" + (f"; {self.advice}" if self.advice else "")
+
+
 class DatasetReader(Protocol):
     """Reads one dataset folder into clips and truths.
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from rewild4d.contracts import Finding, Selection
 from rewild4d.datasets.masking.masks import FRAMED, MaskFacts, mask_facts
+from rewild4d.datasets.masking.trust import MaskTrust
 from rewild4d.datasets.video.wild import LEAST_AREA, TWIN, Video, lay_out
 from rewild4d.errors import UserError
 from rewild4d.files import atomic
@@ -30,7 +31,9 @@ SPLIT = Selection(cameras="unknown", size=256, framing="crop", split=5)
 
 
 def check_video(video: Video, sheets: Path | None) -> list[Finding]:
-    """Return findings on one video; its contact sheet goes to ``sheets``/<case>.png.
+    """Return findings on one video, first whether its masks can be trusted.
+
+    Its contact sheet goes to ``sheets``/<case>.png.
 
     Raises:
         UserError: files that cannot be read.
@@ -38,16 +41,20 @@ def check_video(video: Video, sheets: Path | None) -> list[Finding]:
     count = len(video.moments)
     shown = set(np.linspace(0, count - 1, min(count, SHEET_FRAMES)).round().astype(int).tolist())
     facts: list[MaskFacts | None] = []
+    trust = MaskTrust(count)
     tiles: dict[int, np.ndarray] = {}
     for index, (image, mask) in enumerate(zip(video.images(), video.masks(), strict=False)):
         facts.append(mask_facts(mask) if mask is not None else None)
+        trust.add(index, image, mask)
         if index in shown:
             tiles[index] = tile(image, mask)
     if len(facts) < count:
         raise UserError(f"{video.title}: expected {count} frames, got {len(facts)}: it is cut off.")
     found = {what: [i for i, fact in enumerate(facts) if test(fact or _NO_MASK)] for what, test in _TESTS.items()}
     troubles = found | {"a jump from the frame before": _jumps(facts)}
-    findings = [Finding("warning", video.name, note) for note in video.notes]
+    verdict = trust.verdict([moment.label for moment in video.moments])
+    findings = [Finding("ok" if verdict.level == "green" else "warning", video.name, str(verdict))]
+    findings += [Finding("warning", video.name, note) for note in video.notes]
     for what, indices in troubles.items():
         if indices:
             told = f"{what} in {len(indices)} of {count} frames: {_names(video, indices)}"

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rewild4d.contracts import Finding, Selection
+from rewild4d.contracts import Finding, Selection, Verdict
+from rewild4d.datasets.masking.trust import MaskTrust
 from rewild4d.datasets.video.mask_check import MOST_CASES, SPLIT, check_video, finding_of
 from rewild4d.datasets.video.wild import Video, original_images, split_video
 from rewild4d.errors import UserError
@@ -55,6 +56,14 @@ class VideoDataset(ABC):
     def originals(self, case: str, selection: Selection) -> Iterator[np.ndarray]:
         """Return the whole frames behind the images of a clip, uint8 [h, w, 3]; its errors are those of `video`."""
         return original_images(self.video(case), selection)
+
+    def judge_masks(self, case: str) -> Verdict:
+        """Return whether the masks of a case can be trusted; its errors are those of `video`."""
+        video = self.video(case)
+        trust = MaskTrust(len(video.moments))
+        for index, (image, mask) in enumerate(zip(video.images(), video.masks(), strict=False)):
+            trust.add(index, image, mask)
+        return trust.verdict([moment.label for moment in video.moments])
 
     def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
         """Verify every frame and mask of some cases (the first few default ones where none is named).

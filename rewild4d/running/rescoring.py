@@ -76,7 +76,8 @@ def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: s
     reconstruction = load_method(record.method).load(saved, device)
     fields, seconds = score(
         reconstruction, clip, truth, provenance.shown_clip(clip, record.prior), protocol=protocol, method=record.method,
-        prior=record.prior.get("choice", ""), reader=reader, folder=folder, device=device, title=record.case,
+        prior=record.prior.get("choice", ""), quality=record.prior.get("quality", {}), reader=reader, folder=folder,
+        device=device, title=record.case,
     )  # fmt: skip
     renewed = msgspec.structs.replace(
         record, **fields, coverage=coverage(clip, truth), timing=_timing(record, spent, seconds),

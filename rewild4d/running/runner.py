@@ -229,8 +229,8 @@ class Job:
             whole = with_cameras(self.clip, case.prior)  # also the frames that the fit was not shown
             fields, seconds = score(
                 reconstruction, whole, case.truth, case.clip, protocol=self.plan.protocol, method=self.entry.method,
-                prior=self.plan.prior.name, reader=self.plan.reader, folder=self.folder, device=self.plan.device,
-                title=self.title,
+                prior=self.plan.prior.name, quality=case.prior.quality, reader=self.plan.reader, folder=self.folder,
+                device=self.plan.device, title=self.title,
             )  # fmt: skip
             timing = self._timing(fit_seconds, seconds)
             path = write_record(self._record(case, **fields, coverage=seen, timing=timing), self.folder)

@@ -1,17 +1,20 @@
 """Score a fitted reconstruction for its record."""
 
 import time
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from rewild4d.contracts import DatasetReader, Reconstruction
+from rewild4d.contracts import DatasetReader, Reconstruction, Verdict
 from rewild4d.evaluation.measuring import evaluate
 from rewild4d.evaluation.placing import scale_of
 from rewild4d.evaluation.protocol import Protocol
 from rewild4d.evaluation.refining import ready_to_score
+from rewild4d.evaluation.trust import prior_verdict, result_verdict
+from rewild4d.metrics.score import Score
 from rewild4d.progress import Progress
 from rewild4d.running import provenance
 from rewild4d.types import Clip, Truth
@@ -21,7 +24,7 @@ from rewild4d.visualize.run_pictures import save_pictures
 
 def score(
     reconstruction: Reconstruction, clip: Clip, truth: Truth, shown: Clip, *, protocol: Protocol, method: str,
-    prior: str, reader: DatasetReader, folder: Path, device: torch.device, title: str,
+    prior: str, quality: Mapping[str, float], reader: DatasetReader, folder: Path, device: torch.device, title: str,
 ) -> tuple[dict[str, Any], float]:  # fmt: skip
     """Refine where the method asks for it, evaluate, draw.
 
@@ -33,6 +36,7 @@ def score(
         protocol: what is measured.
         method: its name.
         prior: the value of `--prior`.
+        quality: figures of the prior's fit.
         reader: of the data set.
         folder: of the run; gets pictures and features.
         device: that computes.
@@ -56,4 +60,19 @@ def score(
         **found.keep(folder),
         "diagnostics": provenance.diagnostics(reconstruction, shown, protocol.background),
         "marks": provenance.marks(method, prior, reconstruction),
+        "verdicts": _verdicts(reconstruction, clip, shown, quality, found.scores, reader),
     }, seconds
+
+
+def _verdicts(
+    reconstruction: Reconstruction, clip: Clip, shown: Clip, quality: Mapping[str, float], scores: Mapping[str, Score],
+    reader: DatasetReader,
+) -> list[Verdict]:  # fmt: skip
+    """Judge the masks of a film, a fitted prior and the result."""
+    judge: Callable[[str], Verdict] | None = getattr(reader, "judge_masks", None)
+    verdicts = [
+        judge(clip.name) if judge else None,
+        prior_verdict(quality, len(clip.frames) - len(shown.frames), len(clip.frames)),
+        result_verdict(reconstruction, shown.times, scores),
+    ]
+    return [verdict for verdict in verdicts if verdict is not None]

@@ -230,7 +230,8 @@ def test_check_tells_what_a_person_should_look_at(walk: Path, tmp_path: Path) ->
     sheet = np.asarray(Image.open(tmp_path / "sheets" / "clip.png"))
     assert sheet.shape[1] == 6 * 240
     clean = Davis(moving.davis(tmp_path / "d")).check()
-    assert [finding.level for finding in clean] == ["ok"]
+    assert [finding.level for finding in clean] == ["ok", "ok"]
+    assert clean[0].message.startswith("masks: green: ")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,106 @@
+"""Judge a prior and a result without the truth: figures of the fit, held-out masks, parts that came off the body."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.ndimage import label
+
+from rewild4d.contracts import Reconstruction, Verdict
+from rewild4d.metrics.score import Score
+from rewild4d.types import Splats
+
+FITS, HARDLY = 0.75, 0.6
+"""Mask IoU of the prior: below the first it is to be looked at, below the second it hardly fits."""
+LEFT_OUT, MOST = 0.25, 0.5
+"""Share of the frames that a method was not shown because their fitted cameras are far from the others'."""
+AGREED, UNDECIDED = 0.9, 0.01
+"""Head and tail: share of the frames in which clip and mirror image agree; cost by which the reversed heading loses."""
+COVERED, BARELY = 0.7, 0.5
+"""IoU of the render with the held-out masks: below the first look at it, below the second do not rely on it."""
+GAP, SEEN = 0.02, 0.3
+"""Gaussians of at least this opacity belong together whose cells of this share of the body's diagonal touch."""
+FAR = 100
+"""Cells from the body's corner at which a stray Gaussian counts at most."""
+APART, TORN = 0.02, 0.08
+"""Share of the visible Gaussians that are apart from the body: more, and it is to be looked at; limbs are torn off."""
+NEEDLE, NEEDLES = 0.1, 0.005
+"""A Gaussian longer than this share of the body's diagonal is a needle; share of them above which it is told."""
+
+
+def prior_verdict(quality: Mapping[str, float], left_out: int, frames: int) -> Verdict | None:
+    """Judge a fitted prior; None where nothing was fitted.
+
+    Args:
+        quality: figures of its fit (`Prior.quality`).
+        left_out: frames that the method was not shown.
+        frames: of the clip.
+    """
+    if "mask_iou" not in quality:
+        return None
+    iou = min(quality["mask_iou"], quality.get("mask_iou_flip", 1.0))
+    share = left_out / max(1, frames)
+    if iou < HARDLY:
+        told = f"the template hardly fits the masks (IoU {iou:.2f})"
+        return Verdict("prior", "red", told, "look at prior-only; is another --prior or rig nearer to this animal?")
+    if share > MOST:
+        return Verdict("prior", "red", f"{share:.0%} of the frames are left out, their cameras are far from the rest's")
+    agreed, margin = quality.get("facing_agreement", 1.0), quality.get("facing_margin", 1.0)
+    if agreed < AGREED or margin < UNDECIDED:
+        return Verdict("prior", "yellow", "head and tail are uncertain", "look at prior-only from four sides")
+    if iou < FITS:
+        return Verdict("prior", "yellow", f"the template fits the masks with IoU {iou:.2f} only", "look at prior-only")
+    if share > LEFT_OUT:
+        return Verdict("prior", "yellow", f"{share:.0%} of the frames are left out")
+    return Verdict("prior", "green", f"the template fits the masks (IoU {iou:.2f})")
+
+
+def result_verdict(reconstruction: Reconstruction, times: Sequence[float], scores: Mapping[str, Score]) -> Verdict:
+    """Judge a reconstruction by its Gaussians and by held-out masks.
+
+    Args:
+        reconstruction: of a clip.
+        times: of its frames, seconds.
+        scores: of the record; "iou" is asked for.
+    """
+    moments = [reconstruction.at(times[i]) for i in sorted({0, len(times) // 2, len(times) - 1})]
+    if not min(len(moment) for moment in moments):
+        return Verdict("result", "red", "there are no Gaussians")
+    apart, needles = (max(values) for values in zip(*map(body_facts, moments), strict=True))
+    look = "look at orbit.png"
+    iou = scores["iou"].value if "iou" in scores else None
+    if apart > TORN:
+        told = f"{apart:.0%} of the visible Gaussians are apart from the body: a limb is torn off, or a thing beside it"
+        return Verdict("result", "red", told, look)
+    if iou is not None and iou < BARELY:
+        return Verdict("result", "red", f"it covers the animal in held-out images with IoU {iou:.2f} only", look)
+    if apart > APART:
+        told = f"{apart:.0%} of the visible Gaussians are apart from the body"
+        return Verdict("result", "yellow", told, look)
+    if needles > NEEDLES:
+        return Verdict("result", "yellow", f"{needles:.1%} of the visible Gaussians are long needles", look)
+    if iou is not None and iou < COVERED:
+        return Verdict("result", "yellow", f"it covers the animal in held-out images with IoU {iou:.2f} only", look)
+    covers = "" if iou is None else f" and covers the animal in held-out images (IoU {iou:.2f})"
+    return Verdict("result", "green", f"it hangs together{covers}")
+
+
+def body_facts(splats: Splats) -> tuple[float, float]:
+    """Return the share of the visible Gaussians that are apart from the body, and the share of needles.
+
+    Args:
+        splats: at one time.
+    """
+    seen = splats.opacities.detach().cpu().numpy().ravel() >= SEEN
+    means = splats.means.detach().cpu().numpy()[seen]
+    if not len(means):
+        return 0.0, 0.0
+    low, high = np.quantile(means, (0.005, 0.995), axis=0)
+    diagonal = float(np.linalg.norm(high - low)) or 1.0
+    cells = np.clip((means - low) / (GAP * diagonal), -FAR, FAR).astype(int)
+    cells -= cells.min(axis=0)
+    filled = np.zeros(cells.max(axis=0) + 1, bool)
+    filled[tuple(cells.T)] = True
+    parts, _ = label(filled, np.ones((3, 3, 3)))
+    apart = 1 - np.bincount(parts[tuple(cells.T)]).max() / len(means)
+    longest = splats.scales.detach().cpu().numpy()[seen].max(axis=1)
+    return float(apart), float((longest > NEEDLE * diagonal).mean())
