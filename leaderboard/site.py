@@ -18,7 +18,7 @@ from rewild4d.files import regular_inside, replaced_folder
 from rewild4d.leaderboard.cells import cell
 from rewild4d.leaderboard.formats import ARROWS, html
 from rewild4d.leaderboard.layout import Table
-from rewild4d.leaderboard.media import FILMS, TIMEOUT, link, publish
+from rewild4d.leaderboard.media import FILMS, MOST_BYTES, TIMEOUT, link, publish
 from rewild4d.leaderboard.records import FILE, RunRecord
 from rewild4d.leaderboard.run_page import page_head, provenance_rows, score_rows, template
 from rewild4d.leaderboard.tables import columns_of, standings
@@ -41,6 +41,8 @@ POLICY = (
     "form-action 'none'"
 )
 """Content-Security-Policy of every page: its own style and script, known by their digests, and files of its folder."""
+REPORT = "report.html"
+"""What `report` writes beside a record."""
 Found = tuple[Path, RunRecord]
 
 
@@ -64,7 +66,13 @@ class Part:
     tables: Sequence[Sequence[Table]] = ()
 
 
-def build_site(parts: Sequence[Part], out: Path, say: Callable[[str], None] = tell, timeout: float = TIMEOUT) -> Path:
+def build_site(
+    parts: Sequence[Part],
+    out: Path,
+    say: Callable[[str], None] = tell,
+    timeout: float = TIMEOUT,
+    reports: bool = False,
+) -> Path:
     """Write the page of all records; an older one in the same place is replaced once the new one is complete.
 
     Args:
@@ -72,6 +80,8 @@ def build_site(parts: Sequence[Part], out: Path, say: Callable[[str], None] = te
         out: a folder that is not there, is empty, or was built before.
         say: called with a line for every picture that is left out, because it is none, is damaged or lies elsewhere.
         timeout: seconds that reading one film may take.
+        reports: publish the `REPORT` beside a record too. It is a page with a script of its own and cannot be checked
+            as a picture is, so only for folders of runs that come from no stranger.
 
     Returns:
         The path of its first page.
@@ -80,24 +90,24 @@ def build_site(parts: Sequence[Part], out: Path, say: Callable[[str], None] = te
         UserError: the folder holds something else, or cannot be written.
     """
     with replaced_folder(out, MARKER, "an earlier leaderboard") as building:
-        _write([replace(part, found=_unique(part.found)) for part in parts], building, say, timeout)
+        _write([replace(part, found=_unique(part.found)) for part in parts], building, say, timeout, reports)
     return out / "index.html"
 
 
-def _write(parts: Sequence[Part], folder: Path, say: Callable[[str], None], timeout: float) -> None:
+def _write(parts: Sequence[Part], folder: Path, say: Callable[[str], None], timeout: float, reports: bool) -> None:
     (folder / MARKER).touch()
     loader = jinja2.FunctionLoader(template)
     pages = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     assets = page_head(POLICY, template("style.css"), template("script.js"))
     found = _unique([pair for part in parts for pair in part.found])
 
-    def fill(pair: Found) -> list[dict[str, Any]]:
+    def fill(pair: Found) -> tuple[list[dict[str, Any]], bool]:
         source, record = pair
         page = folder / _place(record)
         page.mkdir(parents=True)
         regular_inside(source / FILE, source)
         shutil.copyfile(source / FILE, page / FILE)
-        return list(_copy_pictures(source, record, page, say, timeout))
+        return list(_copy_pictures(source, record, page, say, timeout)), _copy_report(source, page, say, reports)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         try:
@@ -105,10 +115,10 @@ def _write(parts: Sequence[Part], folder: Path, say: Callable[[str], None], time
         except BaseException:  # Ctrl-C does not wait for what has not begun
             pool.shutdown(cancel_futures=True)
             raise
-    for (_, record), pictures in zip(found, drawn, strict=True):
+    for (_, record), (pictures, report) in zip(found, drawn, strict=True):
         text = pages.get_template("run.html").render(
             title=f"{record.method} on {record.case}", record=record, scores=list(score_rows(record)),
-            pictures=pictures, provenance=provenance_rows(record), **assets,
+            pictures=pictures, report=report, provenance=provenance_rows(record), **assets,
         )  # fmt: skip
         (folder / _place(record) / "index.html").write_text(text, encoding="utf-8")
     shown = [_part(part, f"{index}-" if len(parts) > 1 else "") for index, part in enumerate(parts, 1)]
@@ -186,3 +196,21 @@ def _copy_pictures(
             continue
         is_film = name.lower().endswith(FILMS)
         yield {"href": link(name), "caption": CAPTIONS.get(stems[name], name), "video": is_film}
+
+
+def _copy_report(source: Path, page: Path, say: Callable[[str], None], wanted: bool) -> bool:
+    """Copy the page of a run that lies beside its record, and tell whether there is one now."""
+    path = source / REPORT
+    if not os.path.lexists(path):
+        return False
+    try:
+        if not wanted:
+            raise UserError(f"{path}: it has a script of its own; --reports publishes reports of runs that you trust.")
+        regular_inside(path, source)
+        if (size := path.stat().st_size) > MOST_BYTES:
+            raise UserError(f"{path}: expected at most {MOST_BYTES >> 20} MiB, got {size >> 20} MiB.")
+        shutil.copyfile(path, page / REPORT)
+    except UserError as error:
+        say(f"left out: {error}")
+        return False
+    return True

@@ -251,8 +251,10 @@ def test_scores_say_why_they_are_not_there_and_facts_what_the_record_knows(tmp_p
         data={"root": "/home/somebody/data", "licence": "CC BY 4.0"}, machine={"processor": "a CPU", "torch": "2.9"},
     )  # fmt: skip
     text = page.read_text()
-    for said in ("not computed", "no held-out frame", "upper bound: made from the truth", "0.812", "CC BY 4.0", "a CPU",
-                 "2: the prior does not know their cameras", "270; 30 more are invisible", "three 0.1", "MIT"):  # fmt: skip
+    for said in (
+        "not computed", "no held-out frame", "upper bound: made from the truth", "0.812", "CC BY 4.0", "a CPU",
+        "2: the prior does not know their cameras", "270; 30 more are invisible", "three 0.1", "MIT",
+    ):  # fmt: skip
         assert said in text, said
     assert "somebody" not in text, "a page is handed on: no user names"
 

@@ -15,6 +15,8 @@ before the first one), then, if "along" is true, one along the rows (0 before th
 number r of b bits, written as 2r or, below zero, -2r - 1: first the low bytes of the whole track, then, for b > 8, its
 high bytes.
 
+The page holds the whole in base 85 (RFC 1924), "," in place of "<".
+
 Rows lie along a space-filling curve: neighbours move alike, so that residuals are small and deflate well.
 
 Tracks: means (box of the cloud), quats (wxyz), scales (natural logarithm), opacities, colors. "frame" says what colours

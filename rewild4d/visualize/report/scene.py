@@ -19,9 +19,9 @@ from rewild4d.visualize.report.clouds import Collected, collect
 from rewild4d.visualize.report.layout import Cloud, pack
 from rewild4d.visualize.turntable import find_framing
 
-FILM_SIDE = 320
+FILM_SIDE = 256
 """Longest side of the film's frames in the page, pixels."""
-FILM_QUALITY = 80
+FILM_QUALITY = 75
 """Of their JPEG."""
 
 

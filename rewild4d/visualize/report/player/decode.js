@@ -1,10 +1,20 @@
 // Reads the packed Gaussians; the layout and its twin in Python: rewild4d/visualize/report/layout.py.
 const MAGIC = "R4SP", VERSION = 1, HEAD = 10;
 
-export function bytesOf(base64) {
-  const text = atob(base64.trim()), bytes = new Uint8Array(text.length);
-  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
-  return bytes;
+const DIGITS = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz!#$%&()*+-;,=>?@^_`{|}~";
+const VALUES = Uint8Array.from({ length: 128 }, (_, code) => Math.max(0, DIGITS.indexOf(String.fromCharCode(code))));
+
+// Text in base 85 as Python writes it, with "," for "<"; the last group may be short.
+export function bytesOf(text) {
+  text = text.trim();
+  const spare = (5 - text.length % 5) % 5, groups = (text.length + spare) / 5, view = new DataView(new ArrayBuffer(4 * groups));
+  text += "~".repeat(spare);
+  for (let group = 0, place = 0; group < groups; group++) {
+    let value = 0;
+    for (let digit = 0; digit < 5; digit++) value = 85 * value + VALUES[text.charCodeAt(place++)];
+    view.setUint32(4 * group, value);
+  }
+  return new Uint8Array(view.buffer, 0, 4 * groups - spare);
 }
 
 export async function inflate(bytes) {

@@ -141,6 +141,7 @@ function connect(player) {
 async function start() {
   const facts = JSON.parse($("scene").textContent), canvas = $("view");
   canvas.style.aspectRatio = $("film").style.aspectRatio = `${facts.width} / ${facts.height}`;
+  $("panels").style.maxWidth = `min(72rem, ${130 * facts.width / facts.height}vh)`;  // the controls stay in sight
   $("film").src = `data:image/jpeg;base64,${facts.film[0]}`;
   const clouds = decode(await inflate(bytesOf($("splats").textContent)));
   const player = new Player(facts, new Moments(clouds), canvas);
