@@ -61,6 +61,13 @@ class Swarm:
     def save(self, folder: object) -> None: ...
 
 
+class Growing(Swarm):
+    """A swarm of 100 Gaussians that are 200 from the fourth moment on, and gone at the last; some are invisible."""
+
+    def at(self, time: float) -> Splats:
+        return only(super().at(time), torch.arange(COUNT) < (100 if time < 0.1 else 0 if time > 0.2 else 200))
+
+
 def film(count: int = MOMENTS) -> Clip:
     """A film without cameras whose frames tell their place: grey, brighter from frame to frame."""
     frames = tuple(

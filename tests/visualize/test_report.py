@@ -17,7 +17,7 @@ from calling import call, refusal
 from media_files import picture
 from PIL import Image
 from records_for_tests import PROTOCOL, psnr, record
-from swarm import HEIGHT, MOMENTS, WIDTH, Colors, Swarm, film
+from swarm import HEIGHT, MOMENTS, WIDTH, Colors, Growing, Swarm, film
 
 from rewild4d.baselines.empty import EmptyReconstruction
 from rewild4d.leaderboard.records import RunRecord, write_record
@@ -120,6 +120,19 @@ def test_pictures_of_a_playing_film_are_in_their_order_of_depth(chromium: Any, t
         assert camera is not None
         assert off(pixels(drawn), swarm.at(moment / 24), camera)[0] < 0.004, moment
         assert pixels(frame).mean() == pytest.approx(moment / (MOMENTS - 1), abs=0.02), "the film is in step"
+
+
+@needs_chromium
+def test_gaussians_that_come_and_go_are_drawn_while_they_are_there(chromium: Any, tmp_path: Path) -> None:
+    swarm = Growing()
+    page, said = opened(chromium, written(tmp_path, swarm))
+    for moment in (0, 4, 5, 1):
+        camera = swarm.camera(moment / 24)
+        assert camera is not None
+        drawn = pixels(page.evaluate(DRAWN, moment))
+        assert off(drawn, swarm.at(moment / 24), camera)[0] < 0.004, moment
+        assert (drawn.min() == 1) == (moment == 5)
+    assert said == []
 
 
 @needs_chromium

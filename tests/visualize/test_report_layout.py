@@ -1,18 +1,18 @@
 """The packed Gaussians of a page: what is lost is half a step of each track, and a clip stays small."""
 
+import hashlib
 import json
+import re
 import struct
 import zlib
 from importlib import resources
 
 import numpy as np
 import pytest
-import torch
-from swarm import COUNT, MOMENTS, Colors, Swarm, film, only
+from swarm import COUNT, MOMENTS, Colors, Growing, Swarm, film, only
 
 from rewild4d.contracts import Reconstruction
 from rewild4d.harmonics import seen_colors
-from rewild4d.types import Splats
 from rewild4d.visualize.report.clouds import Collected, collect
 from rewild4d.visualize.report.layout import BITS, Cloud, curve_order, pack, steps, unpack
 
@@ -83,10 +83,6 @@ def test_colours_that_stay_nowhere_are_those_that_the_films_camera_sees() -> Non
 
 
 def test_moments_with_other_gaussians_are_clouds_of_their_own() -> None:
-    class Growing(Swarm):
-        def at(self, time: float) -> Splats:
-            return only(super().at(time), torch.arange(COUNT) < (100 if time < 0.1 else 0 if time > 0.2 else 200))
-
     found = unpack(pack(collected(Growing()).clouds))
     assert [(len(cloud), cloud.moments) for cloud in found] == [(90, 3), (180, 2), (0, 1)]
 
@@ -103,6 +99,16 @@ def test_neighbours_are_close_along_the_curve() -> None:
     ordered = points[curve_order(points)]
     assert np.linalg.norm(np.diff(ordered, axis=0), axis=1).mean() < 0.15
     assert np.linalg.norm(np.diff(points, axis=0), axis=1).mean() > 0.5
+
+
+def test_the_player_in_one_file_is_made_of_these_sources() -> None:
+    folder = resources.files("rewild4d.visualize.report") / "player"
+    names = sorted(file.name for file in folder.iterdir() if re.search(r"(?<!\.min)\.(js|json)$", file.name))
+    sha = hashlib.sha256()
+    for name in names:
+        sha.update(name.encode() + b"\0" + (folder / name).read_bytes() + b"\0")
+    bundle = (folder / "player.min.js").read_text("utf-8")
+    assert bundle.startswith(f"// sources {sha.hexdigest()}\n"), "npm ci && npm run build"
 
 
 def test_a_hundred_moments_of_twenty_thousand_gaussians_take_less_than_fifteen_megabytes() -> None:

@@ -28,6 +28,7 @@ class Player {
     this.time = facts.times[0];
     this.speed = 1;
     this.playing = false;
+    this.inSight = true;
     this.stale = true;
     this.shot = new THREE.PerspectiveCamera();
     this.views = new Views(facts, canvas, () => { this.stale = true; this.turned?.(); });
@@ -41,6 +42,7 @@ class Player {
     await this.mesh.initialized;
     this.scene.add(this.mesh);
     new ResizeObserver(() => this.resize()).observe(this.canvas);
+    new IntersectionObserver(([entry]) => { this.inSight = entry.isIntersecting; }).observe(this.canvas);
     this.resize();
     await this.show(0);
   }
@@ -86,6 +88,7 @@ class Player {
   tick(now) {
     const seconds = Math.min(0.25, (now - (this.now ?? now)) / 1000), { times, duration } = this.facts;
     this.now = now;
+    if (!this.inSight) return;
     this.views.update(seconds);
     if (this.playing) {
       this.time = times[0] + (this.time - times[0] + seconds * this.speed) % (duration - times[0]);

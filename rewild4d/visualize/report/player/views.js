@@ -27,7 +27,9 @@ export class Views {
 
   // Stands where the whole animal is seen from the film's side of it.
   aside() {
-    const center = this.centers[this.moment], distance = this.facts.radius / Math.sin(FIELD_OF_VIEW * Math.PI / 360);
+    // In a wide picture an animal, longer than it is high, may come nearer.
+    const { radius, width, height } = this.facts, center = this.centers[this.moment];
+    const distance = radius / Math.sin(FIELD_OF_VIEW * Math.PI / 360) * (width > height ? 0.85 : height / width);
     this.controls.target.copy(center);
     this.free.position.copy(center).addScaledVector(new THREE.Vector3(...this.facts.from), distance);
     this.free.fov = FIELD_OF_VIEW;
