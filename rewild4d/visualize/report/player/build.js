@@ -14,6 +14,7 @@ await build({
 const PARTS = ["three", "@sparkjsdev/spark", "fflate"];
 const texts = PARTS.map(name => {
   const { version, license, homepage } = JSON.parse(readFileSync(`node_modules/${name}/package.json`, "utf8"));
-  return `${name} ${version} (${license}) ${homepage ?? ""}\n\n${readFileSync(`node_modules/${name}/LICENSE`, "utf8").trim()}\n`;
+  const text = readFileSync(`node_modules/${name}/LICENSE`, "utf8").trim();
+  return `${name} ${version} (${license}) ${homepage ?? ""}\n\n${text}\n`;
 });
 writeFileSync("licences.txt", texts.join(`\n${"-".repeat(80)}\n\n`).replaceAll("\r", ""));

@@ -7,7 +7,8 @@ const VALUES = Uint8Array.from({ length: 128 }, (_, code) => Math.max(0, DIGITS.
 // Text in base 85 as Python writes it, with "," for "<"; the last group may be short.
 export function bytesOf(text) {
   text = text.trim();
-  const spare = (5 - text.length % 5) % 5, groups = (text.length + spare) / 5, view = new DataView(new ArrayBuffer(4 * groups));
+  const spare = (5 - text.length % 5) % 5, groups = (text.length + spare) / 5;
+  const view = new DataView(new ArrayBuffer(4 * groups));
   text += "~".repeat(spare);
   for (let group = 0, place = 0; group < groups; group++) {
     let value = 0;
@@ -22,18 +23,20 @@ export async function inflate(bytes) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-// Clouds: {count, moments, frame, tracks: {name: {moments, components, low, step, codes}}}, codes [moments, components, n].
+// Clouds: {count, moments, frame, tracks: {name: {moments, components, low, step, codes}}}, codes [moments, k, count].
 export function decode(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const magic = String.fromCharCode(...bytes.subarray(0, 4)), version = view.getUint16(4, true);
-  if (magic !== MAGIC || version !== VERSION) throw new Error(`expected ${MAGIC} of version ${VERSION}, got ${magic} of ${version}`);
+  if (magic !== MAGIC || version !== VERSION)
+    throw new Error(`expected ${MAGIC} of version ${VERSION}, got ${magic} of version ${version}`);
   let place = HEAD + view.getUint32(6, true);
   const { clouds } = JSON.parse(new TextDecoder().decode(bytes.subarray(HEAD, place)));
   return clouds.map(({ count, moments, frame, tracks }) => ({
     count, moments, frame,
     tracks: Object.fromEntries(tracks.map(track => {
       const size = track.moments * track.components * count, wide = track.bits > 8;
-      const low = bytes.subarray(place, place + size), high = wide ? bytes.subarray(place + size, place + 2 * size) : null;
+      const low = bytes.subarray(place, place + size);
+      const high = wide ? bytes.subarray(place + size, place + 2 * size) : null;
       place += wide ? 2 * size : size;
       const largest = 2 ** track.bits - 1;
       return [track.name, {

@@ -1,4 +1,5 @@
-// View-dependent colour: real spherical harmonics in the order and sign of 3D Gaussian Splatting (rewild4d/harmonics.py).
+// View-dependent colour: real spherical harmonics in the order and sign of 3D Gaussian Splatting, as in
+// rewild4d/harmonics.py.
 import * as THREE from "three";
 
 const C0 = 0.28209479177387814, C1 = 0.4886025119029199;

@@ -158,7 +158,8 @@ async function start() {
 }
 
 function fail(error) {
-  $("trouble").textContent = `The player does not run in this browser (it needs WebGL 2 and WebAssembly): ${error.message}`;
+  const needs = "it needs WebGL 2 and WebAssembly";
+  $("trouble").textContent = `The player does not run in this browser (${needs}): ${error.message}`;
   $("trouble").hidden = false;
   document.documentElement.dataset.player = "failed";
 }

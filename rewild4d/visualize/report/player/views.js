@@ -2,7 +2,8 @@
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
-const TURN_SECONDS = 12, FIELD_OF_VIEW = 25, AXES = new THREE.Matrix4().makeScale(1, -1, -1);  // OpenCV's y down, z ahead
+const TURN_SECONDS = 12, FIELD_OF_VIEW = 25;
+const AXES = new THREE.Matrix4().makeScale(1, -1, -1);  // from OpenCV's: y down, z ahead
 
 export class Views {
   constructor(facts, canvas, changed) {
