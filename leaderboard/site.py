@@ -1,7 +1,5 @@
 """The leaderboard as a static page: records in, a folder of HTML out that needs no server and no network."""
 
-import base64
-import hashlib
 import os
 import re
 import shutil
@@ -9,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +16,13 @@ from markupsafe import Markup
 from rewild4d.errors import UserError
 from rewild4d.files import regular_inside, replaced_folder
 from rewild4d.leaderboard.cells import cell
-from rewild4d.leaderboard.curves import curve, moments
 from rewild4d.leaderboard.formats import ARROWS, html
 from rewild4d.leaderboard.layout import Table
-from rewild4d.leaderboard.media import FILMS, TIMEOUT, link, publish
+from rewild4d.leaderboard.media import FILMS, MOST_BYTES, TIMEOUT, link, publish
 from rewild4d.leaderboard.records import FILE, RunRecord
+from rewild4d.leaderboard.run_page import page_head, provenance_rows, score_rows, template
 from rewild4d.leaderboard.tables import columns_of, standings
-from rewild4d.leaderboard.variants import by_protocol, flat, variants
+from rewild4d.leaderboard.variants import by_protocol, variants
 
 TITLE = "Reconstructing 4D animals from one video"
 MARKER = ".rewild4d-leaderboard"
@@ -44,6 +41,8 @@ POLICY = (
     "form-action 'none'"
 )
 """Content-Security-Policy of every page: its own style and script, known by their digests, and files of its folder."""
+REPORT = "report.html"
+"""What `report` writes beside a record."""
 Found = tuple[Path, RunRecord]
 
 
@@ -67,7 +66,13 @@ class Part:
     tables: Sequence[Sequence[Table]] = ()
 
 
-def build_site(parts: Sequence[Part], out: Path, say: Callable[[str], None] = tell, timeout: float = TIMEOUT) -> Path:
+def build_site(
+    parts: Sequence[Part],
+    out: Path,
+    say: Callable[[str], None] = tell,
+    timeout: float = TIMEOUT,
+    reports: bool = False,
+) -> Path:
     """Write the page of all records; an older one in the same place is replaced once the new one is complete.
 
     Args:
@@ -75,6 +80,8 @@ def build_site(parts: Sequence[Part], out: Path, say: Callable[[str], None] = te
         out: a folder that is not there, is empty, or was built before.
         say: called with a line for every picture that is left out, because it is none, is damaged or lies elsewhere.
         timeout: seconds that reading one film may take.
+        reports: publish the `REPORT` beside a record too. It is a page with a script of its own and cannot be checked
+            as a picture is, so only for folders of runs that come from no stranger.
 
     Returns:
         The path of its first page.
@@ -83,24 +90,24 @@ def build_site(parts: Sequence[Part], out: Path, say: Callable[[str], None] = te
         UserError: the folder holds something else, or cannot be written.
     """
     with replaced_folder(out, MARKER, "an earlier leaderboard") as building:
-        _write([replace(part, found=_unique(part.found)) for part in parts], building, say, timeout)
+        _write([replace(part, found=_unique(part.found)) for part in parts], building, say, timeout, reports)
     return out / "index.html"
 
 
-def _write(parts: Sequence[Part], folder: Path, say: Callable[[str], None], timeout: float) -> None:
+def _write(parts: Sequence[Part], folder: Path, say: Callable[[str], None], timeout: float, reports: bool) -> None:
     (folder / MARKER).touch()
-    loader = jinja2.FunctionLoader(_template)
+    loader = jinja2.FunctionLoader(template)
     pages = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    assets = _assets()
+    assets = page_head(POLICY, template("style.css"), template("script.js"))
     found = _unique([pair for part in parts for pair in part.found])
 
-    def fill(pair: Found) -> list[dict[str, Any]]:
+    def fill(pair: Found) -> tuple[list[dict[str, Any]], bool]:
         source, record = pair
         page = folder / _place(record)
         page.mkdir(parents=True)
         regular_inside(source / FILE, source)
         shutil.copyfile(source / FILE, page / FILE)
-        return list(_copy_pictures(source, record, page, say, timeout))
+        return list(_copy_pictures(source, record, page, say, timeout)), _copy_report(source, page, say, reports)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         try:
@@ -108,10 +115,10 @@ def _write(parts: Sequence[Part], folder: Path, say: Callable[[str], None], time
         except BaseException:  # Ctrl-C does not wait for what has not begun
             pool.shutdown(cancel_futures=True)
             raise
-    for (_, record), pictures in zip(found, drawn, strict=True):
+    for (_, record), (pictures, report) in zip(found, drawn, strict=True):
         text = pages.get_template("run.html").render(
-            title=f"{record.method} on {record.case}", record=record, scores=list(_scores(record)),
-            pictures=pictures, provenance=_provenance(record), **assets,
+            title=f"{record.method} on {record.case}", record=record, scores=list(score_rows(record)),
+            pictures=pictures, report=report, provenance=provenance_rows(record), **assets,
         )  # fmt: skip
         (folder / _place(record) / "index.html").write_text(text, encoding="utf-8")
     shown = [_part(part, f"{index}-" if len(parts) > 1 else "") for index, part in enumerate(parts, 1)]
@@ -119,14 +126,6 @@ def _write(parts: Sequence[Part], folder: Path, say: Callable[[str], None], time
         title=TITLE, counts=_counts(found), parts=shown, arrows=ARROWS, **assets
     )
     (folder / "index.html").write_text(text, encoding="utf-8")
-
-
-def _assets() -> dict[str, Any]:
-    """Return what stands in the head of every page."""
-    texts = {name: _template(f"{name}{suffix}") for name, suffix in (("style", ".css"), ("script", ".js"))}
-    digests = {name: base64.b64encode(hashlib.sha256(text.encode()).digest()) for name, text in texts.items()}
-    policy = POLICY.format(**{name: f"'sha256-{value.decode()}'" for name, value in digests.items()})
-    return {"policy": policy, **{name: Markup(text) for name, text in texts.items()}}
 
 
 def _part(part: Part, key: str) -> dict[str, Any]:
@@ -139,10 +138,6 @@ def _part(part: Part, key: str) -> dict[str, Any]:
 def _shown(table: Table, key: str) -> dict[str, Any]:
     name = key + table.name
     return {"name": name, "title": table.title, "html": Markup(html(replace(table, name=name)))}
-
-
-def _template(name: str) -> str:
-    return (resources.files("rewild4d.leaderboard") / "templates" / name).read_text(encoding="utf-8")
 
 
 def _unique(found: Sequence[Found]) -> list[Found]:
@@ -184,19 +179,6 @@ def _run_row(record: RunRecord, label: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _scores(record: RunRecord) -> Iterator[dict[str, Any]]:
-    """Fill in each score on a run's page, with a curve where it has values at several moments."""
-    names = [name for name in record.protocol["scores"] if name in record.scores]
-    for column in columns_of([record], names):
-        score = record.scores[column.score]
-        points = moments(score, record.items)
-        yield {
-            "title": f"{column.title.partition(',')[0]} {ARROWS[column.better]}", "score": score,
-            "text": cell([record], [record.case], column.score).text,
-            "curve": Markup(curve(column.title, points)) if len(points) > 1 else "",
-        }  # fmt: skip
-
-
 def _copy_pictures(
     source: Path, record: RunRecord, page: Path, say: Callable[[str], None], timeout: float
 ) -> Iterator[dict[str, Any]]:
@@ -216,18 +198,19 @@ def _copy_pictures(
         yield {"href": link(name), "caption": CAPTIONS.get(stems[name], name), "video": is_film}
 
 
-def _provenance(record: RunRecord) -> list[tuple[str, list[tuple[str, str]]]]:
-    """List every part of the record that is no score as names and values."""
-    parts = {
-        "Settings of the method": record.config, "Data": record.data, "Prior": record.prior,
-        "Protocol": record.protocol, "What the numbers lean on": record.coverage,
-        "What the method says of itself, and how it fits its input": record.diagnostics,
-        "Networks of the metrics": record.networks, "Code": record.code, "Machine": record.machine,
-        "Time": {"started": record.timing.started, "fit, s": record.timing.fit_seconds,
-                 "evaluation, s": record.timing.evaluate_seconds, "peak memory, MiB": record.timing.peak_memory_mib},
-    }  # fmt: skip
-    return [
-        (title, [(name, ", ".join(map(str, value)) if isinstance(value, list) else str(value))
-                 for name, value in flat(part).items()])
-        for title, part in parts.items() if part
-    ]  # fmt: skip
+def _copy_report(source: Path, page: Path, say: Callable[[str], None], wanted: bool) -> bool:
+    """Copy the page of a run that lies beside its record, and tell whether there is one now."""
+    path = source / REPORT
+    if not os.path.lexists(path):
+        return False
+    try:
+        if not wanted:
+            raise UserError(f"{path}: it has a script of its own; --reports publishes reports of runs that you trust.")
+        regular_inside(path, source)
+        if (size := path.stat().st_size) > MOST_BYTES:
+            raise UserError(f"{path}: expected at most {MOST_BYTES >> 20} MiB, got {size >> 20} MiB.")
+        shutil.copyfile(path, page / REPORT)
+    except UserError as error:
+        say(f"left out: {error}")
+        return False
+    return True

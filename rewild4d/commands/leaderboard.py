@@ -38,12 +38,15 @@ class BuildOptions:
         out: folder of the page: new, empty, or an earlier page, which is replaced.
         preset: of the runs in the named tables; each table's own where it is left out.
         timeout: seconds that ffmpeg may take to read one film.
+        reports: publish the pages that `report` wrote beside records. They have a script of their own: only for runs
+            that come from no stranger.
     """
 
     runs: tuple[Path, ...] = (Path("runs"),)
     out: Path = Path("leaderboard-page")
     preset: str = ""
     timeout: float = 120.0
+    reports: bool = False
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,7 @@ def build(arguments: list[str]) -> int:
         parts.append(Part(title_of(folder), found, _named([record for _, record in found], options.preset)))
     parts = [part for part in parts if part.found]
     _require_records(options.runs, parts)
-    print(build_site(parts, options.out.absolute(), timeout=options.timeout))
+    print(build_site(parts, options.out.absolute(), timeout=options.timeout, reports=options.reports))
     return 0
 
 

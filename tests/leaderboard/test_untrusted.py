@@ -162,6 +162,20 @@ def test_a_film_is_decoded_and_its_images_are_copied_alone(run: Path, tmp_path: 
     assert nothing_holds(page, CODE)
 
 
+def test_a_report_is_published_only_where_somebody_says_so(run: Path, tmp_path: Path) -> None:
+    (run / "report.html").write_bytes(CODE)
+    page, said = built(run, tmp_path)
+    (sentence,) = said
+    assert f"{run / 'report.html'}: it has a script of its own; --reports" in sentence
+    assert nothing_holds(tmp_path / "page", CODE) and "report.html" not in (page / "index.html").read_text()
+    build_site([Part("Runs", find_records(run.parent))], tmp_path / "page", said.append, reports=True)
+    assert (page / "report.html").read_bytes() == CODE and '<a href="report.html">' in (page / "index.html").read_text()
+    (run / "report.html").unlink()
+    (run / "report.html").symlink_to(tmp_path / "secret")
+    build_site([Part("Runs", find_records(run.parent))], tmp_path / "page", said.append, reports=True)
+    assert "got a link that leads out of it" in said[-1] and nothing_holds(tmp_path / "page", SECRET)
+
+
 @pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
 def test_bombs_are_told_from_their_headers(tmp_path: Path) -> None:
     def chunk(name: bytes, body: bytes) -> bytes:
