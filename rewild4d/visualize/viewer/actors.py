@@ -15,7 +15,7 @@ from rewild4d.visualize.viewer.moments import Moment, Moments
 from rewild4d.visualize.viewer.staging import Paint, Shape, Stage
 
 Draw = Literal["splats", "points"]
-POINT = 0.02
+POINT = 0.03
 """Size of a point in stage units."""
 BODY = 26
 """Opacity, of 255, from which a Gaussian is a point."""

@@ -47,17 +47,17 @@ def centered(camera: Camera) -> Camera:
     A browser's camera has its principal point in the middle. Where a camera's is elsewhere (a crop of a film), this one
     sees the same points hide one another.
     """
-    rotation, intrinsics = camera.world_to_camera[:3, :3].double(), camera.intrinsics.double()
-    middle = torch.tensor((camera.width / 2, camera.height / 2, 1.0), dtype=torch.float64)
-    ray = torch.linalg.inv(intrinsics) @ middle
-    ahead = normalize(rotation.T @ ray, dim=0)
+    rotation, width, height = camera.world_to_camera[:3, :3].double(), camera.width, camera.height
+    pixels = torch.tensor([(u, v, 1.0) for u in (0, width / 2, width) for v in (0, height / 2, height)]).double()
+    rays = pixels @ torch.linalg.inv(camera.intrinsics.double()).T
+    ahead = normalize(rotation.T @ rays[4], dim=0)  # of the middle of the image
     right = normalize(rotation[0] - (rotation[0] @ ahead) * ahead, dim=0)
     turned = torch.stack((right, torch.linalg.cross(ahead, right), ahead))
-    # The middle of a crop is farther from the centre than the principal point.
-    focal = intrinsics.diagonal() * torch.tensor((float(ray.norm()), float(ray.norm()), 1.0), dtype=torch.float64)
-    straight = torch.diag(focal)
-    straight[:2, 2] = middle[:2]
-    return Camera(rigid(turned, -turned @ camera.center.double()), straight, camera.width, camera.height)
+    seen = rays @ (turned @ rotation.T).T
+    focal = torch.tensor((width, height)).double() / 2 / (seen[:, :2] / seen[:, 2:]).abs().amax(0)
+    straight = torch.diag(torch.cat((focal, torch.ones(1).double())))
+    straight[:2, 2] = torch.tensor((width, height)).double() / 2
+    return Camera(rigid(turned, -turned @ camera.center.double()), straight, width, height)
 
 
 def look_through(camera: Camera, aspect: float, center: Tensor) -> Look:

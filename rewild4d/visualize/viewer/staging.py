@@ -27,7 +27,7 @@ from rewild4d.transforms import (
 )
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Splats, Truth
 from rewild4d.visualize.pictures import part_colors
-from rewild4d.visualize.turntable import Framing, find_framing
+from rewild4d.visualize.turntable import Framing, find_framing, solid
 
 Shape = Literal["deformed", "posed", "canonical"]
 """As the method answers; skinned by the joints alone, without the deformation; at rest."""
@@ -35,12 +35,8 @@ Paint = Literal["appearance", "parts"]
 """The animal's colours without what depends on the view; a colour for the bone of largest skinning weight."""
 SAMPLED = 16
 """Times at which place and size are measured."""
-VISIBLE = 0.1
-"""Opacity from which a Gaussian counts as the animal's body."""
 STRAY = 0.002
 """Share of the Gaussians that may lie below the ground."""
-SOLE = 0.06
-"""Height of the lowest centres above the ground, in stage units: Gaussians have an extent."""
 
 
 @dataclass(frozen=True)
@@ -153,11 +149,12 @@ def set_stage(run: Run) -> Stage:
     rotation = torch.stack((torch.linalg.cross(up, ahead), up, ahead))
     scale, center = OBJECT_DIAGONAL / (2 * framing.radius), framing.middles.mean(0)
     matrix = similarity(scale, rotation, -scale * rotation @ center)
-    lowest = [_body(run.reconstruction.at(times[row])) @ (scale * rotation[1]) for row in rows[:: len(rows) // 4 or 1]]
+    few = [solid(run.reconstruction.at(times[row])) for row in rows[:: len(rows) // 4 or 1]]
+    lowest = [means @ (scale * rotation[1]) - scale * radii for means, radii in few]
     away = float((framing.middles - center).norm(dim=1).max())
     return Stage(
         run, matrix, _stand(run.reconstruction), ground=min(float(torch.quantile(y, STRAY)) for y in lowest)
-        + float(matrix[1, 3]) - SOLE, reach=float(scale) * (framing.radius + away), azimuth=framing.azimuth,
+        + float(matrix[1, 3]), reach=float(scale) * (framing.radius + away), azimuth=framing.azimuth,
         shapes=_shapes(run.reconstruction), paints=_paints(run.reconstruction, len(first)),
     )  # fmt: skip
 
@@ -194,16 +191,9 @@ def _stand(reconstruction: Reconstruction) -> Tensor:
     """Return the translation that puts the middle of the shape at rest at the origin, float64, [4, 4]."""
     matrix = torch.eye(4, dtype=torch.float64)
     if hasattr(reconstruction, "canonical"):
-        body = _body(reconstruction.canonical())
+        body, _ = solid(reconstruction.canonical())
         matrix[:3, 3] = -(body.amin(0) + body.amax(0)) / 2
     return matrix
-
-
-def _body(splats: Splats) -> Tensor:
-    """Return centres of the visible Gaussians, of all where none is visible, float64, [n, 3]."""
-    shown = splats.opacities.detach().cpu() > VISIBLE
-    means = splats.means.detach().double().cpu()
-    return means[shown] if bool(shown.any()) else means
 
 
 def _on_cpu(splats: Splats) -> Splats:
