@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,6 +64,8 @@ def main(arguments: list[str]) -> int:
     try:
         opened = [open_run(folder, options.data, device) for folder in options.runs]
         page = Page(server, [set_stage(run) for run in _runs(opened)])
+        megabytes = sum(actor.moments.nbytes for actor in page.actors) / 1e6
+        print(f"{len(page.times)} moments, {megabytes:.2f} MB each once it was shown", file=sys.stderr)
         print(f"http://{options.host}:{server.get_port()}  (Ctrl-C ends it)", flush=True)
         page.serve()
     except KeyboardInterrupt:

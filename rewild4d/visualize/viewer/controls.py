@@ -1,13 +1,13 @@
 """The panel beside the scene. What stands here is the same in every tab; only a tab's camera is its own."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import viser
 
 from rewild4d.visualize.viewer.comparing import BRIGHTEST
-from rewild4d.visualize.viewer.staging import Stage
+from rewild4d.visualize.viewer.staging import Paint, Shape, Stage
 
 SPEEDS = {"¼ ×": 0.25, "½ ×": 0.5, "1 ×": 1.0, "2 ×": 2.0}
 SIDES = ("film", "side", "front", "back")
@@ -17,6 +17,11 @@ BLANK = np.full((8, 8, 3), 255, np.uint8)
 
 class Controls:
     """Make the panel's elements, and tell of every change that a person makes.
+
+    Args:
+        server: of the page.
+        stages: of the runs.
+        changed: called after each.
 
     Attributes:
         moment: slider, index of the moment.
@@ -28,7 +33,7 @@ class Controls:
         self._changed, self.playing = changed, False
         gui, times = server.gui, stages[0].run.clip.times
         self.notice = gui.add_markdown("", visible=False)
-        self.moment = gui.add_slider("Moment", 0, max(len(times) - 1, 0), 1, 0, disabled=len(times) == 1)
+        self.moment: Any = gui.add_slider("Moment", 0, max(len(times) - 1, 0), 1, 0, disabled=len(times) == 1)
         self.clock = gui.add_markdown("")
         self.play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY, disabled=len(times) == 1)
         self.play.on_click(self._toggle)
@@ -37,7 +42,7 @@ class Controls:
         with tabs.add_tab("Show"):
             self.shape = gui.add_dropdown("Shape", _all(stage.shapes for stage in stages), hint=SHAPE_HINT)
             self.paint = gui.add_dropdown("Colour", _all(stage.paints for stage in stages), hint=PAINT_HINT)
-            self.draw = gui.add_dropdown("Draw as", ("splats", "points"))
+            self.draw: Any = gui.add_dropdown("Draw as", ("splats", "points"))
             self.frustum = gui.add_checkbox("Film's camera in the scene", False)
         with tabs.add_tab("Look") as self.looking:
             self.sides = gui.add_button_group("Look from", SIDES)
@@ -63,8 +68,13 @@ class Controls:
 
     def show_comparison(self, shown: bool) -> None:
         """Show or hide what belongs to the held-out view."""
-        for element in (self.view, self.stand, self.truth, self.scale, *self.renders):
+        elements: list[Any] = [self.view, self.stand, self.truth, self.scale, *self.renders]
+        for element in elements:
             element.visible = shown
+
+    def chosen(self) -> tuple[Shape, Paint]:
+        """Return what is to be shown, and in which colours."""
+        return cast(Shape, self.shape.value), cast(Paint, self.paint.value)
 
     def say(self, sentence: str) -> None:
         """Show a sentence at the top of the panel, in every tab; "" takes it away."""

@@ -59,6 +59,7 @@ class Page:
         self._center = torch.stack(offsets).mean(0)
         self._reach = max(stage.reach for stage in stages) + float(self._center.norm())
         self._azimuth = stages[0].azimuth
+        self._begin()
         self._answer()
 
     def serve(self) -> None:
@@ -85,7 +86,7 @@ class Page:
         controls, now = self.controls, self.times[moment]
         with self.server.atomic():
             for actor in self.actors:
-                actor.show(now, controls.shape.value, controls.paint.value, controls.draw.value)
+                actor.show(now, *controls.chosen(), controls.draw.value)
                 actor.show_camera(actor.frame(now), controls.frustum.value)
             if moment != self._pictured:
                 controls.image.image = to_bytes(self.actors[0].frame(now).over(1.0))
@@ -158,6 +159,12 @@ class Page:
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.set_panel_label(", ".join(dict.fromkeys(stage.run.clip.name for stage in stages)))
 
+    def _begin(self) -> None:
+        """Set the camera with which a tab opens and to which it returns; a phone's is set when it is there."""
+        look, camera = self._find_look("start", aspect=1.0), self.server.initial_camera
+        if look is not None:
+            camera.position, camera.look_at, camera.up, camera.fov = look
+
     def _answer(self) -> None:
         """Answer to tabs that come and go, and to buttons, each for the tab in which it was clicked."""
         controls = self.controls
@@ -208,6 +215,6 @@ class Page:
         return "".join(c if c.isalnum() else "-" for c in f"{run.clip.name}-{now - self.times[0]:.2f}s")
 
     def _save_film(self, client: viser.ClientHandle | None) -> None:
-        controls, stages = self.controls, [actor.stage for actor in self.actors]
+        stages = [actor.stage for actor in self.actors]
         if client is not None:
-            save_film(client, stages, controls.shape.value, controls.paint.value, self._rendering, self._title())
+            save_film(client, stages, *self.controls.chosen(), self._rendering, self._title())
