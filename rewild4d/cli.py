@@ -19,6 +19,7 @@ COMMANDS = {
     "evaluate": ("evaluate", "score a saved reconstruction again"),
     "masks": ("masks", "make masks of the animal for a video that has none"),
     "export": ("export", "write a reconstruction as .ply, .glb, cameras and films"),
+    "view": ("view", "look at runs in the browser, from any side at any time"),
     "report": ("report", "write one HTML page of a run, with a player of its Gaussians"),
     "score": ("score", "score two folders of images or clips, or two .ply files, without our methods"),
     "table": ("table", "print a table of what was found"),

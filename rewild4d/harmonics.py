@@ -150,6 +150,12 @@ def seen_colors(splats: Splats, eye: Tensor) -> Tensor:
     return (torch.einsum("nk,nkc->nc", values, splats.colors) + 0.5).clamp_min(0)
 
 
+def base_colors(splats: Splats) -> Tensor:
+    """Return RGB of each Gaussian without what depends on the view, in [0, 1], [n, 3]."""
+    colors = splats.colors[:, 0]
+    return (colors if splats.colors.shape[1] == 1 else 0.5 + C0 * colors).clamp(0, 1)
+
+
 def products(a: Tensor, b: Tensor) -> Tensor:
     """Compute all a_i b_j, i the slower index, [..., n] and [..., m] -> [..., n m].
 

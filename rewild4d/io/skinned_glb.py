@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rewild4d.contracts import Articulated
 from rewild4d.files import atomic
-from rewild4d.harmonics import C0
+from rewild4d.harmonics import base_colors
 from rewild4d.transforms import matrix_to_quat, quat_to_matrix, split_similarity
 from rewild4d.types import Splats
 
@@ -133,8 +133,7 @@ def _seen(splats: Splats, weights: Tensor) -> tuple[Splats, Tensor]:
 
 def _linear_colors(splats: Splats) -> Tensor:
     """Return the colour without the view-dependent part, linear as glTF wants vertex colours, [n, 3]."""
-    colors = splats.colors[:, 0].double().cpu()
-    srgb = (colors if splats.colors.shape[1] == 1 else 0.5 + C0 * colors).clamp(0, 1)
+    srgb = base_colors(splats).double().cpu()
     return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 

@@ -22,7 +22,7 @@ PANEL = 320
 def save_png(image: Tensor, path: Path) -> None:
     """Write an RGB image in [0, 1], [3, h, w], atomically."""
     with atomic(path) as temporary:
-        imageio.imwrite(temporary, _bytes(image), format="png")
+        imageio.imwrite(temporary, to_bytes(image), format="png")
 
 
 def save_mp4(images: Iterable[Tensor], path: Path, fps: float, quality: int = 8) -> None:
@@ -39,7 +39,7 @@ def save_mp4(images: Iterable[Tensor], path: Path, fps: float, quality: int = 8)
         writer: Any = imageio.get_writer(temporary, fps=fps, **settings)
         with writer:
             for image in images:
-                writer.append_data(_bytes(image))
+                writer.append_data(to_bytes(image))
 
 
 def film_rate(fps: float) -> float:
@@ -69,10 +69,17 @@ def header(titles: Sequence[str], width: int) -> Tensor:
     return torch.from_numpy(strip).permute(2, 0, 1).float() / 255
 
 
+def part_colors(parts: int) -> Tensor:
+    """Return colours by which the parts of a body are told apart, RGB in [0, 1], float64, [parts, 3]."""
+    hues = np.array([[((part * 97) % 180, 200, 235) for part in range(parts)]], np.uint8)
+    return torch.from_numpy(cv2.cvtColor(hues, cv2.COLOR_HSV2RGB)[0]).double() / 255
+
+
 def even(value: float, least: int = 2) -> int:
     """Round to an even number, which films need, of at least the least."""
     return max(least, 2 * round(value / 2))
 
 
-def _bytes(image: Tensor) -> np.ndarray:
+def to_bytes(image: Tensor) -> np.ndarray:
+    """Return an RGB image in [0, 1], [3, h, w], as bytes, uint8 [h, w, 3]."""
     return (image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()

@@ -3,7 +3,6 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -15,7 +14,7 @@ from rewild4d.contracts import Reconstruction
 from rewild4d.transforms import look_at
 from rewild4d.types import OBJECT_DIAGONAL, Camera, Clip, Frame, Splats, Truth
 from rewild4d.visualize.original_view import save_original_view
-from rewild4d.visualize.pictures import PANEL, beside, film_rate, header, over, save_mp4, save_png
+from rewild4d.visualize.pictures import PANEL, beside, film_rate, header, over, part_colors, save_mp4, save_png
 from rewild4d.visualize.turntable import find_framing, four_views, orbit_frames
 
 ROWS = 4
@@ -79,8 +78,7 @@ def comparison(reconstruction: Reconstruction, clip: Clip, truth: Truth, placeme
 
 def canonical(splats: Splats, weights: Tensor) -> Tensor:
     """Draw canonical Gaussians from the side, obliquely, the front and above, coloured by part, [3, H, W]."""
-    hues = np.array([[((part * 97) % 180, 200, 235) for part in range(weights.shape[1])]], np.uint8)
-    palette = torch.from_numpy(cv2.cvtColor(hues, cv2.COLOR_HSV2RGB)[0]).to(weights) / 255
+    palette = part_colors(weights.shape[1]).to(weights)
     colored = Splats(splats.means, splats.quats, splats.scales, splats.opacities, (weights @ palette)[:, None])
     center = splats.means.double().median(0).values.cpu()
     up, ahead = torch.tensor((0.0, 1.0, 0.0)).double(), torch.tensor((0.0, 0.0, 1.0)).double()

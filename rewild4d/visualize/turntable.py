@@ -78,7 +78,7 @@ def find_framing(reconstruction: Reconstruction, clip: Clip, up: Tensor | None) 
         up: of the world, where the data set knows it, [3].
     """
     cameras = [camera for frame in clip.frames if (camera := input_camera(reconstruction, frame)) is not None]
-    clouds = [_solid(reconstruction.at(time)) for time in clip.times]
+    clouds = [solid(reconstruction.at(time)) for time in clip.times]
     if not cameras or not all(len(means) for means, _ in clouds):
         return None
     # The box's centre, not the median, which is in the trunk: legs and head are in the picture too.
@@ -152,7 +152,7 @@ def _axes(
     return torch.stack((torch.linalg.cross(up, ahead), up, ahead)).expand(count, 3, 3), False
 
 
-def _solid(splats: Splats) -> tuple[Tensor, Tensor]:
+def solid(splats: Splats) -> tuple[Tensor, Tensor]:
     """Return centres and radii of the visible Gaussians, float64, [n, 3] and [n]; of all where none is visible."""
     shown = splats.opacities.detach().cpu() > 0.1
     means, radii = splats.means.detach().double().cpu(), 2 * splats.scales.detach().double().cpu().amax(-1)
