@@ -1,0 +1,191 @@
+"""Answer pages on this machine, and nobody else: a token in the address, the loopback, no other site's pages.
+
+Another site's page cannot know the token; nor can it reach the editor under a name of its own that it lets point to
+127.0.0.1 (DNS rebinding), because the Host header then holds that name.
+"""
+
+import hmac
+import json
+import re
+import secrets
+import sys
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
+from pathlib import PurePath
+from socketserver import TCPServer
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from rewild4d.datasets.masking.editor.editor import Editor, refused
+from rewild4d.datasets.masking.editor.requests import LARGEST, parse
+from rewild4d.datasets.masking.editor.work import Refused
+from rewild4d.errors import UserError
+
+HOST = "127.0.0.1"
+TYPES = {
+    ".html": "text/html; charset=utf-8", ".css": "text/css; charset=utf-8", ".js": "text/javascript; charset=utf-8",
+    ".svg": "image/svg+xml",
+}  # fmt: skip
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+PICTURE = re.compile(r"(frame|thumb|mask|marks)/(\d{1,9})")
+KEEP, FORGET = "private, max-age=86400, immutable", "no-store"
+"""What browsers keep: pictures, whose addresses have a version; nothing else."""
+PATIENCE = 30
+"""Seconds for a request to arrive."""
+
+
+class Server(ThreadingHTTPServer):
+    """Serves one editor at ``address``.
+
+    Args:
+        editor: what is served.
+        port: 0 for any that is free.
+
+    Raises:
+        UserError: the port is in use, or may not be used.
+    """
+
+    daemon_threads, allow_reuse_address = True, sys.platform != "win32"
+
+    def __init__(self, editor: Editor, port: int = 0) -> None:
+        self.editor, self.token = editor, secrets.token_urlsafe(24)
+        page = resources.files("rewild4d.datasets.masking.editor") / "page"
+        self.page = {item.name: item.read_bytes() for item in page.iterdir() if PurePath(item.name).suffix in TYPES}
+        try:
+            super().__init__((HOST, port), Handler)
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise UserError(f"--port: expected a port of this machine that is free, got {port}: {reason}.") from error
+        self.hosts = {f"{name}:{self.server_port}" for name in (HOST, "localhost")}
+
+    @property
+    def address(self) -> str:
+        """The page's address, with the token."""
+        return f"http://{HOST}:{self.server_port}/{self.token}/"
+
+    def server_bind(self) -> None:
+        """Bind without looking this machine's name up, which can take seconds."""
+        TCPServer.server_bind(self)
+        self.server_name, self.server_port = HOST, self.server_address[1]
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of a browser that went away."""
+        if not isinstance(sys.exc_info()[1], ConnectionError | TimeoutError):
+            super().handle_error(request, client_address)
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Answers one connection."""
+
+    server: Server
+    protocol_version, server_version, sys_version, timeout = "HTTP/1.1", "rewild4d", "", PATIENCE
+
+    def do_GET(self) -> None:
+        path = self._allowed()
+        if path is None:
+            return
+        name, editor = path.path, self.server.editor
+        picture = PICTURE.fullmatch(name)
+        if name == "about":
+            self._send_json(editor.about())
+        elif name == "state":
+            seen = parse_qs(path.query).get("seen", [""])[0]
+            version = editor.work.version
+            self._send_json({"version": version} if seen == str(version) else editor.state())
+        elif picture and int(picture[2]) < editor.work.count:
+            self._send_picture(picture[1], int(picture[2]))
+        elif (file := name or "index.html") in self.server.page:
+            self._send(HTTPStatus.OK, TYPES[PurePath(file).suffix], self.server.page[file])
+        else:
+            self._refuse(HTTPStatus.NOT_FOUND, "There is no such thing.")
+
+    def do_POST(self) -> None:
+        path = self._allowed()
+        if path is None:
+            return
+        body = self._body()
+        if body is None:
+            return
+        if path.path != "do":
+            return self._refuse(HTTPStatus.NOT_FOUND, "There is no such thing.")
+        try:
+            request = parse(body)
+        except ValueError as error:
+            return self._refuse(HTTPStatus.BAD_REQUEST, f"Not understood: {error}.")
+        try:
+            look = self.server.editor.do(request)
+        except (Refused, UserError) as error:
+            status, said = refused(error)
+            return self._send_json({"error": said, "state": self.server.editor.state()}, status)
+        self._send_json({"state": self.server.editor.state(), "look": look})
+
+    def _allowed(self) -> Any:
+        """Return the address below the token, or None after a refusal."""
+        try:
+            path = urlsplit(self.path)
+        except ValueError:
+            return self._refuse(HTTPStatus.BAD_REQUEST, "Not an address.")
+        _, token, rest = (path.path.split("/", 2) + ["", ""])[:3]
+        host, origin = self.headers.get("Host", "").lower(), self.headers.get("Origin")
+        is_ours = origin is None or origin.removeprefix("http://") in self.server.hosts
+        is_same = self.headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin")
+        if self.command == "GET" and self.headers.get("Sec-Fetch-Mode") == "navigate":
+            is_same = True  # a link to this page was followed
+        if host not in self.server.hosts or not (is_ours and is_same):
+            return self._refuse(HTTPStatus.FORBIDDEN, "Only pages of this editor may ask.")
+        if not hmac.compare_digest(token.encode("utf-8", "surrogateescape"), self.server.token.encode()):
+            return self._refuse(HTTPStatus.FORBIDDEN, "The address lacks its token: use the one in the terminal.")
+        return path._replace(path=rest)
+
+    def _body(self) -> bytes | None:
+        """Return what was posted, or None after a refusal."""
+        length = self.headers.get("Content-Length", "")
+        if self.headers.get("Transfer-Encoding") or not re.fullmatch(r"\d{1,12}", length):
+            return self._refuse(HTTPStatus.LENGTH_REQUIRED, "How long is it?")
+        if int(length) > LARGEST:
+            return self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "That is too much at once.")
+        if self.headers.get_content_type() != "application/json":
+            return self._refuse(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "Expected JSON.")
+        body = self.rfile.read(int(length))
+        if len(body) < int(length):
+            return self._refuse(HTTPStatus.BAD_REQUEST, "It ends early.")
+        return body
+
+    def _send_picture(self, kind: str, place: int) -> None:
+        editor = self.server.editor
+        make = {
+            "frame": editor.film.frame, "thumb": editor.film.thumb, "mask": editor.mask_png, "marks": editor.marks_png,
+        }[kind]  # fmt: skip
+        try:
+            data = make(place)
+        except OSError:
+            return self._refuse(HTTPStatus.NOT_FOUND, "The editor has ended.")
+        self._send(HTTPStatus.OK, "image/jpeg" if kind in ("frame", "thumb") else "image/png", data, KEEP)
+
+    def _send_json(self, value: Any, status: int = HTTPStatus.OK) -> None:
+        self._send(status, "application/json", json.dumps(value).encode())
+
+    def _refuse(self, status: HTTPStatus, said: str) -> None:
+        self.close_connection = True  # what was not read of the request is no request
+        self._send_json({"error": said}, status)
+
+    def _send(self, status: int, kind: str, data: bytes, cache: str = FORGET) -> None:
+        self.send_response(status)
+        for name, value in (HEADERS | {"Content-Type": kind, "Cache-Control": cache}).items():
+            self.send_header(name, value)
+        self.send_header("Content-Length", str(len(data)))
+        if self.close_connection:
+            self.send_header("Connection", "close")
+        self.end_headers()
+        self.wfile.write(data)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Keep quiet: the terminal is for people."""
