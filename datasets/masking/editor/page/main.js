@@ -42,7 +42,7 @@ function begin() {
     show(place);
   });
   client.addEventListener("refused", ({ detail }) => notice("bad", detail));
-  client.addEventListener("offline", ({ detail }) => showOffline(detail));
+  client.addEventListener("offline", showOffline);
   addEventListener("beforeunload", (event) => client.queue.length && client.isOffline && event.preventDefault());
   lastNotice = client.state.notice[0];
   restore();
@@ -83,7 +83,7 @@ async function show(chosen) {
     Object.assign(view, { frame, layers, box: client.state.boxes[place] ?? null });
     for (let i = sent.length - 1; i >= 0; i--) if (sent[i].place !== place || sent[i].version <= version) sent.splice(i, 1);
     showDrafts(pointer.draft);
-    document.body.dataset.shown = `${place}:${version}`;
+    document.body.dataset.version = client.state.version; // of the state that is on the screen
   } catch { /* the connection is lost, which is told elsewhere; or the mask changed meanwhile */ }
 }
 
@@ -91,6 +91,8 @@ function showDrafts(draft) {
   pointer.draft = draft;
   const waiting = [...sent, ...client.queue].filter((drawing) => drawing.place === place);
   view.drafts = draft && (draft.points || draft.box) ? [...waiting, draft] : waiting;
+  showOffline();
+  document.body.dataset.waiting = sent.length + client.queue.length;
   view.draw();
 }
 
@@ -132,11 +134,11 @@ function showBadge() {
   $("fix").setAttribute("aria-pressed", marks === "true");
 }
 
-function showOffline(isOffline) {
-  $("offline").hidden = !isOffline;
+function showOffline() {
+  $("offline").hidden = !client.isOffline;
   const waiting = client.queue.length;
   $("offline").textContent = "The editor does not answer: it has ended, or the connection is lost. " +
-    (waiting ? `${waiting} drawings wait here and are sent when it is back.` : "What you drew is safe with it.");
+    (waiting ? `${waiting} ${waiting > 1 ? "drawings wait" : "drawing waits"} here until it is back.` : "");
 }
 
 let hiding = 0;

@@ -82,6 +82,7 @@ export class View {
   }
 
   #draw() {
+    document.body.dataset.scale = this.scale;
     const context = this.#canvas.getContext("2d");
     context.setTransform(1, 0, 0, 1, 0, 0);
     context.clearRect(0, 0, this.#canvas.width, this.#canvas.height);
