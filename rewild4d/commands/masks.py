@@ -147,12 +147,14 @@ def edit(options: Options) -> int:
     if options.dataset != "online":
         raise UserError(f"--edit: expected --video FILE, got --dataset {options.dataset}.")
     from rewild4d.datasets.masking.editor.app import open_editor, serve
+    from rewild4d.datasets.masking.editor.server import Server
     from rewild4d.datasets.masking.tracking import track_masks
 
     reader: Any = open_dataset(options.dataset, options.data, options)[1]
     source = told(reader.unmasked(reader.name), options)
     require_writable(options.out)
-    serve(open_editor(source, options.out, track_masks, _check_command(options)), options.port)
+    with Server(options.port) as server:
+        serve(server, open_editor(source, options.out, track_masks, _check_command(options)))
     return 0
 
 

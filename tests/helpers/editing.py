@@ -55,7 +55,8 @@ def film(count: int = COUNT) -> Unmasked:
 def served(folder: Path, source: Unmasked | None = None, maker: MaskMaker = track_masks) -> Iterator["Served"]:
     """Serve an editor whose masks go into a folder."""
     editor = open_editor(source or film(), folder, maker, f"rewild4d-bench check --masks {folder}")
-    server = Server(editor)
+    server = Server()
+    server.editor = editor
     thread = Thread(target=server.serve_forever, args=(0.02,), daemon=True)
     thread.start()
     try:

@@ -52,25 +52,20 @@ def open_editor(source: Unmasked, folder: Path, maker: MaskMaker, command: str =
     return Editor(source, film, work, maker, folder, command, lacking)
 
 
-def serve(editor: Editor, port: int = 0) -> None:
-    """Serve an editor until a page says that it is done, or Ctrl-C.
-
-    Raises:
-        UserError: the port cannot be used.
-    """
+def serve(server: Server, editor: Editor) -> None:
+    """Serve an editor until a page says that it is done, or Ctrl-C."""
+    server.editor = editor
+    answering = Thread(target=server.serve_forever, args=(0.1,), name="rewild4d-editor", daemon=True)
+    answering.start()
+    print(f"{server.address}\nopen this address in a browser on this machine; Ctrl-C ends the editor", flush=True)
     try:
-        server = Server(editor, port)
-        answering = Thread(target=server.serve_forever, args=(0.1,), name="rewild4d-editor", daemon=True)
-        answering.start()
-        print(f"{server.address}\nopen this address in a browser on this machine; Ctrl-C ends the editor", flush=True)
-        try:
-            while not editor.ended.wait(0.5):
-                pass
-        except KeyboardInterrupt:
-            print(file=sys.stderr)
+        while not editor.ended.wait(0.5):
+            pass
+    except KeyboardInterrupt:
+        print(file=sys.stderr)
+    finally:
         server.shutdown()
         server.server_close()
-    finally:
         editor.close()
     lost = "no work is lost" if editor.work.is_saved else "work that was not saved is lost"
     print(f"the editor ended; {lost}", file=sys.stderr)

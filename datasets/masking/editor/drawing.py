@@ -11,6 +11,8 @@ from rewild4d.datasets.masking.tracking import WORK_SIDE
 
 SIGNS = {"animal": 1, "surroundings": -1, "eraser": 0}
 """What each brush writes."""
+SPECK = 0.003
+"""Share of a mask's area below which a part of it, or a hole in it, is a speck."""
 PARTS = 16
 """Of a pixel, in which OpenCV takes coordinates here (as a shift of 4 bits)."""
 
@@ -50,12 +52,25 @@ def mask_of(image: np.ndarray, base: np.ndarray | None, said: np.ndarray) -> np.
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     chance = cv2.resize(before.astype(np.float32) / 255, size, interpolation=cv2.INTER_AREA)
     found = corrected(small, chance, resized(said, size))
-    changed = cv2.resize(((found > 0.5) != (chance > 0.5)).astype(np.uint8), said.shape[::-1]) > 0
-    near = cv2.dilate((said != 0).astype(np.uint8), np.ones((3, 3))) > 0
+    other = cv2.dilate(((found > 0.5) != (chance > 0.5)).astype(np.uint8), np.ones((5, 5)))
+    changed = cv2.resize(other, said.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
     smooth = cv2.resize(found, said.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
+    smooth = (smooth | (said > 0)) & (said >= 0)
+    least = SPECK * float(smooth.sum())
+    smooth = ~_without_specks(~_without_specks(smooth, least, changed, said > 0), least, changed, said < 0)
     # Away from what changed the mask keeps its own, finer edge.
-    mask = np.where(changed | near, np.where(smooth, 255, 0), before)
-    return np.where(said > 0, 255, np.where(said < 0, 0, mask)).astype(np.uint8)
+    return np.where(changed | (said != 0), smooth * np.uint8(255), before).astype(np.uint8)
+
+
+def _without_specks(mask: np.ndarray, least: float, changed: np.ndarray, told: np.ndarray) -> np.ndarray:
+    """Return a mask without parts of less than ``least`` pixels that a change touched, unless they were told."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    areas = stats[:, cv2.CC_STAT_AREA]
+    dropped = areas < least
+    dropped &= np.bincount(labels[changed], minlength=len(areas)) > 0
+    dropped &= np.bincount(labels[told], minlength=len(areas)) == 0
+    found: np.ndarray = mask & ~dropped[labels]
+    return found
 
 
 def true_marks(mask: np.ndarray) -> np.ndarray:

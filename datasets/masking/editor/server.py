@@ -43,11 +43,13 @@ PATIENCE = 30
 
 
 class Server(ThreadingHTTPServer):
-    """Serves one editor at ``address``.
+    """Holds a port from the start, and serves `editor` at ``address`` once it is told to.
 
     Args:
-        editor: what is served.
         port: 0 for any that is free.
+
+    Attributes:
+        editor: what is served.
 
     Raises:
         UserError: the port is in use, or may not be used.
@@ -55,8 +57,10 @@ class Server(ThreadingHTTPServer):
 
     daemon_threads, allow_reuse_address = True, sys.platform != "win32"
 
-    def __init__(self, editor: Editor, port: int = 0) -> None:
-        self.editor, self.token = editor, secrets.token_urlsafe(24)
+    editor: Editor
+
+    def __init__(self, port: int = 0) -> None:
+        self.token = secrets.token_urlsafe(24)
         page = resources.files("rewild4d.datasets.masking.editor") / "page"
         self.page = {item.name: item.read_bytes() for item in page.iterdir() if PurePath(item.name).suffix in TYPES}
         try:

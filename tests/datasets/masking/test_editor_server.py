@@ -184,7 +184,7 @@ def test_ctrl_c_ends_it_and_says_whether_work_is_lost(
 
     with served(tmp_path / "masks") as editor:
         monkeypatch.setattr(editor.editor.ended, "wait", stop)
-        serve(editor.editor)
+        serve(Server(), editor.editor)
         assert "the editor ended; no work is lost" in capsys.readouterr().err
 
 
@@ -193,10 +193,10 @@ def test_a_port_in_use_and_flags_that_do_not_fit_are_one_sentence(
 ) -> None:
     port = editor.server.server_port
     with pytest.raises(UserError, match=f"--port: expected a port of this machine that is free, got {port}: Address"):
-        Server(editor.editor, port)
+        Server(port)
     for wrong in (-1, 99999):
         with pytest.raises(UserError, match=f"expected a port of this machine that is free, got {wrong}"):
-            Server(editor.editor, wrong)
+            Server(wrong)
     moving.frames(tmp_path / "clip", 4)
     words = ("masks", "--edit", "--video", str(tmp_path / "clip"), "--out", str(tmp_path / "m"))
     assert "--edit: expected --tool track, which it follows with, got rough." in refusal(

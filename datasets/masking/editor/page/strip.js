@@ -5,6 +5,8 @@ const COLORS = {
   dim: "#a3a9b6", now: "#ffffff", ground: "#131519",
 };
 
+const FOOT = 50; // pixels below the thumbnails: masks, marks, numbers
+
 export class Strip {
   place = 0;
   #canvas;
@@ -58,7 +60,7 @@ export class Strip {
     this.high = this.#canvas.clientHeight;
     this.#canvas.width = Math.max(1, this.wide * this.ratio);
     this.#canvas.height = Math.max(1, this.high * this.ratio);
-    const thumbHigh = this.high - 46;
+    const thumbHigh = this.high - FOOT;
     this.count = Math.max(1, Math.min(this.names.length, Math.round(this.wide / (thumbHigh * this.shape))));
     for (let i = 0; i < this.count; i++) this.#load(Math.floor(((i + 0.5) * this.names.length) / this.count));
     this.draw();
@@ -78,7 +80,7 @@ export class Strip {
     context.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
     context.fillStyle = COLORS.ground;
     context.fillRect(0, 0, this.wide, this.high);
-    const high = this.high - 46;
+    const high = this.high - FOOT;
     this.#drawThumbs(context, high);
     if (!this.state) return;
     const step = this.wide / this.names.length;
@@ -86,8 +88,8 @@ export class Strip {
       const left = place * step;
       this.#drawMask(context, mask, left, step, high + 3);
       const middle = left + step / 2;
-      if (this.state.boxes[place]) square(context, middle, high + 22);
-      if (marks) dot(context, marks, middle, high + (this.state.boxes[place] ? 32 : 24));
+      if (this.state.boxes[place]) square(context, middle, high + 21);
+      if (marks) dot(context, marks, middle, high + (this.state.boxes[place] ? 30 : 22));
     });
     this.#drawNames(context, step);
     this.#drawNow(context, step);
@@ -118,8 +120,8 @@ export class Strip {
     context.textBaseline = "bottom";
     const every = Math.max(1, Math.ceil(70 / step));
     for (let place = 0; place < this.names.length; place += every) {
-      const near = Math.abs(place - this.place) * step < 34;
-      if (!near && place * step < this.wide - 30) context.fillText(this.names[place], place * step + 1, this.high - 1);
+      const middle = (place + 0.5) * step;
+      if (Math.abs(place - this.place) * step > 34) this.#name(context, place, middle, this.high - 1);
     }
   }
 
@@ -128,9 +130,12 @@ export class Strip {
     context.fillStyle = COLORS.now;
     context.fillRect(middle - 1, 0, 2, this.high - 13);
     context.font = "600 11px system-ui, sans-serif";
-    const name = this.names[this.place];
-    const half = context.measureText(name).width / 2;
-    context.fillText(name, Math.max(0, Math.min(this.wide - 2 * half, middle - half)), this.high);
+    this.#name(context, this.place, middle, this.high);
+  }
+
+  #name(context, place, middle, bottom) {
+    const half = context.measureText(this.names[place]).width / 2;
+    context.fillText(this.names[place], Math.max(0, Math.min(this.wide - 2 * half, middle - half)), bottom);
   }
 }
 
