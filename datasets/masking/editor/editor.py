@@ -213,7 +213,7 @@ class Editor:
         left = job.left
         return {
             "done": job.written, "read": job.read, "total": job.total, "first": job.first,
-            "left": None if left is None else round(left, 1),
+            "left": None if left is None else round(left, 1), "stopping": job.is_stopping,
         }  # fmt: skip
 
     def _name(self, place: int) -> str:

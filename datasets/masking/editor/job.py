@@ -45,6 +45,12 @@ class Job(Thread):
     def cancel(self) -> None:
         """Stop at the next frame."""
         self._cancelled.set()
+        self.work.touch()
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether it was told to stop."""
+        return self._cancelled.is_set()
 
     @property
     def left(self) -> float | None:
@@ -68,7 +74,7 @@ class Job(Thread):
         except Cancelled:
             kind, said = "", f"Stopped after {self.written} of {self.total} frames."
         except UserError as error:
-            said = str(error)
+            said = f"{error} In this page: draw a box around the animal." if "--box" in str(error) else str(error)
         except Exception as error:
             traceback.print_exc(file=sys.stderr)
             said = f"Following failed ({type(error).__name__}: {error}); the terminal has the details."
@@ -86,7 +92,7 @@ class Job(Thread):
             yield image
 
     def _stop_if_cancelled(self) -> None:
-        if self._cancelled.is_set():
+        if self.is_stopping:
             raise Cancelled
 
 

@@ -8,12 +8,14 @@ from threading import Event
 import moving
 import numpy as np
 import pytest
+from calling import output
 from editing import BOX, COUNT, SIZE, Served, film, served, stub_network, walking
 from films import iou
 from PIL import Image
 
 from rewild4d.datasets.masking.editor.drawing import drawn, mask_of
 from rewild4d.datasets.masking.makers import Unmasked
+from rewild4d.datasets.masking.marks import read_marks
 from rewild4d.errors import UserError
 
 
@@ -127,12 +129,14 @@ def test_while_it_follows_nothing_is_drawn_masks_appear_as_they_come_and_it_can_
         editor.decide("track")
         assert slow.seen.wait(20)
         state = editor.state()
-        assert state["job"] == {"done": 1, "read": 2, "total": COUNT, "first": 0, "left": None}
+        assert state["job"] == {
+            "done": 1, "read": 2, "total": COUNT, "first": 0, "left": None, "stopping": False
+        }  # fmt: skip
         assert state["frames"][0][2] == "mask" and state["frames"][1][2] == ""
         for request in (stroke(), {"kind": "save"}, {"kind": "undo", "version": state["version"]}):
             status, answer = editor.do(**request)
             assert status == 423 and answer["error"].startswith("The animal is being followed")
-        assert editor.do(kind="cancel")[0] == 200
+        assert editor.do(kind="cancel")[1]["state"]["job"]["stopping"]
         slow.may.set()
         state = wait(editor)
         assert state["notice"][2] == f"Stopped after 1 of {COUNT} frames."
@@ -148,14 +152,15 @@ def failing(source: Unmasked) -> Iterator[np.ndarray]:
 
 def unwilling(source: Unmasked) -> Iterator[np.ndarray]:
     yield from ()
-    raise UserError("film: nothing in it stands out.")
+    raise UserError("film: nothing in it stands out; give a box: --box frame:left,top,width,height.")
 
 
 def test_what_goes_wrong_while_following_is_told_on_the_page(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for maker, said in ((failing, "Following failed (ZeroDivisionError: oh); the terminal has the details."),
-                        (unwilling, "film: nothing in it stands out.")):  # fmt: skip
+                        (unwilling, "film: nothing in it stands out; give a box: --box frame:left,top,width,height. In this "
+                         "page: draw a box around the animal.")):  # fmt: skip
         with served(tmp_path / "masks", maker=maker) as editor:
             editor.decide("track")
             assert wait(editor)["notice"][1:] == ["bad", said]
@@ -181,7 +186,8 @@ def test_saving_writes_masks_marks_and_boxes_and_the_next_sitting_goes_on_from_t
     assert (np.asarray(Image.open(tmp_path / "masks" / names[2])) == editor.mask(2) * 255).all()
     assert sorted(path.name for path in (tmp_path / "masks-marks").iterdir()) == ["00102.png", "boxes.txt"]
     assert (tmp_path / "masks-marks" / "boxes.txt").read_text() == "00100:8,40,64,56\n"
-    assert set(Image.open(tmp_path / "masks-marks" / "00102.png").getcolors()) > {(0, (0, 255, 0))} or True
+    colors = {color for _, color in Image.open(tmp_path / "masks-marks" / "00102.png").getcolors()}
+    assert colors == {(0, 0, 0), (255, 0, 0)}
     with served(tmp_path / "masks") as again:
         state = again.state()
         assert state["saved"] and state["boxes"] == {"0": list(BOX)} and state["undo"] == ""
@@ -237,3 +243,43 @@ def test_a_mask_keeps_its_own_edge_away_from_strokes() -> None:
     said = drawn(np.zeros(SIZE[::-1], np.int8), "surroundings", 4.0, [(150.0, 20.0)])
     assert (mask_of(walking(0), base, said) == base).all()
     assert mask_of(walking(0), None, np.zeros(SIZE[::-1], np.int8)) is None
+
+
+def test_the_command_makes_the_same_masks_from_what_was_saved(
+    editor: Served, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for place in range(COUNT):
+        moving.save(tmp_path / "film" / f"{100 + place:05d}.png", walking(place))
+    editor.do(**box())
+    editor.do(**stroke(3, place=4))
+    editor.decide("track")
+    wait(editor)
+    editor.do(kind="save")
+    boxes = (tmp_path / "masks-marks" / "boxes.txt").read_text().split()
+    marks = tmp_path / "masks-marks"
+    words = ("masks", "--video", tmp_path / "film", "--out", tmp_path / "again", "--marks", marks, "--box", *boxes)
+    output(capsys, *words)
+    for path in sorted((tmp_path / "masks").iterdir()):
+        assert (np.asarray(Image.open(path)) == np.asarray(Image.open(tmp_path / "again" / path.name))).all()
+
+
+def test_red_strokes_alone_in_masks_from_elsewhere_start_from_the_mask_that_they_correct(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stub_network(monkeypatch)
+    for place in range(COUNT):
+        moving.save(tmp_path / "masks" / f"{100 + place:05d}.png", moving.mask(place, SIZE))
+    with served(tmp_path / "masks") as editor:
+        assert (editor.mask(3) == (moving.mask(3, SIZE) > 0)).all()
+        editor.do(**stroke(0, tool="surroundings", points=[[40.0, 80.0], [40.0, 92.0]]))
+        editor.decide("track")
+        assert wait(editor)["notice"][1] == "good"
+        assert iou(editor.mask(5), moving.mask(5, SIZE) > 0) > 0.8
+
+
+def test_a_frame_that_is_said_to_hold_no_animal_is_read_again(tmp_path: Path, editor: Served) -> None:
+    editor.do(**stroke(tool="surroundings"))
+    editor.decide("fix", place=0)
+    editor.do(kind="save")
+    said = read_marks(tmp_path / "masks-marks", film().stems, SIZE)
+    assert (said[0] == -1).all()
