@@ -144,4 +144,5 @@ def test_the_wheel_carries_code_and_data(tmp_path: Path) -> None:
     assert "rewild4d/leaderboard/paper/artemis.json" in names
     assert "rewild4d/baselines/presets/ours.toml" in names
     assert "rewild4d/metrics/weights.toml" in names
+    assert {f"rewild4d/datasets/masking/editor/page/{name}" for name in ("index.html", "style.css", "main.js")} <= names
     assert {name.split("/")[0] for name in names if not name.startswith("rewild4d-")} == {"rewild4d"}

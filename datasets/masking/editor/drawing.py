@@ -57,9 +57,10 @@ def mask_of(image: np.ndarray, base: np.ndarray | None, said: np.ndarray) -> np.
     smooth = cv2.resize(found, said.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
     smooth = (smooth | (said > 0)) & (said >= 0)
     least = SPECK * float(smooth.sum())
-    smooth = ~_without_specks(~_without_specks(smooth, least, changed, said > 0), least, changed, said < 0)
+    clean = ~_without_specks(~_without_specks(smooth, least, changed, said > 0), least, changed, said < 0)
+    changed |= (clean != smooth) | (said != 0)
     # Away from what changed the mask keeps its own, finer edge.
-    return np.where(changed | (said != 0), smooth * np.uint8(255), before).astype(np.uint8)
+    return np.where(changed, clean * np.uint8(255), before).astype(np.uint8)
 
 
 def _without_specks(mask: np.ndarray, least: float, changed: np.ndarray, told: np.ndarray) -> np.ndarray:

@@ -158,9 +158,11 @@ def unwilling(source: Unmasked) -> Iterator[np.ndarray]:
 def test_what_goes_wrong_while_following_is_told_on_the_page(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for maker, said in ((failing, "Following failed (ZeroDivisionError: oh); the terminal has the details."),
-                        (unwilling, "film: nothing in it stands out; give a box: --box frame:left,top,width,height. In this "
-                         "page: draw a box around the animal.")):  # fmt: skip
+    nothing = "film: nothing in it stands out; give a box: --box frame:left,top,width,height."
+    for maker, said in (
+        (failing, "Following failed (ZeroDivisionError: oh); the terminal has the details."),
+        (unwilling, f"{nothing} In this page: draw a box around the animal."),
+    ):
         with served(tmp_path / "masks", maker=maker) as editor:
             editor.decide("track")
             assert wait(editor)["notice"][1:] == ["bad", said]
@@ -283,3 +285,14 @@ def test_a_frame_that_is_said_to_hold_no_animal_is_read_again(tmp_path: Path, ed
     editor.do(kind="save")
     said = read_marks(tmp_path / "masks-marks", film().stems, SIZE)
     assert (said[0] == -1).all()
+
+
+def test_crumbs_that_a_stroke_leaves_of_a_mask_are_swept_away() -> None:
+    picture = np.full((*SIZE[::-1], 3), 90, np.uint8)
+    picture[10:40, 20:80] = (200, 40, 30)
+    picture[24:27, 70:73] = 90  # of another colour, so the change does not reach it
+    base = np.zeros(SIZE[::-1], np.uint8)
+    base[10:40, 20:80] = base[60:120, 20:180] = 255
+    said = drawn(np.zeros(SIZE[::-1], np.int8), "surroundings", 3.0, [(25.0, 15.0), (60.0, 15.0)])
+    mask = mask_of(picture, base, said)
+    assert mask is not None and not mask[:50].any() and (mask[60:] == base[60:]).all()
