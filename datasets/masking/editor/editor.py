@@ -1,5 +1,7 @@
 """Do what pages ask for: every request changes the one state of the work."""
 
+import sys
+import traceback
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -239,8 +241,9 @@ def _png(image: np.ndarray) -> bytes:
 
 
 def refused(error: Exception) -> tuple[int, str]:
-    """Return the HTTP status and the sentence for an error of `Editor.do`."""
+    """Return the HTTP status and the sentence for an error of `Editor.do`; what is our own fault is printed too."""
     for kind, status in ((Stale, 409), (Busy, 423), (Refused, 400), (UserError, 500)):
         if isinstance(error, kind):
             return status, str(error)
-    raise error
+    traceback.print_exception(error, file=sys.stderr)
+    return 500, f"The editor failed ({type(error).__name__}: {error}); the terminal has the details."

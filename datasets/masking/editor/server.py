@@ -9,6 +9,7 @@ import json
 import re
 import secrets
 import sys
+from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
@@ -19,7 +20,6 @@ from urllib.parse import parse_qs, urlsplit
 
 from rewild4d.datasets.masking.editor.editor import Editor, refused
 from rewild4d.datasets.masking.editor.requests import LARGEST, parse
-from rewild4d.datasets.masking.editor.work import Refused
 from rewild4d.errors import UserError
 
 HOST = "127.0.0.1"
@@ -35,7 +35,7 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-PICTURE = re.compile(r"(frame|thumb|mask|marks)/(\d{1,9})")
+PICTURE = re.compile(r"(frame|thumb|mask|marks)/([0-9]{1,9})")
 KEEP, FORGET = "private, max-age=86400, immutable", "no-store"
 """What browsers keep: pictures, whose addresses have a version; nothing else."""
 PATIENCE = 30
@@ -86,6 +86,14 @@ class Server(ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
 
+class Unfit(Exception):
+    """A request that is not answered as it hoped: a status and a sentence."""
+
+    def __init__(self, status: HTTPStatus, said: str) -> None:
+        super().__init__(said)
+        self.status = status
+
+
 class Handler(BaseHTTPRequestHandler):
     """Answers one connection."""
 
@@ -93,50 +101,60 @@ class Handler(BaseHTTPRequestHandler):
     protocol_version, server_version, sys_version, timeout = "HTTP/1.1", "rewild4d", "", PATIENCE
 
     def do_GET(self) -> None:
-        path = self._allowed()
-        if path is None:
-            return
-        name, editor = path.path, self.server.editor
+        self._answer(self._get)
+
+    def do_POST(self) -> None:
+        self._answer(self._post)
+
+    def _answer(self, answer: Callable[[str, str], None]) -> None:
+        """Answer what may ask, with the address below the token and what follows a question mark."""
+        try:
+            answer(*self._allowed())
+        except Unfit as error:
+            self.close_connection = True  # what was not read of the request is no request
+            self._send_json({"error": str(error)}, error.status)
+
+    def _get(self, name: str, query: str) -> None:
+        editor = self.server.editor
         picture = PICTURE.fullmatch(name)
         if name == "about":
             self._send_json(editor.about())
         elif name == "state":
-            seen = parse_qs(path.query).get("seen", [""])[0]
-            version = editor.work.version
+            seen, version = parse_qs(query).get("seen", [""])[0], editor.work.version
             self._send_json({"version": version} if seen == str(version) else editor.state())
         elif picture and int(picture[2]) < editor.work.count:
             self._send_picture(picture[1], int(picture[2]))
         elif (file := name or "index.html") in self.server.page:
             self._send(HTTPStatus.OK, TYPES[PurePath(file).suffix], self.server.page[file])
         else:
-            self._refuse(HTTPStatus.NOT_FOUND, "There is no such thing.")
+            raise Unfit(HTTPStatus.NOT_FOUND, "There is no such thing.")
 
-    def do_POST(self) -> None:
-        path = self._allowed()
-        if path is None:
-            return
-        body = self._body()
-        if body is None:
-            return
-        if path.path != "do":
-            return self._refuse(HTTPStatus.NOT_FOUND, "There is no such thing.")
+    def _post(self, name: str, query: str) -> None:
+        body, editor = self._body(), self.server.editor
+        if name != "do":
+            raise Unfit(HTTPStatus.NOT_FOUND, "There is no such thing.")
         try:
             request = parse(body)
         except ValueError as error:
-            return self._refuse(HTTPStatus.BAD_REQUEST, f"Not understood: {error}.")
+            raise Unfit(HTTPStatus.BAD_REQUEST, f"Not understood: {error}.") from error
         try:
-            look = self.server.editor.do(request)
-        except (Refused, UserError) as error:
+            look = editor.do(request)
+        except Exception as error:
             status, said = refused(error)
-            return self._send_json({"error": said, "state": self.server.editor.state()}, status)
-        self._send_json({"state": self.server.editor.state(), "look": look})
+            self._send_json({"error": said, "state": editor.state()}, status)
+        else:
+            self._send_json({"state": editor.state(), "look": look})
 
-    def _allowed(self) -> Any:
-        """Return the address below the token, or None after a refusal."""
+    def _allowed(self) -> tuple[str, str]:
+        """Return the address below the token and what follows a question mark.
+
+        Raises:
+            Unfit: another site's page asks, or the token is missing.
+        """
         try:
             path = urlsplit(self.path)
-        except ValueError:
-            return self._refuse(HTTPStatus.BAD_REQUEST, "Not an address.")
+        except ValueError as error:
+            raise Unfit(HTTPStatus.BAD_REQUEST, "Not an address.") from error
         _, token, rest = (path.path.split("/", 2) + ["", ""])[:3]
         host, origin = self.headers.get("Host", "").lower(), self.headers.get("Origin")
         is_ours = origin is None or origin.removeprefix("http://") in self.server.hosts
@@ -144,23 +162,27 @@ class Handler(BaseHTTPRequestHandler):
         if self.command == "GET" and self.headers.get("Sec-Fetch-Mode") == "navigate":
             is_same = True  # a link to this page was followed
         if host not in self.server.hosts or not (is_ours and is_same):
-            return self._refuse(HTTPStatus.FORBIDDEN, "Only pages of this editor may ask.")
+            raise Unfit(HTTPStatus.FORBIDDEN, "Only pages of this editor may ask.")
         if not hmac.compare_digest(token.encode("utf-8", "surrogateescape"), self.server.token.encode()):
-            return self._refuse(HTTPStatus.FORBIDDEN, "The address lacks its token: use the one in the terminal.")
-        return path._replace(path=rest)
+            raise Unfit(HTTPStatus.FORBIDDEN, "The address lacks its token: use the one in the terminal.")
+        return rest, path.query
 
-    def _body(self) -> bytes | None:
-        """Return what was posted, or None after a refusal."""
+    def _body(self) -> bytes:
+        """Return what was posted.
+
+        Raises:
+            Unfit: it has no length, is too long, no JSON, or ends early.
+        """
         length = self.headers.get("Content-Length", "")
-        if self.headers.get("Transfer-Encoding") or not re.fullmatch(r"\d{1,12}", length):
-            return self._refuse(HTTPStatus.LENGTH_REQUIRED, "How long is it?")
+        if self.headers.get("Transfer-Encoding") or not re.fullmatch(r"[0-9]{1,12}", length):
+            raise Unfit(HTTPStatus.LENGTH_REQUIRED, "How long is it?")
         if int(length) > LARGEST:
-            return self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "That is too much at once.")
+            raise Unfit(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "That is too much at once.")
         if self.headers.get_content_type() != "application/json":
-            return self._refuse(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "Expected JSON.")
+            raise Unfit(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "Expected JSON.")
         body = self.rfile.read(int(length))
         if len(body) < int(length):
-            return self._refuse(HTTPStatus.BAD_REQUEST, "It ends early.")
+            raise Unfit(HTTPStatus.BAD_REQUEST, "It ends early.")
         return body
 
     def _send_picture(self, kind: str, place: int) -> None:
@@ -170,16 +192,12 @@ class Handler(BaseHTTPRequestHandler):
         }[kind]  # fmt: skip
         try:
             data = make(place)
-        except OSError:
-            return self._refuse(HTTPStatus.NOT_FOUND, "The editor has ended.")
+        except OSError as error:
+            raise Unfit(HTTPStatus.NOT_FOUND, "The editor has ended.") from error
         self._send(HTTPStatus.OK, "image/jpeg" if kind in ("frame", "thumb") else "image/png", data, KEEP)
 
     def _send_json(self, value: Any, status: int = HTTPStatus.OK) -> None:
         self._send(status, "application/json", json.dumps(value).encode())
-
-    def _refuse(self, status: HTTPStatus, said: str) -> None:
-        self.close_connection = True  # what was not read of the request is no request
-        self._send_json({"error": said}, status)
 
     def _send(self, status: int, kind: str, data: bytes, cache: str = FORGET) -> None:
         self.send_response(status)

@@ -209,3 +209,14 @@ def test_a_port_in_use_and_flags_that_do_not_fit_are_one_sentence(
     assert "there is no such thing" in refusal(
         capsys, "masks", "--edit", "--video", str(tmp_path / "no.mp4"), "--out", str(tmp_path / "m")
     )
+
+
+def test_a_fault_of_the_editor_is_told_and_the_work_goes_on(
+    editor: Served, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(editor.editor.work, "marks", lambda _: 1 / 0)
+        status, answer = editor.do(kind="stroke", id="a", place=0, tool="animal", radius=3, points=[[20, 20]])
+    assert status == 500 and answer["error"].startswith("The editor failed (ZeroDivisionError: division by zero)")
+    assert "Traceback" in capsys.readouterr().err
+    assert editor.do(kind="box", id="b", place=0, box=BOX)[0] == 200
