@@ -22,6 +22,8 @@ from rewild4d.datasets.masking.makers import MaskMaker, Unmasked
 from rewild4d.datasets.masking.marks import is_whole
 from rewild4d.errors import UserError
 
+PATIENCE = 5.0
+"""Seconds that a job gets to stop at the end."""
 REMEMBERED = 1000
 """Drawings whose ids are known: one that is sent again after a lost connection is not drawn twice."""
 GREEN, RED = (60, 220, 60, 255), (70, 70, 255, 255)
@@ -115,10 +117,12 @@ class Editor:
 
     def close(self) -> None:
         """Stop what runs."""
-        if self._job:
-            self._job.cancel()
-            self._job.join(30)
-        self.film.close()
+        try:
+            if self._job:
+                self._job.cancel()
+                self._job.join(PATIENCE)
+        finally:
+            self.film.close()
 
     def _do(self, request: ask.AnyRequest) -> int | None:
         match request:

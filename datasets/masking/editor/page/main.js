@@ -17,6 +17,7 @@ let place = 0;
 let tool = "box";
 let isPlaying = false;
 let lastNotice = null;
+let isLackingRead = false;
 const sent = []; // drawings, until the pictures show them
 
 await client.start();
@@ -106,8 +107,8 @@ function showState() {
   for (const id of ["track", "onwards", "save", "done", "fix", "clear"]) $(id).disabled = isBusy;
   $("saved").textContent = state.saved ? "saved" : "not saved";
   $("saved").classList.toggle("bad", !state.saved);
-  $("lacking").hidden = !state.lacking;
-  $("lacking").textContent = state.lacking;
+  $("lacking").hidden = !state.lacking || isLackingRead;
+  $("lacking-text").textContent = state.lacking;
   $("job").hidden = !isBusy;
   if (isBusy) showJob(state.job);
   const [number, kind, text] = state.notice;
@@ -253,6 +254,7 @@ function wire() {
     save: () => decide("save"), done, cancel: () => decide("cancel"), help: () => $("help-box").showModal(),
     fix: () => decide("fix", { place }), clear: () => decide("clear", { place }), before: () => go(place - 1),
     after: () => go(place + 1), play, fit: () => view.fit(), closer: () => view.zoom(1.5), farther: () => view.zoom(1 / 1.5),
+    "lacking-close": () => ($("lacking").hidden = isLackingRead = true),
     "notice-close": () => ($("notice").hidden = true),
     "notice-copy": () => navigator.clipboard.writeText($("notice-code").textContent),
   };
