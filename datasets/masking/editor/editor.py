@@ -5,6 +5,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Event, Lock
 from typing import Any
@@ -18,7 +19,7 @@ from rewild4d.datasets.masking.editor.film import Film
 from rewild4d.datasets.masking.editor.job import Job
 from rewild4d.datasets.masking.editor.saving import marks_folder, save
 from rewild4d.datasets.masking.editor.work import Busy, Refused, Stale, Work, packed
-from rewild4d.datasets.masking.makers import MaskMaker, Unmasked
+from rewild4d.datasets.masking.makers import Box, MaskMaker, Unmasked
 from rewild4d.datasets.masking.marks import is_whole
 from rewild4d.errors import UserError
 
@@ -171,7 +172,17 @@ class Editor:
             if right - left < 1 or bottom - top < 1:
                 raise Refused("The box is not inside the frame.")
             box = (round(left, 1), round(top, 1), round(right - left, 1), round(bottom - top, 1))
-        self.work.change(f"box in frame {self._name(request.place)}", request.place, {("boxes", request.place): box})
+        values = {} if box is None else self._boxed(request.place, box)
+        values["boxes", request.place] = box
+        self.work.change(f"box in frame {self._name(request.place)}", request.place, values)
+
+    def _boxed(self, place: int, box: Box) -> dict[tuple[str, int], Any]:
+        """Return a frame's mask as following starts from a box, before it goes on to other frames."""
+        said, stems = self.work.marks(place), (self.source.stems[place],)
+        marks, images = {0: said} if said.any() else {}, partial(iter, (self.film.image(place),))
+        source = replace(self.source, stems=stems, images=images, boxes={0: box}, marks=marks)
+        mask = packed(next(iter(self.maker(source))))
+        return {("bases", place): mask, ("masks", place): mask}
 
     def _fix(self, place: int) -> None:
         name, before, mask = self._name(place), self.work.marks(place), self.work.mask(place)

@@ -68,7 +68,10 @@ def read_drawn(folder: Path, source: Unmasked) -> tuple[dict[int, np.ndarray], d
     """
     marks = read_marks(folder, source.stems, source.size) if folder.is_dir() and list_images(folder) else {}
     file = folder / BOXES
-    boxes = parse_boxes(tuple(read_text(file, "boxes").split()), source.stems) if file.is_file() else {}
+    try:
+        boxes = parse_boxes(tuple(read_text(file, "boxes").split()), source.stems) if file.is_file() else {}
+    except UserError as error:
+        raise UserError(f"{file}: expected boxes, one a line. {error}") from error
     return marks, boxes
 
 

@@ -46,6 +46,7 @@ def wait(editor: Served, seconds: float = 30) -> dict[str, object]:
 
 def test_a_box_and_following_make_masks_of_all_frames_and_one_undo_takes_them_back(editor: Served) -> None:
     assert editor.do(**box())[0] == 200
+    assert iou(editor.mask(0), moving.mask(0, SIZE) > 0) > 0.9, "the frame's own mask is there at once"
     status, answer = editor.decide("track")
     assert status == 200 and answer["state"]["undo"] == "box in frame 100"
     state = wait(editor)
@@ -220,6 +221,15 @@ def test_masks_and_marks_that_do_not_fit_are_one_sentence(tmp_path: Path) -> Non
     given = Unmasked(source.title, source.stems, source.size, source.images, {}, marks)
     with pytest.raises(UserError, match="holds marks of an earlier sitting"), served(tmp_path / "masks", given):
         pass
+
+
+def test_boxes_that_cannot_be_read_are_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "masks-marks").mkdir()
+    for text, said in (("00100:1,2,3\n", r"boxes\.txt: expected boxes, one a line\. --box: expected left,top"),
+                       ("00300:1,2,3,4", "in a frame from 00100 to 00107")):  # fmt: skip
+        (tmp_path / "masks-marks" / "boxes.txt").write_text(text)
+        with pytest.raises(UserError, match=said), served(tmp_path / "masks"):
+            pass
 
 
 def test_a_film_that_ends_early_is_one_sentence(tmp_path: Path) -> None:
