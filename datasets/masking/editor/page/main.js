@@ -10,8 +10,7 @@ import { View } from "./view.js";
 const $ = (id) => document.getElementById(id);
 const [PLAYED, SMALLEST, LARGEST] = [12, 1, 120]; // frames a second; radii of brushes, pixels of the screen at fit
 const client = new Client();
-const pictures = new Pictures();
-let view, strip, pointer;
+let pictures, view, strip, pointer;
 let names = [];
 let place = 0;
 let tool = "box";
@@ -27,6 +26,7 @@ function begin() {
   const { title, size } = client.about;
   names = client.about.names.map((name) => name.replace(/^0+(?=\d)/, ""));
   $("title").textContent = document.title = title;
+  pictures = new Pictures(size);
   view = new View($("canvas"), size);
   strip = new Strip($("strip"), names, size, pictures, (chosen) => show(chosen));
   pointer = new Pointer($("canvas"), view, {

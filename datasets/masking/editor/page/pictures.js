@@ -1,10 +1,15 @@
 // Frames, thumbnails, masks and strokes, decoded and kept for a while.
 
-const MOST = { frame: 40, layers: 60 };
+const [MEMORY, FEWEST] = [200e6, 8]; // bytes of frames that are kept, and the same of layers; but so many at least
 const TINT = "#3ba0ff";
 
 export class Pictures {
   #kept = { frame: new Map(), layers: new Map(), thumb: new Map() };
+
+  // `size`: width and height of the frames.
+  constructor([width, height]) {
+    this.most = Math.max(FEWEST, Math.floor(MEMORY / (4 * width * height)));
+  }
 
   frame(place) {
     return this.#get("frame", place, () => decoded(`frame/${place}`));
@@ -34,7 +39,7 @@ export class Pictures {
       found.catch(() => kept.delete(key));
     }
     kept.set(key, found);
-    if (kept.size > (MOST[kind] ?? Infinity)) kept.delete(kept.keys().next().value);
+    if (kind !== "thumb" && kept.size > this.most) kept.delete(kept.keys().next().value);
     return found;
   }
 }
