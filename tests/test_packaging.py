@@ -148,4 +148,5 @@ def test_the_wheel_carries_code_and_data(tmp_path: Path) -> None:
     assert {
         f"{page}/{name}" for name in ("player/player.min.js", "player/licences.txt", "templates/report.html")
     } <= names
+    assert {f"rewild4d/datasets/masking/editor/page/{name}" for name in ("index.html", "style.css", "main.js")} <= names
     assert {name.split("/")[0] for name in names if not name.startswith("rewild4d-")} == {"rewild4d"}

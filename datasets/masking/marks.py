@@ -49,6 +49,8 @@ def read_marks(folder: Path, stems: Sequence[str], size: tuple[int, int]) -> dic
 def write_marks(marks: Mapping[int, np.ndarray], stems: Sequence[str], folder: Path) -> list[Path]:
     """Write folder/<stem>.png for each marked frame: a whole mask in greys, strokes in green and red on black.
 
+    A frame without the animal is red all over.
+
     Args:
         marks: by the frame's place.
         stems: names of all frames.
@@ -62,7 +64,8 @@ def write_marks(marks: Mapping[int, np.ndarray], stems: Sequence[str], folder: P
         paths.append(folder / f"{stems[place]}.png")
         image = np.zeros((*said.shape, 3), np.uint8)
         image[said > 0], image[said < 0] = GREEN, RED
-        drawn = (said > 0) * np.uint8(255) if is_whole(said) else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+        is_mask = is_whole(said) and (said > 0).any()  # a black one says nothing to a reader
+        drawn = (said > 0) * np.uint8(255) if is_mask else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
         with atomic(paths[-1]) as temporary:
             cv2.imwrite(str(temporary), drawn)
     return paths

@@ -26,11 +26,18 @@ def track_masks(source: Unmasked) -> Iterator[np.ndarray]:
     """Follow the animal on and back from each frame that somebody told about: a box, a whole mask or strokes.
 
     Where nobody did it starts in the first frame in which one thing stands out. Without the network's weights the masks
-    are rough ones, and a line says so.
+    are rough ones, and a line says so. Pixels that marks tell are as they say.
 
     Raises:
         UserError: no box, and two things stand out, or nothing does.
     """
+    for index, mask in enumerate(_made(source)):
+        said = source.marks.get(index)
+        yield mask if said is None else np.where(said > 0, 255, np.where(said < 0, 0, mask)).astype(np.uint8)
+
+
+def _made(source: Unmasked) -> Iterator[np.ndarray]:
+    """Yield the mask of each frame, uint8 [h, w]."""
     if not is_here(NAME):
         print(
             f"masks: the network '{NAME}' is not here, so these are rough masks, from flow and colours alone; "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from rewild4d.foreign.programs import TIMEOUT
 if TYPE_CHECKING:
     import torch
 
-    from rewild4d.datasets.masking.makers import MaskMaker
+    from rewild4d.datasets.masking.makers import MaskMaker, Unmasked
 
 DESCRIPTION = """Make masks of the animal. --tool track follows it offline from boxes, strokes or whole masks on any
 frames, or from what stands out in the first one (a network of 4.5 MB: `weights fetch u2netp`). --tool program runs any
@@ -51,6 +52,8 @@ class Options:
         detector: for grounded-sam2: name or folder of a Grounding DINO model.
         segmenter: for grounded-sam2: name or folder of a SAM 2 model.
         device: auto, cpu or cuda.
+        edit: draw and correct masks in a browser on this machine; --out holds what is there and what is saved.
+        port: of this machine, for --edit; 0: any that is free.
     """
 
     out: Path
@@ -70,13 +73,16 @@ class Options:
     detector: str = DETECTOR
     segmenter: str = SEGMENTER
     device: str = "auto"
+    edit: bool = False
+    port: int = 0
 
 
 def main(arguments: list[str]) -> int:
     options = parse_flags(Options, arguments, prog="rewild4d-bench masks", description=DESCRIPTION)
     check_timeout(options.timeout)
-    from rewild4d.datasets.masking.makers import parse_boxes, write_masks
-    from rewild4d.datasets.masking.marks import read_marks
+    if options.edit:
+        return edit(options)
+    from rewild4d.datasets.masking.makers import write_masks
     from rewild4d.datasets.masking.masks import list_images
     from rewild4d.datasets.video.mask_check import SPLIT
     from rewild4d.machine import pick_device
@@ -94,13 +100,7 @@ def main(arguments: list[str]) -> int:
     cases = (reader.name,) if is_one else choose_cases(reader.cases(SPLIT), options.case)
     require_writable(options.out)
     for case in cases:
-        source = reader.unmasked(case)
-        if options.box:
-            source = replace(source, boxes=parse_boxes(options.box, source.stems))
-        if options.marks is not None:
-            told = options.marks if is_one else options.marks / case
-            if is_one or told.is_dir():
-                source = replace(source, marks=read_marks(told, source.stems, source.size))
+        source = told(reader.unmasked(case), options, None if is_one else case)
         folder = options.out if is_one else options.out / case
         progress = Progress(f"{folder}: masks")
         try:
@@ -112,6 +112,60 @@ def main(arguments: list[str]) -> int:
             print(f"{folder}: it holds {len(older)} other masks, which readers take too: remove them?", file=sys.stderr)
     print("check the masks before use: rewild4d-bench check with --masks draws a contact sheet", file=sys.stderr)
     return 0
+
+
+def told(source: Unmasked, options: Options, case: str | None = None) -> Unmasked:
+    """Return frames with the boxes and marks that the flags give.
+
+    Args:
+        source: the frames.
+        options: flags of the command.
+        case: of a data set with several, whose marks lie in a folder of its name and may be missing.
+
+    Raises:
+        UserError: boxes or marks that cannot be used.
+    """
+    from rewild4d.datasets.masking.makers import parse_boxes
+    from rewild4d.datasets.masking.marks import read_marks
+
+    if options.box:
+        source = replace(source, boxes=parse_boxes(options.box, source.stems))
+    folder = None if options.marks is None else options.marks / (case or "")
+    if folder is not None and (case is None or folder.is_dir()):
+        source = replace(source, marks=read_marks(folder, source.stems, source.size))
+    return source
+
+
+def edit(options: Options) -> int:
+    """Serve the editor of one film until it is done.
+
+    Raises:
+        UserError: other flags than it takes, or a film, masks or a port that cannot be used.
+    """
+    if options.tool != "track":
+        raise UserError(f"--edit: expected --tool track, which it follows with, got {options.tool}.")
+    if options.dataset != "online":
+        raise UserError(f"--edit: expected --video FILE, got --dataset {options.dataset}.")
+    from rewild4d.datasets.masking.editor.app import open_editor, serve
+    from rewild4d.datasets.masking.editor.server import Server
+    from rewild4d.datasets.masking.tracking import track_masks
+
+    reader: Any = open_dataset(options.dataset, options.data, options)[1]
+    source = told(reader.unmasked(reader.name), options)
+    require_writable(options.out)
+    with Server(options.port) as server:
+        serve(server, open_editor(source, options.out, track_masks, _check_command(options)))
+    return 0
+
+
+def _check_command(options: Options) -> str:
+    """Return the command that checks the masks of the same frames."""
+    words = ["rewild4d-bench", "check", "--dataset", "online", "--video", options.data or options.video]
+    words += ["--masks", options.out]
+    for flag in ("start", "end", "fps"):
+        if (value := getattr(options, flag)) is not None:
+            words += [f"--{flag}", f"{value:g}"]
+    return shlex.join(map(str, words))
 
 
 def make_maker(options: Options, device: torch.device) -> MaskMaker:

@@ -171,6 +171,8 @@ def test_the_command_takes_marks(tmp_path: Path, capsys: pytest.CaptureFixture[s
         words = ("masks", "--video", str(tmp_path / "clip"), "--out", str(tmp_path / "m"))
         assert call(*words, "--marks", str(tmp_path / "marks")) == 0
         assert "12 masks by 'track', 0 of them without the animal" in capsys.readouterr().out
+        made = np.asarray(Image.open(tmp_path / "m" / f"{first}.png"))
+        assert (made == moving.mask(0, SIZE)).all(), "what is told stays"
         said = refusal(capsys, *words, "--tool", "rough", "--marks", str(tmp_path / "marks"))
         assert "--marks: only --tool track takes marks, got --tool rough." in said
         assert "expected a folder of images" in refusal(capsys, *words, "--marks", str(tmp_path / "nowhere"))
