@@ -278,6 +278,8 @@ class OneSide(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """Instead of `geometry.temporal`."""
     turns: bool = False
     """Instead of `pose.turns`: what one side tells of a turn may be false."""
+    stray: Weight = 100.0
+    """Instead of `geometry.stray`."""
     colors_epsilon: Positive = 1e-4
     """Instead of `rates.colors_epsilon`."""
     cap: Count = 16_000

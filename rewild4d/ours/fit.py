@@ -29,7 +29,7 @@ from rewild4d.ours.symmetry import Key, Supervision, Target
 from rewild4d.ours.training import GaussianTraining, run_steps
 from rewild4d.ours.warmup import WarmUp
 from rewild4d.rasterizer import RasterInfo, rasterize
-from rewild4d.types import Clip, Prior
+from rewild4d.types import OBJECT_DIAGONAL, Clip, Prior
 
 CLIPPED = ("pose", "deform")
 """Groups whose gradients are clipped."""
@@ -196,6 +196,9 @@ class Training(GaussianTraining):
             losses["rigid"] = config.rigid * rigid_loss(own.means, deformed.means, self.near)
         if config.steady:
             losses["steady"] = config.steady * (deformed.log_scales - posed.log_scales).square().mean()
+        if config.stray:
+            away = ((deformed.means - posed.means) / OBJECT_DIAGONAL).square().sum(dim=1)
+            losses["stray"] = config.stray * torch.relu(away - config.stray_from**2).mean()
         return losses | self.skin_losses(opacities)
 
     def change_density(self, index: int) -> bool:

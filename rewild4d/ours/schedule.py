@@ -54,7 +54,7 @@ def _for_one_side(config: Config) -> Config:
         canonical=replace(config.canonical, samples=own.samples, thickness=own.thickness, opacity=own.opacity),
         prior=replace(config.prior, pull=own.pull, pull_until=own.pull_until, untold=own.untold),
         pose=replace(config.pose, turns=own.turns),
-        geometry=replace(config.geometry, temporal=own.temporal),
+        geometry=replace(config.geometry, temporal=own.temporal, stray=own.stray),
         rates=replace(config.rates, colors_epsilon=own.colors_epsilon),
         density=replace(config.density, cap=own.cap),
         skin=own.skin,

@@ -24,7 +24,7 @@ from rewild4d.ours.schedule import for_clip
 from rewild4d.ours.symmetry import SIGNS, Key, Supervision
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import axis_angle_to_matrix, similarity
-from rewild4d.types import Clip, Prior
+from rewild4d.types import OBJECT_DIAGONAL, Clip, Prior
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -119,6 +119,24 @@ def test_a_change_of_scale_by_the_deformation_costs_its_square(toy: tuple[Clip, 
     assert training.losses(key, target, last)[0]["steady"].item() == pytest.approx(0.1 * offset**2, rel=1e-4)
     off = msgspec.structs.replace(TINY, geometry=msgspec.structs.replace(TINY.geometry, steady=0.0))
     assert "steady" not in start(toy, off).losses(key, target, last)[0]
+
+
+def test_only_displacements_beyond_the_body_cost_something(toy: tuple[Clip, Prior]) -> None:
+    held = msgspec.structs.replace(TINY.geometry, stray=2.0, stray_from=0.02)
+    training = start(toy, msgspec.structs.replace(TINY, geometry=held))
+    deform, key = training.model.deform, Key(1, 1, 1)
+    target, last = training.supervision.target(key), TINY.iterations - 1
+    with torch.no_grad():
+        deform.out.weight.zero_()
+        deform.out.bias.zero_()
+    for diagonals, cost in ((0.02, 0.0), (0.5, 2 * (0.5**2 - 0.02**2))):
+        with torch.no_grad():
+            deform.out.bias[0] = diagonals * OBJECT_DIAGONAL / TINY.deform.reach
+        lost = training.losses(key, target, last)[0]["stray"]
+        assert lost.item() == pytest.approx(cost, rel=1e-4, abs=1e-6)
+    lost.backward()
+    assert deform.out.bias.grad is not None and deform.out.bias.grad[0] > 0, "it draws the part back"
+    assert "stray" not in start(toy, TINY).losses(key, target, last)[0]
 
 
 def test_a_killed_fit_resumes_to_the_same_bits_on_more_threads(toy: tuple[Clip, Prior], tmp_path: Path) -> None:

@@ -75,6 +75,11 @@ class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """Neighbours that a Gaussian is compared with."""
     steady: Weight = 0.1
     """Deformed branch: weight of the squared change of log scale, against scales that grow and are shrunk again."""
+    stray: Weight = 0.0
+    """Deformed branch: weight of squared displacements above `stray_from`, against parts that leave the body where no
+    image speaks of them."""
+    stray_from: Weight = 0.02
+    """Displacement by the deformation that costs nothing, diagonals."""
 
 
 class Skin(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
