@@ -81,7 +81,7 @@ def protocol_tables(records: Sequence[RunRecord]) -> list[Table]:
         kept, remarks = latest(group)
         cases = list(dict.fromkeys(record.case for record in kept))
         named = variants(kept)
-        frame = _frame(kept, remarks)
+        frame = _without_missing_sets(_frame(kept, remarks), kept)
         columns = (*columns_of(kept, frame.scores), Column("seeds"), Column("fit, s"))
         over = [[case] for case in cases] + [cases] * (len(cases) > 1)
         rows = []
@@ -238,6 +238,20 @@ def _frame(records: Sequence[RunRecord], remarks: Sequence[str]) -> Frame:
     caption = f"Protocol `{protocol['name']}`. {sentence(coverage_text(records))}"
     scores = tuple(protocol["scores"])
     return Frame(protocol["name"], protocol["title"], caption, ("",), scores, (*remarks, *_floors(records, scores)))
+
+
+def _without_missing_sets(frame: Frame, records: Sequence[RunRecord]) -> Frame:
+    """Leave out distances between sets that no run has, such as those of one short clip, and say why in a remark."""
+    sets = {name for scores in KINDS.values() for name in scores if name in frame.scores}
+    notes: dict[str, list[str]] = {}
+    for name in frame.scores:
+        found = [run.scores[name] for run in records if name in run.scores]
+        if name in sets and found and all(score.value is None for score in found):
+            notes.setdefault(found[0].note, []).append(TITLES.get(name, name))
+    missing = {title for titles in notes.values() for title in titles}
+    scores = tuple(name for name in frame.scores if TITLES.get(name, name) not in missing)
+    said = tuple(f"{', '.join(titles)}: {note or 'not computed'}" for note, titles in notes.items())
+    return replace(frame, scores=scores, remarks=(*frame.remarks, *said))
 
 
 def _floors(records: Sequence[RunRecord], scores: Sequence[str]) -> list[str]:

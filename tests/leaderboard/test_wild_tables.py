@@ -19,6 +19,7 @@ from rewild4d.datasets.video.davis import known_sequences
 from rewild4d.evaluation.protocol import load_protocols
 from rewild4d.leaderboard.records import RunRecord, find_records, write_record
 from rewild4d.leaderboard.specs import load_specs
+from rewild4d.leaderboard.tables import markdown
 from rewild4d.metrics.score import Score
 from rewild4d.priors.config import FOOTAGE, QUICK, STANDARD, PriorConfig
 from rewild4d.running import planning
@@ -234,3 +235,16 @@ def test_a_table_whose_rows_are_all_one_run_is_not_on_the_page(tmp_path: Path) -
     assert call("leaderboard", "build", "--runs", str(runs), "--out", str(page)) == 0
     text = (page / "index.html").read_text()
     assert '<table id="artemis">' in text and '<table id="ablation">' not in text
+
+
+def test_distances_that_a_short_clip_cannot_have_are_no_columns() -> None:
+    why = "not computed: 16 images expected, got 4"
+
+    def made(method: str, kid: float | None) -> RunRecord:
+        scores = {"psnr": Score(20.0, "dB", "higher", 1), "kid_v": Score(kid, "1", "lower", 4, note="" if kid else why)}
+        return record(method=method, scores=scores, protocol={"name": "p", "title": "P", "scores": ["psnr", "kid_v"]})
+
+    shown = markdown([made("ours", None), made("gart", None)])
+    assert "| case | method | PSNR, dB ↑ | seeds |" in shown and f"KID-16V: {why}" in shown
+    shown = markdown([made("ours", 0.25), made("gart", None)])
+    assert "| PSNR, dB ↑ | KID-16V ↓ |" in shown and "0.2500" in shown and "n/a" in shown
