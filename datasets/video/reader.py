@@ -13,6 +13,9 @@ from rewild4d.datasets.video.wild import Video, original_images, split_video
 from rewild4d.errors import UserError
 from rewild4d.types import Clip, Truth
 
+_JUDGED: dict[str, Verdict] = {}
+"""Verdicts on masks by what decides them: a run asks before its fit and again for its record."""
+
 
 class VideoDataset(ABC):
     """Videos with masks, each one a case. Keeps contracts.DatasetReader.
@@ -60,10 +63,12 @@ class VideoDataset(ABC):
     def judge_masks(self, case: str) -> Verdict:
         """Return whether the masks of a case can be trusted; its errors are those of `video`."""
         video = self.video(case)
-        trust = MaskTrust(len(video.moments))
-        for index, (image, mask) in enumerate(zip(video.images(), video.masks(), strict=False)):
-            trust.add(index, image, mask)
-        return trust.verdict([moment.label for moment in video.moments])
+        if video.identity not in _JUDGED:
+            trust = MaskTrust(len(video.moments))
+            for index, (image, mask) in enumerate(zip(video.images(), video.masks(), strict=False)):
+                trust.add(index, image, mask)
+            _JUDGED[video.identity] = trust.verdict([moment.label for moment in video.moments])
+        return _JUDGED[video.identity]
 
     def check(self, cases: Sequence[str] = (), sheets: Path | None = None) -> list[Finding]:
         """Verify every frame and mask of some cases (the first few default ones where none is named).

@@ -4,7 +4,7 @@ import contextlib
 import shutil
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import torch
 
-from rewild4d.contracts import DatasetReader, Reconstruction
+from rewild4d.contracts import DatasetReader, Reconstruction, Verdict
 from rewild4d.errors import DiskFull, UserError, bounded, unknown_name
 from rewild4d.evaluation.coverage import coverage
 from rewild4d.evaluation.networks import may_be_scored_now
@@ -140,10 +140,16 @@ def list_jobs(plan: Plan) -> list["Job"]:
 
 
 def _prepare(plan: Plan, name: str) -> None:
-    """Make the prior of a case where a fit still needs it, and print its notes; its errors are reported by the fits."""
+    """Make the prior of a case where a fit still needs it; print its notes, and masks that cannot be trusted.
+
+    Its errors are reported by the fits.
+    """
     clip, truth = plan.reader.load(name, plan.protocol.selection)
     if not all(job.finished() for job in _jobs(plan, name, clip, truth)):
+        judge: Callable[[str], Verdict] | None = getattr(plan.reader, "judge_masks", None)
         with contextlib.suppress(UserError, FloatingPointError):
+            if judge and (verdict := judge(name)).level != "green":
+                print(f"{name}: {verdict}", file=sys.stderr)
             for note in _prior(plan, clip, truth).notes:
                 print(f"{name}: prior: {note}", file=sys.stderr)
 

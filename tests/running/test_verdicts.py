@@ -1,0 +1,49 @@
+"""A run says before its fit whether its masks can be trusted, and its record and its first lines say it again."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import moving
+import msgspec
+import numpy as np
+import pytest
+from films import TINY, plan
+from records_for_tests import record
+
+from rewild4d.commands.run import print_verdicts
+from rewild4d.contracts import Verdict
+from rewild4d.datasets.video.online import Online
+from rewild4d.leaderboard.records import to_json
+from rewild4d.running import runner
+
+
+def test_a_run_with_masks_that_are_too_large_says_so_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    moving.frames(tmp_path / "clip")
+    for number in range(12):
+        mask = moving.mask(number)
+        grown = np.maximum.reduce([np.roll(mask, (y, x), (0, 1)) for y in range(-5, 6) for x in range(-5, 6)])
+        moving.save(tmp_path / "masks" / f"{number:05d}.png", grown)
+    made = plan(Online(tmp_path / "clip", masks=tmp_path / "masks"), "clip", tmp_path / "runs")
+    (record,) = runner.execute(replace(made, prior=replace(made.prior, config=TINY)))
+    before = capsys.readouterr().err
+    assert "clip: masks: red: they are too large, or shifted" in before
+    levels = {verdict.about: verdict.level for verdict in record.verdicts}
+    assert levels["masks"] == "red" and {*levels} == {"masks", "prior", "result"}
+    print_verdicts([record], "prior-only")
+    assert capsys.readouterr().out.startswith("clip, seed 0: masks: red: they are too large, or shifted")
+
+
+def test_what_is_red_comes_first_and_green_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    green, yellow, red = (Verdict("result", level, level) for level in ("green", "yellow", "red"))
+    print_verdicts([record(verdicts=[yellow]), record(seed=1, verdicts=[red])], "ours")
+    assert capsys.readouterr().out == "wolf/Run, seed 1: result: red: red\nwolf/Run, seed 0: result: yellow: yellow\n\n"
+    print_verdicts([record(verdicts=[green]), record(method="gart", verdicts=[red])], "ours")
+    assert capsys.readouterr().out == "green: result: nothing speaks against them\n\n"
+    print_verdicts([record()], "ours")
+    assert capsys.readouterr().out == ""
+
+
+def test_a_record_keeps_its_verdicts() -> None:
+
+    made = record(verdicts=[Verdict("masks", "red", "why", "do this")])
+    assert msgspec.json.decode(to_json(made), type=type(made)) == made
