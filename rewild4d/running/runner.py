@@ -239,6 +239,8 @@ class Job:
                 device=self.plan.device, title=self.title,
             )  # fmt: skip
             timing = self._timing(fit_seconds, seconds)
+            # Before the record: a run that was killed in between is not finished, and clears up when it goes on.
+            shutil.rmtree(self.folder / "work", ignore_errors=True)
             path = write_record(self._record(case, **fields, coverage=seen, timing=timing), self.folder)
         except DiskFull:  # it is no failure of the run, and its record could not be written either
             raise
@@ -249,7 +251,6 @@ class Job:
                 raise fault from error
             traceback.print_exc(file=sys.stderr)
             return self.fail(f"{type(error).__name__}: {error}", case)
-        shutil.rmtree(self.folder / "work", ignore_errors=True)
         return read_record(path)
 
     def fail(self, message: str, case: Case | None = None) -> RunRecord:
