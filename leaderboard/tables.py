@@ -247,10 +247,12 @@ def _without_missing_sets(frame: Frame, records: Sequence[RunRecord]) -> Frame:
     for name in frame.scores:
         found = [run.scores[name] for run in records if name in run.scores]
         if name in sets and found and all(score.value is None for score in found):
-            notes.setdefault(found[0].note, []).append(TITLES.get(name, name))
-    missing = {title for titles in notes.values() for title in titles}
-    scores = tuple(name for name in frame.scores if TITLES.get(name, name) not in missing)
-    said = tuple(f"{', '.join(titles)}: {note or 'not computed'}" for note, titles in notes.items())
+            notes.setdefault(found[0].note, []).append(name)
+    missing = {name for names in notes.values() for name in names}
+    scores = tuple(name for name in frame.scores if name not in missing)
+    said = tuple(
+        f"{', '.join(TITLES[name] for name in names)}: {note or 'not computed'}" for note, names in notes.items()
+    )
     return replace(frame, scores=scores, remarks=(*frame.remarks, *said))
 
 

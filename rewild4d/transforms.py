@@ -201,6 +201,11 @@ def transform_splats(splats: Splats, matrix: Tensor) -> Splats:
     )
 
 
+def on_cpu(splats: Splats) -> Splats:
+    """Return Gaussians on the CPU in single precision, without gradients."""
+    return Splats(*(part.detach().float().cpu() for part in vars(splats).values()))
+
+
 def skin_points(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
     """Apply linear blend skinning: x -> sum_j w_j P_j x.
 

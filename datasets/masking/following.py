@@ -34,6 +34,8 @@ BINS, LEARNED = 16, 0.1
 """Colours a channel, and share of them that each frame teaches anew."""
 TAUGHT = 0.5
 """The same of a frame that a person has corrected."""
+DOUBT, DROPPED = 0.1, 0.05
+"""How far from a half a chance is at least before strokes change it, and the chance of what they cut off."""
 YOUNG = 0.5
 """A loose part is dropped where it was first seen less than this share of the largest part's frames ago."""
 LEAST_PART, TOUCHING = 0.02, 0.3
@@ -108,11 +110,12 @@ class Follower:
             if (said > 0).any():
                 self._start(image, None, said)
             return
-        chance = corrected(image, np.where(self.mask, self._chance.clip(0.6), self._chance.clip(0, 0.4)), said)
+        before = np.where(self.mask, self._chance.clip(0.5 + DOUBT), self._chance.clip(0, 0.5 - DOUBT))
+        chance = corrected(image, before, said)
         mask = _as_said(_main_parts(chance > 0.5, self.mask | (said > 0), touching=0.0), said)
         oldest = float(self._seen.max())
         self._seen = np.where(mask, np.where(self.mask, self._seen, oldest), 0).astype(np.float32)
-        self.mask, self._chance = mask, np.where(mask | (chance < 0.5), chance, 0.05).astype(np.float32)
+        self.mask, self._chance = mask, np.where(mask | (chance < 0.5), chance, DROPPED).astype(np.float32)
         if mask.any():
             self._areas[-1] = int(mask.sum())
             self._colours.learn(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), self._chance, TAUGHT)

@@ -9,7 +9,7 @@ from rewild4d.harmonics import spiral
 from rewild4d.io.sampling import OPACITY
 from rewild4d.metrics.clouds import cell_rows, subsample
 from rewild4d.rasterizer import rasterize
-from rewild4d.transforms import look_at
+from rewild4d.transforms import look_at, on_cpu
 from rewild4d.types import Camera, Splats
 
 VIEWS = 32
@@ -44,7 +44,7 @@ def sample_drawn(splats: Splats, count: int, seed: int) -> Tensor:
     Returns:
         float64, [m, 3], m <= count; [0, 3] where nothing is drawn.
     """
-    splats = _on_cpu(splats)
+    splats = on_cpu(splats)
     solid = splats.means[splats.opacities >= OPACITY].double()
     if not len(solid):
         return solid
@@ -82,8 +82,3 @@ def _seen(splats: Splats, camera: Camera, radius: float) -> Tensor:
     pixels = torch.stack((columns + 0.5, rows + 0.5, torch.ones_like(depth)), dim=-1)
     in_camera = pixels @ torch.linalg.inv(camera.intrinsics.double()).T * depth[:, None]
     return (in_camera - pose[:3, 3]) @ pose[:3, :3]
-
-
-def _on_cpu(splats: Splats) -> Splats:
-    parts = (splats.means, splats.quats, splats.scales, splats.opacities, splats.colors)
-    return Splats(*(part.detach().float().cpu() for part in parts))

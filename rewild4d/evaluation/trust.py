@@ -1,4 +1,4 @@
-"""Judge a prior and a result without the truth: figures of the fit, held-out masks, parts that came off the body."""
+"""Judge a result without the truth: parts that came off the body, needles, held-out masks."""
 
 from collections.abc import Mapping, Sequence
 
@@ -9,12 +9,6 @@ from rewild4d.contracts import Reconstruction, Verdict
 from rewild4d.metrics.score import Score
 from rewild4d.types import Splats
 
-FITS, HARDLY = 0.75, 0.6
-"""Mask IoU of the prior: below the first it is to be looked at, below the second it hardly fits."""
-LEFT_OUT, MOST = 0.25, 0.5
-"""Share of the frames that a method was not shown because their fitted cameras are far from the others'."""
-AGREED, UNDECIDED = 0.9, 0.01
-"""Head and tail: share of the frames in which clip and mirror image agree; cost by which the reversed heading loses."""
 COVERED, BARELY = 0.7, 0.5
 """IoU of the render with the held-out masks: below the first look at it, below the second do not rely on it."""
 GAP, SEEN = 0.02, 0.3
@@ -25,33 +19,6 @@ APART, TORN = 0.02, 0.08
 """Share of the visible Gaussians that are apart from the body: more, and it is to be looked at; limbs are torn off."""
 NEEDLE, NEEDLES = 0.1, 0.005
 """A Gaussian longer than this share of the body's diagonal is a needle; share of them above which it is told."""
-
-
-def prior_verdict(quality: Mapping[str, float], left_out: int, frames: int) -> Verdict | None:
-    """Judge a fitted prior; None where nothing was fitted.
-
-    Args:
-        quality: figures of its fit (`Prior.quality`).
-        left_out: frames that the method was not shown.
-        frames: of the clip.
-    """
-    if "mask_iou" not in quality:
-        return None
-    iou = min(quality["mask_iou"], quality.get("mask_iou_flip", 1.0))
-    share = left_out / max(1, frames)
-    if iou < HARDLY:
-        told = f"the template hardly fits the masks (IoU {iou:.2f})"
-        return Verdict("prior", "red", told, "look at prior-only; is another --prior or rig nearer to this animal?")
-    if share > MOST:
-        return Verdict("prior", "red", f"{share:.0%} of the frames are left out, their cameras are far from the rest's")
-    agreed, margin = quality.get("facing_agreement", 1.0), quality.get("facing_margin", 1.0)
-    if agreed < AGREED or margin < UNDECIDED:
-        return Verdict("prior", "yellow", "head and tail are uncertain", "look at prior-only from four sides")
-    if iou < FITS:
-        return Verdict("prior", "yellow", f"the template fits the masks with IoU {iou:.2f} only", "look at prior-only")
-    if share > LEFT_OUT:
-        return Verdict("prior", "yellow", f"{share:.0%} of the frames are left out")
-    return Verdict("prior", "green", f"the template fits the masks (IoU {iou:.2f})")
 
 
 def result_verdict(reconstruction: Reconstruction, times: Sequence[float], scores: Mapping[str, Score]) -> Verdict:

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from rewild4d.contracts import Verdict
 from rewild4d.priors.landmarks import FRONT, LANDMARKS, REAR, Marks, landmark_pixels
 from rewild4d.priors.silhouettes import mask_box, overlap
 from rewild4d.priors.steady import steady
@@ -20,6 +21,10 @@ UNDECIDED = 0.01
 """Lead in cost below which head and tail are uncertain."""
 AGREED = 0.9
 """Share of frames in which the clip and its mirror image must agree about the heading."""
+FITS = 0.75
+"""Mask IoU from which on a verdict says that the template fits."""
+LEFT_OUT, MOST = 0.25, 0.5
+"""Share of frames left out above which a verdict is yellow, and red."""
 
 
 def measured(prior: Prior, frames: Sequence[Frame]) -> dict[str, float]:
@@ -56,7 +61,7 @@ def agreement(cameras: Sequence[Camera], cameras_flip: Sequence[Camera]) -> floa
 def doubts(quality: Mapping[str, float]) -> tuple[str, ...]:
     """Return the reasons to doubt a prior that its figures give, a sentence each."""
     found = []
-    iou = min(quality.get("mask_iou", 1.0), quality.get("mask_iou_flip", 1.0))
+    iou = _worse_iou(quality)
     if iou < POOR:
         found.append(f"the template hardly fits these masks (mask IoU {iou:.2f}, below {POOR:g})")
     agreed, margin = quality.get("facing_agreement", 1.0), quality.get("facing_margin", 1.0)
@@ -65,6 +70,31 @@ def doubts(quality: Mapping[str, float]) -> tuple[str, ...]:
     elif margin < UNDECIDED:
         found.append(f"head and tail are uncertain: the reversed heading costs only {margin:.4f} more")
     return tuple(found)
+
+
+def prior_verdict(quality: Mapping[str, float], left_out: int, frames: int) -> Verdict | None:
+    """Judge a fitted prior; None where nothing was fitted.
+
+    Args:
+        quality: figures of its fit (`Prior.quality`).
+        left_out: frames that the method was not shown, since their cameras are far from the others'.
+        frames: of the clip.
+    """
+    if "mask_iou" not in quality:
+        return None
+    iou, share = _worse_iou(quality), left_out / max(1, frames)
+    reasons = [*doubts(quality), *([f"{share:.0%} of the frames are left out"] if share > LEFT_OUT else [])]
+    if not reasons and iou < FITS:
+        reasons = [f"the template fits the masks with IoU {iou:.2f} only"]
+    if not reasons:
+        return Verdict("prior", "green", f"the template fits the masks (IoU {iou:.2f})")
+    is_bad = iou < POOR or share > MOST
+    return Verdict("prior", "red" if is_bad else "yellow", "; ".join(reasons), "look at prior-only from four sides")
+
+
+def _worse_iou(quality: Mapping[str, float]) -> float:
+    """Return the lower mask IoU of a clip and of its mirror image."""
+    return min(quality.get("mask_iou", 1.0), quality.get("mask_iou_flip", 1.0))
 
 
 def joint_scores(prior: Prior, frames: Sequence[Frame], found: Marks) -> dict[str, float]:

@@ -13,8 +13,9 @@ from rewild4d.evaluation.measuring import evaluate
 from rewild4d.evaluation.placing import scale_of
 from rewild4d.evaluation.protocol import Protocol
 from rewild4d.evaluation.refining import ready_to_score
-from rewild4d.evaluation.trust import prior_verdict, result_verdict
+from rewild4d.evaluation.trust import result_verdict
 from rewild4d.metrics.score import Score
+from rewild4d.priors.judge import prior_verdict
 from rewild4d.progress import Progress
 from rewild4d.running import provenance
 from rewild4d.types import Clip, Truth

@@ -1,9 +1,9 @@
-"""Whether a prior and a result can be trusted."""
+"""Whether a result can be trusted."""
 
 import pytest
 import torch
 
-from rewild4d.evaluation.trust import body_facts, prior_verdict, result_verdict
+from rewild4d.evaluation.trust import body_facts, result_verdict
 from rewild4d.metrics.score import Score
 from rewild4d.types import Splats
 
@@ -53,18 +53,3 @@ def test_a_result_is_judged_by_its_body_and_by_held_out_masks() -> None:
     assert judged(body(), 0.4).startswith("result: red: it covers the animal in held-out images with IoU 0.40 only")
     assert judged(body(), 0.6).startswith("result: yellow: it covers the animal in held-out images with IoU 0.60 only")
     assert judged(body(0)) == "result: red: there are no Gaussians"
-
-
-def test_a_prior_is_judged_by_its_fit() -> None:
-    def said(quality: dict[str, float], left_out: int = 0) -> str:
-        return str(prior_verdict(quality, left_out, 20))
-
-    assert prior_verdict({}, 0, 20) is None, "nothing was fitted"
-    assert said({"mask_iou": 0.88}) == "prior: green: the template fits the masks (IoU 0.88)"
-    assert said({"mask_iou": 0.88, "mask_iou_flip": 0.5}).startswith(
-        "prior: red: the template hardly fits the masks (IoU 0.50)"
-    )
-    assert said({"mask_iou": 0.7}).startswith("prior: yellow: the template fits the masks with IoU 0.70 only")
-    assert said({"mask_iou": 0.9, "facing_margin": 0.001}).startswith("prior: yellow: head and tail are uncertain")
-    assert said({"mask_iou": 0.9}, 12).startswith("prior: red: 60% of the frames are left out")
-    assert said({"mask_iou": 0.9}, 6) == "prior: yellow: 30% of the frames are left out"

@@ -22,7 +22,7 @@ from rewild4d.priors.choose import PriorChoice, make_prior
 from rewild4d.priors.config import STANDARD
 from rewild4d.priors.footage import fit_footage
 from rewild4d.priors.io import load_prior, save_prior
-from rewild4d.priors.judge import agreement, doubts
+from rewild4d.priors.judge import agreement, doubts, prior_verdict
 from rewild4d.priors.placing import known_frames, placed
 from rewild4d.running import provenance, runner
 from rewild4d.types import Clip, Crop, Frame, Prior, Truth
@@ -297,3 +297,18 @@ def test_odd_masks_never_crash_a_fit(what: str) -> None:
     prior = fit_footage(clip, config=TINY, seed=0, log=silent)
     assert all(math.isfinite(value) for value in prior.quality.values())
     assert torch.isfinite(prior.transforms).all() and torch.isfinite(prior.transforms_flip).all()
+
+
+def test_a_prior_is_judged_by_its_fit() -> None:
+    def said(quality: dict[str, float], left_out: int = 0) -> str:
+        return str(prior_verdict(quality, left_out, 20))
+
+    assert prior_verdict({}, 0, 20) is None, "nothing was fitted"
+    assert said({"mask_iou": 0.88}) == "prior: green: the template fits the masks (IoU 0.88)"
+    assert said({"mask_iou": 0.88, "mask_iou_flip": 0.5}).startswith(
+        "prior: red: the template hardly fits these masks (mask IoU 0.50"
+    )
+    assert said({"mask_iou": 0.7}).startswith("prior: yellow: the template fits the masks with IoU 0.70 only")
+    assert said({"mask_iou": 0.9, "facing_margin": 0.001}).startswith("prior: yellow: head and tail are uncertain")
+    assert said({"mask_iou": 0.9}, 12).startswith("prior: red: 60% of the frames are left out")
+    assert said({"mask_iou": 0.9}, 6).startswith("prior: yellow: 30% of the frames are left out;")

@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 from rewild4d.cameras.input_view import finite_at
 from rewild4d.contracts import Reconstruction
 from rewild4d.harmonics import C0, rotated, seen_colors
-from rewild4d.transforms import quat_to_matrix
+from rewild4d.transforms import on_cpu, quat_to_matrix
 from rewild4d.types import Camera, Splats
 from rewild4d.visualize.report.layout import BITS, Cloud, Frame, curve_order, steps
 
@@ -53,7 +53,7 @@ def collect(reconstruction: Reconstruction, times: Sequence[float], cameras: Seq
     Raises:
         UserError: it answers with values that are not finite.
     """
-    moments = [_on_cpu(finite_at(reconstruction, time)) for time in times]
+    moments = [on_cpu(finite_at(reconstruction, time)) for time in times]
     clouds, seen, shown = [], False, 0
     rows = zip(moments, cameras, strict=True)
     for _, group in groupby(rows, key=lambda row: (len(row[0]), row[0].colors.shape[1])):
@@ -123,10 +123,6 @@ def _steady_signs(quats: np.ndarray) -> np.ndarray:
 def _rows(splats: Splats, rows: torch.Tensor) -> Splats:
     return Splats(splats.means[rows], splats.quats[rows], splats.scales[rows], splats.opacities[rows],
                   splats.colors[rows])  # fmt: skip
-
-
-def _on_cpu(splats: Splats) -> Splats:
-    return Splats(*(getattr(splats, name).detach().float().cpu() for name in Splats.__dataclass_fields__))
 
 
 def _stack(values: Sequence[torch.Tensor]) -> np.ndarray:

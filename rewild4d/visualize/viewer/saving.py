@@ -108,4 +108,4 @@ class _Shown:
         raise NotImplementedError  # an orbit has cameras of its own
 
     def save(self, folder: Path) -> None:
-        raise NotImplementedError
+        raise NotImplementedError  # it is drawn, not kept

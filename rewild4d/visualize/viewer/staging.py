@@ -19,6 +19,7 @@ from rewild4d.harmonics import base_colors
 from rewild4d.transforms import (
     camera_in_object,
     matrix_to_quat,
+    on_cpu,
     similarity,
     skin_points,
     skin_quats,
@@ -106,7 +107,7 @@ class Stage:
         if paint == "parts":
             weights = made.weights  # type: ignore[attr-defined]
             colors = part_colors(weights.shape[1]).to(colors)[weights.argmax(1)]
-        plain = replace(_on_cpu(splats), colors=colors.float().cpu()[:, None])
+        plain = replace(on_cpu(splats), colors=colors.float().cpu()[:, None])
         return transform_splats(plain, self.rest_to_stage if shape == "canonical" else self.world_to_stage)
 
     def camera(self, frame: Frame) -> Camera | None:
@@ -194,7 +195,3 @@ def _stand(reconstruction: Reconstruction) -> Tensor:
         body, _ = solid(reconstruction.canonical())
         matrix[:3, 3] = -(body.amin(0) + body.amax(0)) / 2
     return matrix
-
-
-def _on_cpu(splats: Splats) -> Splats:
-    return Splats(*(part.detach().float().cpu() for part in vars(splats).values()))
