@@ -21,7 +21,7 @@ from rewild4d.datasets.masking.meaning import Census, Meaning
 from rewild4d.datasets.video.frame_files import FRAME_SUFFIXES, image_size, read_images, read_masks
 from rewild4d.datasets.video.parts import with_parts
 from rewild4d.datasets.video.reader import VideoDataset
-from rewild4d.datasets.video.video_file import ASSUMED_FPS, SUFFIXES, read_video, video_facts
+from rewild4d.datasets.video.video_file import SUFFIXES, read_video, video_facts
 from rewild4d.datasets.video.wild import Masks, Moment, Video, files_identity
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.types import Keypoints
@@ -161,10 +161,9 @@ class Online(VideoDataset):
                 raise UserError(f"{self.root}: expected a video or a folder of frames, got one image.")
             facts = video_facts(self.root)
             fault = f"ffmpeg complains of the video, {len(facts.times)} frames were read: {facts.faults}"
-            order = f"time stamps are missing or out of order: {ASSUMED_FPS:g} frames a second assumed"
-            notes = (fault if facts.faults else "", "" if facts.is_stamped else order, facts.squared)
+            notes = (fault if facts.faults else "", facts.pace, *facts.changes)
             told, size = tuple(note for note in notes if note), (facts.width, facts.height)
-            return Material((), facts.times, size, facts.has_alpha, told, facts.stored if facts.squared else None)
+            return Material((), facts.times, size, facts.has_alpha, told, facts.stored if facts.is_stretched else None)
         inner = (self.root / name for name in ("frames", "images"))
         folder = next((path for path in inner if path.is_dir()), self.root)
         files = tuple(mask_files.list_images(folder, FRAME_SUFFIXES))
@@ -273,7 +272,7 @@ class Online(VideoDataset):
         indices = self._chosen[0]
         if self._material.files:
             return read_images([self._material.files[i] for i in indices], self._material.size)
-        return (frame[..., :3] for frame in _picked(read_video(self.root), indices))
+        return (frame[..., :3] for frame in read_video(self.root, indices))
 
     @cached_property
     def _alpha_meaning(self) -> Meaning:
@@ -293,7 +292,7 @@ class Online(VideoDataset):
             chosen = [self._material.files[i] for i in indices]
             found, size = zip(chosen, map(read_transparency, chosen), strict=True), self._material.size
             return (None if alpha is None else fit_size(alpha, size, str(file)) for file, alpha in found)
-        return (frame[..., 3] for frame in _picked(read_video(self.root), indices))
+        return (frame[..., 3] for frame in read_video(self.root, indices))
 
 
 def _numbered(indices: Sequence[int], masks: Masks) -> Iterator[tuple[int, np.ndarray | None]]:
@@ -310,16 +309,6 @@ def _thinned(times: list[float], indices: list[int], fps: float) -> list[int]:
     return [indices[i] for i in sorted(set(nearest.tolist())) if i < len(indices)]
 
 
-def _picked(frames: Iterator[np.ndarray], indices: Sequence[int]) -> Iterator[np.ndarray]:
-    """Yield some frames of a stream; it is not read beyond the last of them."""
-    wanted, last = set(indices), max(indices)
-    for index, frame in enumerate(frames):
-        if index in wanted:
-            yield frame
-        if index == last:
-            return
-
-
 @lru_cache(maxsize=4)
 def _film_meaning(path: Path, identity: str, indices: tuple[int, ...], alpha: bool) -> Meaning:
     """Return what the shades of a film of masks mean, of a file that is known by its ``identity``."""
@@ -330,7 +319,7 @@ def _film_meaning(path: Path, identity: str, indices: tuple[int, ...], alpha: bo
 
 
 def _film_shades(path: Path, indices: Sequence[int], alpha: bool) -> Iterator[np.ndarray]:
-    for frame in _picked(read_video(path), indices):
+    for frame in read_video(path, indices):
         shades = frame[..., 3] if alpha else mask_files.shades(frame[..., :3], mask_files.FILM_TINT)
         yield np.ascontiguousarray(shades)
 

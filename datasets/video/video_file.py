@@ -1,6 +1,6 @@
 """Video files, frame by frame with their own time stamps: any codec that ffmpeg knows, turned upright, with alpha.
 
-Pixels are made square: where the header says that they are wider than high, or less, frames are stretched across.
+What the header asks for is done (`video_header`): pixels are made square, interlaced frames whole, PQ and HLG plain.
 
 Frames come through a pipe as PAM images, which say their own size; the time stamps come from ffmpeg's `showinfo`, so a
 variable frame rate keeps its times.
@@ -9,7 +9,7 @@ variable frame rate keeps its times.
 import re
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -18,21 +18,18 @@ from typing import IO
 import imageio_ffmpeg
 import numpy as np
 
+from rewild4d.datasets.video.video_header import read_header
 from rewild4d.errors import UserError
 from rewild4d.files import file_state
-from rewild4d.foreign.reading import PIXEL, require_room
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".gif", ".mpg", ".mpeg", ".wmv", ".ts", ".3gp")
 _TIME = re.compile(r"showinfo.*\bn: *\d+ .*\bpts_time:(\S+)")
 _FAULT = re.compile(r"\[(?:error|fatal)\] (.+)")
 _SHAPE = re.compile(r"showinfo.*\bn: *\d+ .*\bs:(\d+)x(\d+)")
-_STREAM = re.compile(r"Stream #.*Video:.*")
-_SIZE = re.compile(r", (\d{1,7})x(\d{1,7})\b")
-_ASPECT = re.compile(r"\bSAR (\d+):(\d+)")
-MOST_ASPECT = 10.0
-"""Width over height of a pixel, or height over width, beyond which a header is wrong."""
 ASSUMED_FPS = 25.0
 """Of a video without time stamps that ascend."""
+UNEVEN = 1.5
+"""A frame rate varies where the longest time between frames is so many times the shortest."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +45,7 @@ class VideoFacts:
         is_stamped: whether the times are the file's own; where its stamps are missing or out of order, they are those
             of `ASSUMED_FPS` frames a second.
         stored: width and height of the upright frames before their pixels were made square.
+        treated: what the header asked for beside that, a sentence each.
     """
 
     times: tuple[float, ...]
@@ -57,23 +55,47 @@ class VideoFacts:
     faults: str
     is_stamped: bool = True
     stored: tuple[int, int] = (0, 0)
+    treated: tuple[str, ...] = ()
 
     @property
-    def squared(self) -> str:
-        """A sentence where the pixels were made square; "" where they were."""
-        if self.stored == (self.width, self.height):
+    def is_stretched(self) -> bool:
+        """Whether the pixels were made square."""
+        return self.stored != (self.width, self.height)
+
+    @property
+    def changes(self) -> tuple[str, ...]:
+        """How the frames differ from those that the file stores, a sentence each."""
+        squared = f"pixels made square: {self.stored[0]}x{self.stored[1]} stretched to {self.width}x{self.height}"
+        return (*([squared] if self.is_stretched else []), *self.treated)
+
+    @property
+    def pace(self) -> str:
+        """A sentence where the frame rate varies, or was assumed; "" elsewhere."""
+        if not self.is_stamped:
+            return f"time stamps are missing or out of order: {ASSUMED_FPS:g} frames a second assumed"
+        steps = np.diff(self.times)
+        if len(steps) < 2 or steps.max() < UNEVEN * steps.min():
             return ""
-        return f"pixels made square: {self.stored[0]}x{self.stored[1]} stretched to {self.width}x{self.height}"
+        slowest, fastest = 1 / steps.max(), 1 / steps.min()
+        return f"the frame rate varies, {slowest:.3g} to {fastest:.3g} a second: each frame keeps its own time"
 
 
-def read_video(path: Path) -> Iterator[np.ndarray]:
-    """Yield every frame of a video, upright, uint8 [h, w, 4] (alpha is 255 where the video has none).
+def read_video(path: Path, indices: Sequence[int] | None = None) -> Iterator[np.ndarray]:
+    """Yield frames of a video, upright, uint8 [h, w, 4] (alpha is 255 where the video has none).
+
+    Args:
+        path: the video.
+        indices: which frames, ascending; None: all of them.
 
     Raises:
         UserError: ffmpeg cannot read the file.
     """
+    first, last = (indices[0], indices[-1]) if indices else (0, None)
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as log:
-        yield from _frames(path, log)
+        wanted = None if indices is None else {*indices}
+        for index, frame in enumerate(_frames(path, log, first, last), first):
+            if wanted is None or index in wanted:
+                yield frame
 
 
 def video_facts(path: Path) -> VideoFacts:
@@ -91,20 +113,28 @@ def video_facts(path: Path) -> VideoFacts:
 
 @lru_cache(maxsize=8)
 def _facts(path: Path, size: int, changed: int) -> VideoFacts:
+    header = read_header(path, file_state(path))
     count, width, height, has_alpha = 0, 0, 0, False
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as log:
-        for frame in _frames(path, log):
+        for frame in _frames(path, log, 0, None if header.may_be_clear else 0):
             count, (height, width) = count + 1, frame.shape[:2]
             has_alpha = has_alpha or bool((frame[..., 3] < 255).any())
+        if count and not header.may_be_clear:
+            log.seek(0)
+            log.truncate()
+            subprocess.run([*_decoding(path, "showinfo=checksum=0"), "-f", "null", "-"], stderr=log, check=False)
         log.seek(0)
         said = log.read()
+    stamps = re.findall(_TIME, said)
+    count = count if header.may_be_clear else len(stamps)
     if not count:
         raise UserError(f"{path}: expected a video that ffmpeg can read, got {_complaint(said) or 'no frame'}.")
-    times = ascending(re.findall(_TIME, said), count)
+    times = ascending(stamps, count)
     assumed = tuple(i / ASSUMED_FPS for i in range(count))
     shape = re.search(_SHAPE, said)
     stored = (int(shape[1]), int(shape[2])) if shape else (width, height)
-    return VideoFacts(times or assumed, width, height, has_alpha, _complaint(said), times is not None, stored)
+    is_stamped = times is not None
+    return VideoFacts(times or assumed, width, height, has_alpha, _complaint(said), is_stamped, stored, header.changes)
 
 
 def ascending(stamps: list[str], count: int) -> tuple[float, ...] | None:
@@ -123,18 +153,26 @@ def _complaint(said: str) -> str:
     return found.group(1).strip().rstrip(".") if found else ""
 
 
-def _frames(path: Path, log: IO[str]) -> Iterator[np.ndarray]:
-    """Decode; ffmpeg's words go to ``log``."""
-    decoder, square = _header(path, file_state(path))
-    command = [
-        imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-nostats", "-loglevel", "level+info",
-        *decoder, "-i", f"file:{path}", "-map", "0:v:0", "-fps_mode", "passthrough",
-        "-vf", f"showinfo=checksum=0{square}", "-pix_fmt", "rgba", "-c:v", "pam", "-f", "image2pipe", "-",
-    ]  # fmt: skip
+def _frames(path: Path, log: IO[str], first: int = 0, last: int | None = None) -> Iterator[np.ndarray]:
+    """Decode, and yield frames from the first to the last that is wanted; ffmpeg's words go to ``log``."""
+    filters = ["showinfo=checksum=0", *read_header(path, file_state(path)).filters]
+    until = [] if last is None else ["-frames:v", str(last - first + 1)]
+    if first:  # fields need the frames around them, so that frames are left out after that
+        filters.insert(1 + sum("bwdif" in name for name in filters), f"select=gte(n\\,{first})")
+    command = [*_decoding(path, ",".join(filters)), *until, "-pix_fmt", "rgba", "-c:v", "pam", "-f", "image2pipe", "-"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log) as process:
         assert process.stdout is not None
         while (frame := _pam(process.stdout)) is not None:
             yield frame
+
+
+def _decoding(path: Path, filters: str) -> list[str]:
+    """Return ffmpeg's command up to what it makes of the frames."""
+    return [
+        imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-nostats", "-loglevel", "level+info",
+        *read_header(path, file_state(path)).decoder, "-i", f"file:{path}", "-map", "0:v:0",
+        "-fps_mode", "passthrough", "-vf", filters,
+    ]  # fmt: skip
 
 
 def _pam(pipe: IO[bytes]) -> np.ndarray | None:
@@ -150,35 +188,3 @@ def _pam(pipe: IO[bytes]) -> np.ndarray | None:
     if len(data) < shape[0] * shape[1] * shape[2]:
         return None
     return np.frombuffer(data, np.uint8).reshape(shape)
-
-
-@lru_cache(maxsize=8)
-def _header(path: Path, state: str) -> tuple[tuple[str, ...], str]:
-    """Return the decoder that the header asks for, and the filter that makes pixels square ("" where they are).
-
-    ffmpeg's own VP8 and VP9 decoders drop the alpha channel; libvpx keeps it.
-
-    Args:
-        path: the video.
-        state: changes with the file.
-
-    Raises:
-        UserError: pixels of a shape that no camera has, or more of them than `reading.largest` lets in.
-    """
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-i", f"file:{path}"]
-    said = subprocess.run(command, capture_output=True, text=True, errors="replace").stderr
-    decoder: tuple[str, ...] = ()
-    if re.search(r"alpha_mode\s*: 1", said, re.IGNORECASE):
-        decoder = ("-c:v", "libvpx-vp9" if "Video: vp9" in said else "libvpx")
-    stream = re.search(_STREAM, said)
-    if stream and (size := re.search(_SIZE, stream[0])):
-        width, height = map(int, size.groups())
-        require_room(path, PIXEL * width * height, f"frames of a video, {width}x{height} pixels,")
-    # where the container says another shape than the stream in it, both are there, and the container's counts
-    shapes = re.findall(_ASPECT, stream[0]) if stream else []
-    across, down = map(int, shapes[-1]) if shapes else (1, 1)
-    if across == down or not across or not down:
-        return decoder, ""
-    if not 1 / MOST_ASPECT <= across / down <= MOST_ASPECT:
-        raise UserError(f"{path}: expected pixels that are about square, got some of {across}:{down}.")
-    return decoder, ",scale=w='max(1,round(iw*sar))':h=ih,setsar=1"  # turned frames have their own ratio

@@ -77,7 +77,7 @@ def score_pictures(
         sides[0] = tuple(match.prediction for match in matches)
     rates = {reel.fps for side in sides for reel in side if reel.fps} or ({fps} if fps else set())
     reels = (reel for side in sides for reel in side if not reel.files)
-    notes += [f"{reel.path}: {told}" for reel in reels if (told := video_facts(reel.path).squared)]
+    notes += [f"{reel.path}: {told}" for reel in reels for told in video_facts(reel.path).changes]
     if len(rates) > 1:
         notes.append(f"frame rates differ: {', '.join(f'{rate:g}' for rate in sorted(rates))}")
     conditions = Conditions(f"{background:g} behind alpha", fps=min(rates) if len(rates) == 1 else None)

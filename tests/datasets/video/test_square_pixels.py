@@ -37,7 +37,7 @@ def test_frames_have_the_shape_that_people_see(aspect: str, width: int, tmp_path
     facts = video_facts(path)
     assert (facts.width, facts.height, facts.stored) == (width, HEIGHT, moving.SIZE)
     assert {frame.shape for frame in read_video(path)} == {(HEIGHT, width, 4)}
-    assert facts.squared == ("" if width == WIDTH else f"pixels made square: 96x64 stretched to {width}x64")
+    assert facts.changes == (() if width == WIDTH else (f"pixels made square: 96x64 stretched to {width}x64",))
 
 
 def test_a_turned_film_is_stretched_across_what_was_down(tmp_path: Path) -> None:
