@@ -16,7 +16,7 @@ from rewild4d.datasets.artemis.recipe import read_recipe
 from rewild4d.datasets.artemis.views import SOLID, Look, covered, look, strayed, strayed_sentence
 from rewild4d.datasets.artemis.volume import SURFACE_POINTS, Voxels, read_pose, read_skeleton, read_surface
 from rewild4d.datasets.images import ImagePair, read_alpha, read_pair, read_rgb
-from rewild4d.datasets.masking.masks import FRAMED
+from rewild4d.datasets.masking.facts import FRAMED
 from rewild4d.errors import UserError
 from rewild4d.types import Camera
 

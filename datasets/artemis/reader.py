@@ -25,7 +25,7 @@ from rewild4d.datasets.artemis.views import SOLID, look, strayed, strayed_senten
 from rewild4d.datasets.artemis.volume import SURFACE_POINTS, MovingSurface, Voxels, read_pose, read_surface
 from rewild4d.datasets.artemis.writer import ArtemisWriter
 from rewild4d.datasets.images import Decoded, ImagePair, decode
-from rewild4d.datasets.masking.masks import FRAMED
+from rewild4d.datasets.masking.facts import FRAMED
 from rewild4d.errors import UserError, unknown_name
 from rewild4d.files import digest
 from rewild4d.types import Camera, Clip, Frame, Truth

@@ -22,42 +22,8 @@ from rewild4d.foreign.reading import picture_size
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 LOSSY = (".jpg", ".jpeg", ".webp")
-NOISE = 0.04
-"""Parts smaller than this share of the largest one do not widen the animal's box."""
 FILM_TINT = 40
 """Largest difference of two channels where a film of masks is grey: compression tints it."""
-CUT_SHARE = 0.1
-"""The animal is cut where it touches the image's border along more than this share of its shorter side."""
-FRAMED = 0.9
-"""Of an image's border that is animal: more, and the mask is inverted or covers everything."""
-
-
-@dataclass(frozen=True)
-class MaskFacts:
-    """What a mask says about the animal in it.
-
-    Attributes:
-        box: left, top, right, bottom of all parts that count, in pixels; None where there is no animal.
-        is_cut: it reaches over the image's border.
-        parts: the area of each connected part in pixels, largest first.
-        holes: area enclosed by the animal over the animal's area.
-        framed: share of the image's border that is animal, in [0, 1].
-    """
-
-    box: tuple[int, int, int, int] | None
-    is_cut: bool
-    parts: tuple[int, ...]
-    holes: float
-    framed: float = 0.0
-
-    @property
-    def area(self) -> int:
-        return sum(self.parts)
-
-    @property
-    def second(self) -> float:
-        """The second part's area over the largest one's; 0 where there is one part or none."""
-        return self.parts[1] / self.parts[0] if len(self.parts) > 1 else 0.0
 
 
 @dataclass(frozen=True)
@@ -241,32 +207,6 @@ def fit_size(mask: np.ndarray, size: tuple[int, int], title: str, stored: tuple[
             f"got {width}x{height}."
         )
     return cv2.resize(mask, size, interpolation=cv2.INTER_AREA if width > size[0] else cv2.INTER_LINEAR)
-
-
-def mask_facts(mask: np.ndarray) -> MaskFacts:
-    """Look at one mask, uint8 [h, w]."""
-    solid = (mask > 127).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(solid)
-    areas = stats[1:, cv2.CC_STAT_AREA]
-    if count < 2:
-        return MaskFacts(None, False, (), 0.0)
-    large = 1 + np.flatnonzero(areas >= NOISE * areas.max())
-    lower = stats[large, :2].min(axis=0)
-    upper = (stats[large, :2] + stats[large, 2:4]).max(axis=0)
-    edges = (labels[0], labels[-1], labels[:, 0], labels[:, -1])
-    contact = max(int(np.isin(edge, large).sum()) for edge in edges)
-    framed = float((np.concatenate(edges) > 0).mean())
-    is_cut = contact > CUT_SHARE * int((upper - lower).min())
-    box = (int(lower[0]), int(lower[1]), int(upper[0]), int(upper[1]))
-    parts = tuple(sorted(map(int, areas), reverse=True))
-    return MaskFacts(box, is_cut, parts, _holes(solid) / int(areas.sum()), framed)
-
-
-def _holes(solid: np.ndarray) -> int:
-    """Return pixels of background that no path joins to the border."""
-    padded = cv2.copyMakeBorder(1 - solid, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
-    _, labels = cv2.connectedComponents(padded, connectivity=4)
-    return int(((padded > 0) & (labels != labels[0, 0])).sum())
 
 
 def list_images(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> list[Path]:

@@ -2,8 +2,8 @@
 
 Three kinds of evidence, from a few frames. Around a good mask the picture changes most along the mask's own edge, and
 not further in or out. What stands out in a window around the mask (U²-Net-p, where its weights are here) is what the
-mask holds. Optical flow carries each mask to the next one. The bounds were set on two films of DAVIS with true masks
-and with spoilt ones (docs/experiments/trust.md).
+mask holds. Optical flow carries each mask to the next one. And from all frames: whether masks are lost between others,
+or jump. The bounds were set on two films of DAVIS with true masks and with spoilt ones (docs/experiments/trust.md).
 """
 
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from rewild4d.contracts import Verdict
+from rewild4d.datasets.masking.facts import FRAMED, MaskFacts, jumps, mask_facts
 from rewild4d.datasets.masking.flow import Flow, carried
-from rewild4d.datasets.masking.masks import FRAMED, mask_facts
 from rewild4d.datasets.masking.saliency import NAME, Saliency
 from rewild4d.metrics.weights import FETCH, is_here, load_weights
 
@@ -38,6 +38,8 @@ AGREED = 0.65
 """Overlap (IoU) of a mask with what stands out: less counts against it where its edges are poor, too."""
 CARRIED = 0.85
 """Overlap (IoU) of a mask with the one before carried by flow, where flow is sure: less, and masks jump."""
+UNSTEADY = 0.025
+"""Share of a film's frames in which the animal is lost between others, or its mask jumps: more, and it is told."""
 GOOD = Verdict("masks", "green", "their edges lie on the picture's, and what stands out lies in them")
 
 
@@ -55,6 +57,7 @@ class MaskTrust:
     _carried: list[float] = field(default_factory=list)
     _bare: list[int] = field(default_factory=list)
     _framed: list[float] = field(default_factory=list)
+    _facts: list[MaskFacts | None] = field(default_factory=list)
     _before: tuple[np.ndarray, np.ndarray] | None = None
     _saliency: Saliency | None = None
 
@@ -72,6 +75,7 @@ class MaskTrust:
             image: uint8 [h, w, 3], red, green, blue.
             mask: uint8 [h, w]; None where there is none.
         """
+        self._facts.append(None if mask is None else mask_facts(mask))
         before, self._before = self._before, None
         if before is None and index not in self._chosen:
             return
@@ -133,12 +137,25 @@ class MaskTrust:
         if self._carried and np.median(self._carried) < CARRIED:
             told = f"motion carries only {np.median(self._carried):.0%} of a mask to the next one"
             return Verdict("masks", "yellow", f"they jump: {told}", look)
+        if told := self._unsteady(labels):
+            return Verdict("masks", "yellow", told, f"{look}; --box frame:..., or --marks, sets masks right")
         if here < ON_EDGE:
             return Verdict("masks", "yellow", "their edges do not lie on the picture's", f"shifted masks? {look}")
         if self._saliency is None:
             told = f"their edges lie on the picture's; what stands out was not looked at ({FETCH} {NAME})"
             return Verdict("masks", "green", told)
         return GOOD
+
+    def _unsteady(self, labels: Sequence[str]) -> str:
+        """Return a sentence where masks are lost between others, or jump, in too many frames; "" elsewhere."""
+        areas = [None if fact is None else fact.area for fact in self._facts]
+        there = [index for index, area in enumerate(areas) if area]
+        lost = {index for index, area in enumerate(areas) if area == 0 and there[0] < index < there[-1]}
+        found = sorted(lost | {*jumps(self._facts)})
+        if len(found) <= UNSTEADY * len(self._facts):
+            return ""
+        where = ", ".join(labels[index] for index in found[:3])
+        return f"the animal is lost, or its mask jumps, in {len(found)} of {len(self._facts)} frames, first in {where}"
 
 
 def _rings(image: np.ndarray, mask: np.ndarray) -> np.ndarray:

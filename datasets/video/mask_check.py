@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from rewild4d.contracts import Finding, Selection
-from rewild4d.datasets.masking.masks import FRAMED, MaskFacts, mask_facts
+from rewild4d.datasets.masking.facts import FRAMED, MaskFacts, jumps, mask_facts
 from rewild4d.datasets.masking.trust import MaskTrust
 from rewild4d.datasets.video.wild import LEAST_AREA, TWIN, Video, lay_out
 from rewild4d.errors import UserError
@@ -20,8 +20,6 @@ HOLES = 0.01
 """Share of the animal that may be enclosed background."""
 PART = 0.02
 """A second part above this share of the largest is told."""
-JUMP = 0.35
-"""The mask jumps where its area changes by more than this share, or its middle moves by as much of its width."""
 SHEET_FRAMES = 24
 TILE = 240
 MOST_CASES = 12
@@ -51,7 +49,7 @@ def check_video(video: Video, sheets: Path | None) -> list[Finding]:
     if len(facts) < count:
         raise UserError(f"{video.title}: expected {count} frames, got {len(facts)}: it is cut off.")
     found = {what: [i for i, fact in enumerate(facts) if test(fact or _NO_MASK)] for what, test in _TESTS.items()}
-    troubles = found | {"a jump from the frame before": _jumps(facts)}
+    troubles = found | {"a jump from the frame before": jumps(facts)}
     verdict = trust.verdict([moment.label for moment in video.moments])
     findings = [Finding("ok" if verdict.level == "green" else "warning", video.name, str(verdict))]
     findings += [Finding("warning", video.name, note) for note in video.notes]
@@ -82,21 +80,6 @@ def finding_of(error: UserError) -> Finding:
     """Return an error as a finding."""
     path, _, sentence = str(error).partition(": ")
     return Finding("error", path, sentence.rstrip("."))
-
-
-def _jumps(facts: Sequence[MaskFacts | None]) -> list[int]:
-    """Return frames whose mask differs much from that of the frame before."""
-    found = []
-    for i in range(1, len(facts)):
-        before, after = facts[i - 1], facts[i]
-        if before is None or after is None or before.box is None or after.box is None:
-            continue
-        grown = max(before.area, after.area) / min(before.area, after.area) - 1
-        a, b = np.array(before.box, dtype=float), np.array(after.box, dtype=float)
-        moved = np.abs((a[:2] + a[2:]) / 2 - (b[:2] + b[2:]) / 2).max() / max(1.0, float((a[2:] - a[:2]).max()))
-        if grown > JUMP or moved > JUMP:
-            found.append(i)
-    return found
 
 
 _SECOND, _TWO = "a second part beside the animal", "two parts of like size (two animals?)"

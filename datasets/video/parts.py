@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from rewild4d.contracts import Parts
-from rewild4d.datasets.masking.masks import NOISE
+from rewild4d.datasets.masking.facts import NOISE
 from rewild4d.datasets.video.wild import Masks, Video
 from rewild4d.errors import unknown_name
 from rewild4d.files import atomic, cache_folder, digest

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from rewild4d.datasets.masking.masks import mask_facts
+from rewild4d.datasets.masking.facts import mask_facts
 from rewild4d.datasets.video.travel import TravelMeter, reduced
 from rewild4d.datasets.video.wild import Video, usable
 from rewild4d.errors import UserError

@@ -15,7 +15,7 @@ import torch
 
 from rewild4d.contracts import Selection
 from rewild4d.datasets.keypoints.keypoints import in_crop
-from rewild4d.datasets.masking.masks import MaskFacts, mask_facts
+from rewild4d.datasets.masking.facts import MaskFacts, mask_facts
 from rewild4d.datasets.video.crops import cut, follow, lost_share
 from rewild4d.datasets.video.travel import TravelMeter
 from rewild4d.errors import UserError

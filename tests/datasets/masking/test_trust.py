@@ -128,3 +128,20 @@ def test_true_masks_of_real_films_are_green_and_headless_ones_are_told(davis: Pa
     # One frame in ten: masks are no longer like those before.
     assert found["true"].verdict(labels).level != "red"
     assert found["cut"].verdict(labels).level != "green"
+
+
+@pytest.mark.usefixtures("network")
+@pytest.mark.parametrize(
+    ("level", "mask_of"),
+    [
+        ("yellow", lambda n: 0 * true(n) if n == 5 else true(n)),
+        ("yellow", lambda n: without_head(without_head(true(n))) if n == 5 else true(n)),
+        ("green", lambda n: None if n == 5 else true(n)),
+        ("green", lambda n: 0 * true(n) if n == 11 else true(n)),
+    ],
+    ids=["lost between others", "smaller in one frame by 44 %", "a frame without a mask", "gone at the end"],
+)
+def test_masks_that_are_lost_or_jump_are_told(level: str, mask_of: Callable[[int], np.ndarray | None]) -> None:
+    verdict = judged(mask_of)
+    assert verdict.level == level
+    assert ("the animal is lost, or its mask jumps, in " in str(verdict)) == (level == "yellow")

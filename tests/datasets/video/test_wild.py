@@ -10,7 +10,8 @@ import torch
 from films import SELECTION, iou, restored
 
 from rewild4d.datasets.keypoints.keypoints import read_badja
-from rewild4d.datasets.masking.masks import FRAMED, mask_facts, match_masks, open_masks
+from rewild4d.datasets.masking.facts import FRAMED, mask_facts
+from rewild4d.datasets.masking.masks import match_masks, open_masks
 from rewild4d.datasets.video.aptv2 import AptV2
 from rewild4d.datasets.video.crops import cut, follow
 from rewild4d.datasets.video.davis import Davis, known_sequences
