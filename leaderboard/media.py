@@ -23,6 +23,8 @@ MOST_BYTES = 64 << 20
 """Of one file."""
 MOST_PIXELS = 1 << 26
 """Of a picture, and of a frame of a film."""
+THUMBNAIL_WIDTH = 320
+"""Pixels, of the small pictures beside the runs of a table."""
 TIMEOUT = 120.0
 """Seconds that ffmpeg may take for a film."""
 warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # above 89 million; `MOST_PIXELS` is an error
@@ -57,6 +59,21 @@ def publish(source: Path, folder: Path, target: Path, timeout: float = TIMEOUT) 
     except UserError:
         target.unlink(missing_ok=True)
         raise
+
+
+def shrink(source: Path, target: Path) -> None:
+    """Write a picture at `THUMBNAIL_WIDTH`, as WebP.
+
+    Args:
+        source: one that was published.
+        target: its small copy.
+
+    Raises:
+        UserError: `source` is no picture that can be decoded.
+    """
+    image = open_picture(source, PICTURES[source.suffix.lower()], source).convert("RGB")
+    high = max(1, round(image.height * THUMBNAIL_WIDTH / image.width))
+    image.resize((THUMBNAIL_WIDTH, high), Image.Resampling.LANCZOS).save(target, "WEBP", quality=80)
 
 
 def open_picture(source: Path | io.BytesIO, kind: str, title: Path) -> Image.Image:

@@ -4,7 +4,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from rewild4d.files import regular_inside, replaced_folder
 from rewild4d.leaderboard.cells import cell
 from rewild4d.leaderboard.formats import ARROWS, html
 from rewild4d.leaderboard.layout import Table
-from rewild4d.leaderboard.media import FILMS, MOST_BYTES, TIMEOUT, link, publish
+from rewild4d.leaderboard.media import FILMS, MOST_BYTES, TIMEOUT, link, publish, shrink
 from rewild4d.leaderboard.records import FILE, RunRecord
 from rewild4d.leaderboard.run_page import page_head, provenance_rows, score_rows, template
 from rewild4d.leaderboard.tables import columns_of, standings
@@ -36,6 +36,9 @@ CAPTIONS = {
     "original film": "The filmed frame beside the render in its place.",
     "original": "The filmed frame beside the render in its place, at six moments.",
 }
+IN_SHORT = ("orbit.png", "original.png", "comparison.png", "canonical.png")
+"""Which picture of a run stands small beside it: the first that it has."""
+THUMBNAIL = "thumbnail.webp"
 POLICY = (
     "default-src 'none'; img-src 'self'; media-src 'self'; style-src {style}; script-src {script}; base-uri 'none'; "
     "form-action 'none'"
@@ -64,6 +67,21 @@ class Part:
     title: str
     found: Sequence[Found]
     tables: Sequence[Sequence[Table]] = ()
+
+
+@dataclass(frozen=True)
+class Page:
+    """What was copied for the page of a run.
+
+    Attributes:
+        pictures: for `run.html`.
+        has_thumbnail: whether there is a small picture too.
+        has_report: whether the page of its player was copied.
+    """
+
+    pictures: list[dict[str, Any]]
+    has_thumbnail: bool
+    has_report: bool
 
 
 def build_site(
@@ -101,13 +119,16 @@ def _write(parts: Sequence[Part], folder: Path, say: Callable[[str], None], time
     assets = page_head(POLICY, template("style.css"), template("script.js"))
     found = _unique([pair for part in parts for pair in part.found])
 
-    def fill(pair: Found) -> tuple[list[dict[str, Any]], bool]:
+    def fill(pair: Found) -> Page:
         source, record = pair
         page = folder / _place(record)
         page.mkdir(parents=True)
         regular_inside(source / FILE, source)
         shutil.copyfile(source / FILE, page / FILE)
-        return list(_copy_pictures(source, record, page, say, timeout)), _copy_report(source, page, say, reports)
+        pictures = list(_copy_pictures(source, record, page, say, timeout))
+        if small := next((name for name in IN_SHORT if (page / name).exists()), ""):
+            shrink(page / small, page / THUMBNAIL)
+        return Page(pictures, bool(small), _copy_report(source, page, say, reports))
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         try:
@@ -115,24 +136,27 @@ def _write(parts: Sequence[Part], folder: Path, say: Callable[[str], None], time
         except BaseException:  # Ctrl-C does not wait for what has not begun
             pool.shutdown(cancel_futures=True)
             raise
-    for (_, record), (pictures, report) in zip(found, drawn, strict=True):
+    pages_of = {record.run_id: page for (_, record), page in zip(found, drawn, strict=True)}
+    for _, record in found:
+        page = pages_of[record.run_id]
         text = pages.get_template("run.html").render(
             title=f"{record.method} on {record.case}", record=record, scores=list(score_rows(record)),
-            pictures=pictures, report=report, provenance=provenance_rows(record), **assets,
+            pictures=page.pictures, report=page.has_report, provenance=provenance_rows(record), **assets,
         )  # fmt: skip
         (folder / _place(record) / "index.html").write_text(text, encoding="utf-8")
-    shown = [_part(part, f"{index}-" if len(parts) > 1 else "") for index, part in enumerate(parts, 1)]
+    shown = [_part(part, f"{index}-" if len(parts) > 1 else "", pages_of) for index, part in enumerate(parts, 1)]
     text = pages.get_template("index.html").render(
         title=TITLE, counts=_counts(found), parts=shown, arrows=ARROWS, **assets
     )
     (folder / "index.html").write_text(text, encoding="utf-8")
 
 
-def _part(part: Part, key: str) -> dict[str, Any]:
+def _part(part: Part, key: str, pages: Mapping[str, Page]) -> dict[str, Any]:
     """Fill in a folder of runs on the first page; ``key`` tells its tables from those of other parts."""
     records = [record for _, record in part.found]
     tables = [[_shown(table, key) for table in group] for group in part.tables]
-    return {"title": part.title, "counts": _counts(part.found), "tables": tables, "sections": _sections(records, key)}
+    sections = _sections(records, key, pages)
+    return {"title": part.title, "counts": _counts(part.found), "tables": tables, "sections": sections}
 
 
 def _shown(table: Table, key: str) -> dict[str, Any]:
@@ -157,7 +181,7 @@ def _counts(found: Sequence[Found]) -> str:
     return f"{len(found)} runs of {methods} methods on {cases} cases."
 
 
-def _sections(records: Sequence[RunRecord], key: str) -> list[dict[str, Any]]:
+def _sections(records: Sequence[RunRecord], key: str, pages: Mapping[str, Page]) -> list[dict[str, Any]]:
     """Fill in each protocol on the first page."""
     sections = []
     for group, table in zip(by_protocol(records), standings(records), strict=True):
@@ -166,14 +190,16 @@ def _sections(records: Sequence[RunRecord], key: str) -> list[dict[str, Any]]:
         sections.append({
             **_shown(table, key), "description": protocol.get("description", ""),
             "columns": columns_of(group, protocol["scores"]),
-            "runs": [_run_row(record, labels[record.run_id]) for record in group],
+            "runs": [_run_row(record, labels[record.run_id], pages[record.run_id]) for record in group],
         })  # fmt: skip
     return sections
 
 
-def _run_row(record: RunRecord, label: str) -> dict[str, Any]:
+def _run_row(record: RunRecord, label: str, page: Page) -> dict[str, Any]:
+    place = _place(record).as_posix()
     return {
-        "record": record, "label": label, "href": f"{_place(record).as_posix()}/index.html",
+        "record": record, "label": label, "href": f"{place}/index.html",
+        "thumbnail": f"{place}/{THUMBNAIL}" if page.has_thumbnail else "",
         "flags": [mark.partition(":")[0] for mark in record.marks],
         "cells": [cell([record], [record.case], name) for name in record.protocol["scores"]],
     }  # fmt: skip

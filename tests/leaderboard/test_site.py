@@ -12,6 +12,7 @@ import pytest
 from browser import browser, needs_chromium
 from calling import call
 from media_files import film, picture
+from PIL import Image
 from records_for_tests import PROTOCOL, psnr, record
 
 from rewild4d.errors import UserError
@@ -98,6 +99,14 @@ def test_a_run_shows_what_it_was(runs: Path, tmp_path: Path) -> None:
     assert page.text.count("PSNR, dB") == 1, "one curve"
     other = Page(tmp_path / "page" / "runs" / ("c" * 16) / "index.html")
     assert "No pictures were kept beside this record." in other.text and "upper bound: rotated" in other.text
+
+
+def test_runs_with_pictures_stand_in_tables_with_a_small_one(runs: Path, tmp_path: Path) -> None:
+    first = Page(build_site([Part("Runs", find_records(runs))], tmp_path / "page"))
+    small = f"runs/{'a' * 16}/thumbnail.webp"
+    assert [link for link in first.links if "thumbnail" in link] == [small], "the others have no picture"
+    with Image.open(tmp_path / "page" / small) as image, Image.open(runs / "a" / "comparison.png") as whole:
+        assert image.width == 320 and image.height == round(320 * whole.height / whole.width)
 
 
 def test_names_and_messages_are_text(runs: Path, tmp_path: Path) -> None:
