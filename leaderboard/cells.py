@@ -7,6 +7,7 @@ from rewild4d.leaderboard.layout import Cell
 from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.statistics import Cases, Estimate, estimate, paired
 from rewild4d.leaderboard.titles import digits_of
+from rewild4d.metrics.names import ALL, KINDS, split_name
 from rewild4d.metrics.score import Score
 
 
@@ -31,6 +32,8 @@ def cell(records: Sequence[RunRecord], cases: Sequence[str], name: str, absent: 
     values = values_of(good, name)
     if empty := next((record for record in good if record.case not in values), None):
         return Cell("n/a", note=f"not computed: {_reason(empty, name)}")
+    if said := _unlike(good, name):
+        return Cell("n/a", note=said)
     return figure(estimate(values), digits_of(name, _unit(good, name)), _left_out(wanted, name))
 
 
@@ -54,6 +57,8 @@ def difference(records: Sequence[RunRecord], reference: Sequence[RunRecord], nam
     shared = [case for case in values if case in others]
     if not shared:
         return Cell("n/a", note=absent or _no_difference(records, reference, name))
+    if said := _unlike([run for run in (*records, *reference) if run.case in shared], name):
+        return Cell("n/a", note=said)
     found, digits = paired(values, others), digits_of(name, _unit(records, name))
     interval = " [" + ", ".join(_signed(end, digits) for end in found.interval) + "]" if found.interval else ""
     left = sorted(set(values) ^ set(others))
@@ -76,6 +81,27 @@ def values_of(
     return dict(values)
 
 
+def _unlike(records: Sequence[RunRecord], name: str) -> str:
+    """Say that values of a score are by unlike weights or versions of its metric; "" where they are not."""
+    found: dict[str, str] = {}
+    for record in records:
+        score = record.scores.get(name)
+        if (said := _measured_by(record, name)) and score is not None and score.value is not None:
+            found.setdefault(said, record.case)
+    listed = " and ".join(f"{case} by {said}" for said, case in found.items())
+    return f"not averaged: {listed}; `rewild4d-bench evaluate` scores again" if len(found) > 1 else ""
+
+
+def _measured_by(record: RunRecord, name: str) -> str:
+    """Name what a score depends on beside our code: another package, or weights; "" where that is not known."""
+    if about := record.metrics.get(name):
+        return " ".join(filter(None, map(about.get, ("package", "version", "sources"))))
+    titles = {title: score for scores in KINDS.values() for score, title in scores.items()}
+    distances = {titles.get(one.name.partition(" [")[0]): one.digest for one in record.distances}
+    digest = distances.get(name) or record.networks.get(split_name(name)[0], "")
+    return f"weights {digest[:8]}" if digest else ""
+
+
 def _unit(records: Sequence[RunRecord], name: str) -> str:
     """Return the unit of a score; "1" where none of the records has it."""
     return next((record.scores[name].unit for record in records if name in record.scores), "1")
@@ -84,8 +110,10 @@ def _unit(records: Sequence[RunRecord], name: str) -> str:
 def _reason(record: RunRecord, name: str) -> str:
     """Say why a good record has no value."""
     score = record.scores.get(name)
-    if score is None:
+    if score is None and name in ALL:
         return f"{record.protocol['name']} does not measure it"
+    if score is None:
+        return "it was scored without this metric's package; `rewild4d-bench evaluate` scores it again"
     return score.note.removeprefix("not computed: ")
 
 

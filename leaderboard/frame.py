@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rewild4d.errors import UserError
 from rewild4d.leaderboard.curves import times_of
 from rewild4d.leaderboard.records import RunRecord, find_records
-from rewild4d.leaderboard.titles import better_of
+from rewild4d.leaderboard.titles import better_of, known_scores
 from rewild4d.leaderboard.variants import by_protocol, latest, row_kind, variants
 from rewild4d.metrics.score import Score
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 RUN = ("protocol", "dataset", "case", "method", "preset", "variant", "prior", "kind", "seed", "run_id", "latest")
 RECORDS = (
     *RUN, "status", "metric", "value", "unit", "better", "count", "floor", "note", "marks", "started", "fit_seconds",
-    "evaluate_seconds", "peak_memory_mib", "processor", "code", "folder",
+    "evaluate_seconds", "peak_memory_mib", "processor", "code", "folder", "package",
 )  # fmt: skip
 ITEMS = (*RUN, "metric", "item", "label", "time", "value", "unit", "better")
 Found = Sequence[tuple[Path, RunRecord]]
@@ -57,6 +57,7 @@ def records_frame(folder: Path) -> "pd.DataFrame":
         - marks: sentences beside the numbers, such as "upper bound: ...", joined by "; ".
         - started (datetime64, UTC), fit_seconds, evaluate_seconds, peak_memory_mib (float64).
         - processor, code (digest of the sources), folder (of the record).
+        - package: name and version of the package that a metric is from; "" where it is ours.
 
     Raises:
         UserError: no such folder, no record in it, or one that cannot be read.
@@ -64,7 +65,7 @@ def records_frame(folder: Path) -> "pd.DataFrame":
     import pandas as pd
 
     found = _found(folder)
-    known = {name: score for _, record in found for name, score in record.scores.items()}
+    known = known_scores(record for _, record in found)
     rows = []
     for (place, record), run in zip(found, _runs(found), strict=True):
         about = {
@@ -76,7 +77,7 @@ def records_frame(folder: Path) -> "pd.DataFrame":
         for metric, score in _scores(record, known).items():
             rows.append({
                 **about, "metric": metric, "value": score.value, "unit": score.unit, "better": score.better,
-                "count": score.count, "floor": score.floor, "note": score.note,
+                "count": score.count, "floor": score.floor, "note": score.note, "package": _package(record, metric),
             })  # fmt: skip
     frame = pd.DataFrame(rows, columns=list(RECORDS)).astype({"value": float, "floor": float})
     return frame.assign(started=pd.to_datetime(frame["started"], utc=True, format="ISO8601", errors="coerce"))
@@ -144,6 +145,11 @@ def _runs(found: Found) -> list[dict[str, Any]]:
          "latest": id(record) in kept}
         for record in records
     ]  # fmt: skip
+
+
+def _package(record: RunRecord, metric: str) -> str:
+    about = record.metrics.get(metric, {})
+    return " ".join(filter(None, (about.get("package"), about.get("version"))))
 
 
 def _scores(record: RunRecord, known: Mapping[str, Score]) -> dict[str, Score]:

@@ -45,6 +45,8 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         distances: between sets of novel views and the input video, with all that decides their values.
         alignments: by which shapes were laid on the truth.
         networks: SHA-256 of the weights of the metric networks that scores leaned on.
+        metrics: of each score that is another package's: its title, definition, package, version and a digest of the
+            package's sources.
         verdicts: whether masks, prior and result can be trusted, and why; older records have none.
         features: SHA-256 of what `metrics.sets.FILE` beside the record holds: the features that ``distances`` were
             computed from, for scores pooled over cases; "" where there is no such file.
@@ -82,6 +84,7 @@ class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     networks: dict[str, str] = {}
     features: str = ""
     verdicts: list[Verdict] = []
+    metrics: dict[str, dict[str, str]] = {}
 
 
 class _Protocol(msgspec.Struct):

@@ -1,6 +1,6 @@
 """Sentences below a table: over which cases its means are, and what is known of the spread over seeds."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.variants import grouped
@@ -54,3 +54,19 @@ def _has_spread(good: Sequence[RunRecord]) -> bool:
     """Tell whether two seeds have a result on every case, as `statistics.estimate` needs for a spread."""
     by_case = grouped(good, lambda run: run.case).values()
     return len(set.intersection(*({run.seed for run in runs} for runs in by_case))) > 1
+
+
+def definitions_said(records: Iterable[RunRecord], scores: Collection[str]) -> list[str]:
+    """Say what the scores of other packages' metrics are and whose, a sentence for each that has said it.
+
+    Args:
+        records: of a table.
+        scores: of its columns.
+    """
+    said: dict[tuple[str, str], dict[str, None]] = {}
+    for record in records:
+        for name, about in record.metrics.items():
+            if name in scores and about.get("definition"):
+                package = " ".join(filter(None, (about.get("package"), about.get("version"))))
+                said.setdefault((about.get("title", name), about["definition"].rstrip(".")), {})[package] = None
+    return [f"{title}: {text} (metric of {', '.join(packages)})." for (title, text), packages in said.items()]

@@ -13,7 +13,7 @@ from rewild4d.leaderboard.curves import curve, moments
 from rewild4d.leaderboard.formats import ARROWS
 from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.tables import columns_of
-from rewild4d.leaderboard.variants import flat
+from rewild4d.leaderboard.variants import flat, scores_of
 
 
 def template(name: str) -> str:
@@ -37,7 +37,7 @@ def page_head(policy: str, style: str, script: str) -> dict[str, Any]:
 
 def score_rows(record: RunRecord) -> Iterator[dict[str, Any]]:
     """Yield each score for `run.html`, with a curve where it has values at several moments."""
-    names = [name for name in record.protocol["scores"] if name in record.scores]
+    names = [name for name in scores_of([record]) if name in record.scores]
     for column in columns_of([record], names):
         score = record.scores[column.score]
         points = moments(score, record.items)
@@ -55,7 +55,8 @@ def provenance_rows(record: RunRecord) -> list[tuple[str, list[tuple[str, str]]]
         "Settings of the method": record.config, "Data": record.data, "Prior": record.prior,
         "Protocol": record.protocol, "What the numbers lean on": record.coverage,
         "What the method says of itself, and how it fits its input": record.diagnostics,
-        "Networks of the metrics": record.networks, "Code": record.code, "Machine": record.machine,
+        "Networks of the metrics": record.networks,
+        "Metrics of other packages": record.metrics, "Code": record.code, "Machine": record.machine,
         "Time": {"started": record.timing.started, "fit, s": record.timing.fit_seconds,
                  "evaluation, s": record.timing.evaluate_seconds, "peak memory, MiB": record.timing.peak_memory_mib},
     }  # fmt: skip

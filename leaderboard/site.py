@@ -22,7 +22,7 @@ from rewild4d.leaderboard.media import FILMS, MOST_BYTES, TIMEOUT, link, publish
 from rewild4d.leaderboard.records import FILE, RunRecord
 from rewild4d.leaderboard.run_page import page_head, provenance_rows, score_rows, template
 from rewild4d.leaderboard.tables import columns_of, standings
-from rewild4d.leaderboard.variants import by_protocol, variants
+from rewild4d.leaderboard.variants import by_protocol, scores_of, variants
 
 TITLE = "Reconstructing 4D animals from one video"
 MARKER = ".rewild4d-leaderboard"
@@ -186,22 +186,22 @@ def _sections(records: Sequence[RunRecord], key: str, pages: Mapping[str, Page])
     sections = []
     for group, table in zip(by_protocol(records), standings(records), strict=True):
         labels = {record.run_id: variant.label for variant in variants(group) for record in variant.records}
-        protocol = group[0].protocol
+        scores = scores_of(group)
         sections.append({
-            **_shown(table, key), "description": protocol.get("description", ""),
-            "columns": columns_of(group, protocol["scores"]),
-            "runs": [_run_row(record, labels[record.run_id], pages[record.run_id]) for record in group],
+            **_shown(table, key), "description": group[0].protocol.get("description", ""),
+            "columns": columns_of(group, scores),
+            "runs": [_run_row(record, labels[record.run_id], pages[record.run_id], scores) for record in group],
         })  # fmt: skip
     return sections
 
 
-def _run_row(record: RunRecord, label: str, page: Page) -> dict[str, Any]:
+def _run_row(record: RunRecord, label: str, page: Page, scores: Sequence[str]) -> dict[str, Any]:
     place = _place(record).as_posix()
     return {
         "record": record, "label": label, "href": f"{place}/index.html",
         "thumbnail": f"{place}/{THUMBNAIL}" if page.has_thumbnail else "",
         "flags": [mark.partition(":")[0] for mark in record.marks],
-        "cells": [cell([record], [record.case], name) for name in record.protocol["scores"]],
+        "cells": [cell([record], [record.case], name) for name in scores],
     }  # fmt: skip
 
 

@@ -9,10 +9,10 @@ from rewild4d.leaderboard.cells import cell, difference, values_of
 from rewild4d.leaderboard.formats import markdown as to_markdown
 from rewild4d.leaderboard.layout import Cell, Column, Row, Table
 from rewild4d.leaderboard.records import RunRecord
-from rewild4d.leaderboard.remarks import cases_said, seeds_said
+from rewild4d.leaderboard.remarks import cases_said, definitions_said, seeds_said
 from rewild4d.leaderboard.specs import Reported
 from rewild4d.leaderboard.statistics import Estimate, estimate, ranks
-from rewild4d.leaderboard.titles import TITLES, better_of, digits_of
+from rewild4d.leaderboard.titles import TITLES, better_of, digits_of, known_scores
 from rewild4d.leaderboard.variants import (
     Variant,
     by_protocol,
@@ -20,6 +20,7 @@ from rewild4d.leaderboard.variants import (
     latest,
     marks,
     row_kind,
+    scores_of,
     variants,
 )
 from rewild4d.metrics.names import KINDS
@@ -88,7 +89,7 @@ def protocol_tables(records: Sequence[RunRecord]) -> list[Table]:
         for some in over:
             rows += _apart([row for variant in named if (row := _timed_row(variant, some, frame.scores))])
         sets = len(cases) > 1 and any(name in scores for scores in KINDS.values() for name in frame.scores)
-        remarks = [*frame.remarks, *([POOLED] if sets else [])]
+        remarks = [*frame.remarks, *definitions_said(kept, frame.scores), *([POOLED] if sets else [])]
         stubs = ("case", "method")
         tables.append(Table(frame.name, frame.title, frame.caption, stubs, columns, tuple(rows), tuple(remarks)))
     return tables
@@ -127,7 +128,7 @@ def named_table(frame: Frame, entrants: Sequence[Entrant], reported: Reported | 
         ])
         for entrant in entrants
     ], columns)  # fmt: skip
-    remarks = [*rests_on(frame, entrants), *frame.remarks]
+    remarks = [*rests_on(frame, entrants), *frame.remarks, *definitions_said(runs_of(entrants), frame.scores)]
     if reported is not None:
         rows += _reported_rows(reported, columns)
         remarks += [f"Reported: {reported.source}. {reported.note}"]
@@ -223,20 +224,21 @@ def columns_of(
     records: Sequence[RunRecord], scores: Sequence[str], conditions: Sequence[str] = ("",)
 ) -> tuple[Column, ...]:
     """Make a column for each score under each condition, with unit and direction as the records say."""
-    known = {name: score for record in records for name, score in record.scores.items()}
+    known = known_scores(records)
+    titles = {name: about["title"] for record in records for name, about in record.metrics.items() if "title" in about}
     columns = []
     for condition in conditions:
         for name in scores:
             score = known.get(name)
             unit = f", {score.unit}" if score and score.unit != "1" else ""
-            columns.append(Column(TITLES.get(name, name) + unit, better_of(name, known), condition, name))
+            columns.append(Column((titles | TITLES).get(name, name) + unit, better_of(name, known), condition, name))
     return tuple(columns)
 
 
 def _frame(records: Sequence[RunRecord], remarks: Sequence[str]) -> Frame:
     protocol = records[0].protocol
     caption = f"Protocol `{protocol['name']}`. {sentence(coverage_text(records))}"
-    scores = tuple(protocol["scores"])
+    scores = scores_of(records)
     return Frame(protocol["name"], protocol["title"], caption, ("",), scores, (*remarks, *_floors(records, scores)))
 
 

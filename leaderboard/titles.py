@@ -1,7 +1,8 @@
 """How scores are called and printed in tables."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
+from rewild4d.leaderboard.records import RunRecord
 from rewild4d.metrics.names import SCALE
 from rewild4d.metrics.score import Score
 
@@ -32,6 +33,14 @@ DIGITS = {
 """Printed after the point, by the score's name or unit; three for all others."""
 LESS_IS_BETTER = ("lpips", "chamfer", "kid", "fvd", "kvd")
 """Beginnings of such scores' names; asked only where no record says it."""
+
+
+def known_scores(records: Iterable[RunRecord]) -> dict[str, Score]:
+    """Return a score of each name, one with a value where there is any: what unit and direction are asked of."""
+    found = [pair for record in records for pair in record.scores.items()]
+    return {name: score for name, score in found if score.value is None} | {
+        name: score for name, score in found if score.value is not None
+    }
 
 
 def better_of(name: str, known: Mapping[str, Score]) -> str:

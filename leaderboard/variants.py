@@ -86,6 +86,12 @@ def is_floor(record: RunRecord) -> bool:
     return record.method in record.protocol.get("floors", ())
 
 
+def scores_of(records: Sequence[RunRecord]) -> tuple[str, ...]:
+    """List the scores of a protocol's records: those that it asks for, then those of other packages' metrics."""
+    asked = dict.fromkeys(records[0].protocol["scores"])
+    return tuple(asked | dict.fromkeys(name for record in records for name in record.metrics))
+
+
 def marks(records: Sequence[RunRecord]) -> tuple[str, ...]:
     """List what the records say beside their numbers, each sentence once."""
     return tuple(dict.fromkeys(mark for record in records for mark in record.marks))

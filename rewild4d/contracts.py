@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import msgspec
 
@@ -84,6 +84,7 @@ class MethodInfo:
         mark: what stands beside all of its numbers and keeps its rows out of the ranking: an advantage of its kind.
         is_floor: whether it is a floor, printed beside the others and never ranked.
         uses_prior: whether it starts from the prior.
+        description: a sentence on what it does, for `list`.
     """
 
     title: str
@@ -92,6 +93,7 @@ class MethodInfo:
     mark: str = ""
     is_floor: bool = False
     uses_prior: bool = True
+    description: str = ""
 
 
 class Method(Protocol):
@@ -196,9 +198,10 @@ class Verdict:
 class DatasetReader(Protocol):
     """Reads one dataset folder into clips and truths.
 
-    It may have more: ``originals(case, selection)``, the whole frames that the images of the clip and of the truth were
-    cut from, in the order of time, uint8 [h, w, 3] each, one after the other; for pictures of a finished run, never for
-    a method; ``default_cases(selection)``, what is run where no case is named; ``settings``, options for the record.
+    It may have more: ``title``, what `list` says of it; ``originals(case, selection)``, the whole frames that the
+    images of the clip and of the truth were cut from, in the order of time, uint8 [h, w, 3] each, one after the other;
+    for pictures of a finished run, never for a method; ``default_cases(selection)``, what is run where no case is
+    named; ``settings``, options for the record.
     """
 
     licence: str
@@ -213,4 +216,104 @@ class DatasetReader(Protocol):
 
     def check(self) -> list[Finding]:
         """Verify layout and contents without stopping at the first fault."""
+        ...
+
+
+@dataclass(frozen=True)
+class MetricInfo:
+    """What a metric of another package measures: pure data.
+
+    Attributes:
+        title: of its column.
+        definition: one sentence: what is compared, over which pixels or points, and how items are averaged.
+        unit: "dB", "px", "1" for a ratio; tables print three digits after the point, so choose it to suit.
+        better: which way is better; "" for a figure that rates nothing.
+        needs: what `Metric.measure` is given: held-out images beside their renders, or shapes as points.
+        paper: where it is from.
+        licence: of its code.
+    """
+
+    title: str
+    definition: str
+    unit: str
+    better: Literal["higher", "lower", ""]
+    needs: Literal["images", "points"]
+    paper: str = ""
+    licence: str = ""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """One held-out image beside its render: of one size, on one background, float32 on the CPU.
+
+    Attributes:
+        time: seconds.
+        view: index of the camera in the data set, or -1.
+        prediction: in [0, 1], [3, h, w].
+        truth: in [0, 1], [3, h, w].
+        prediction_matte: in [0, 1], [1, h, w].
+        truth_matte: in [0, 1], [1, h, w].
+        background: grey level in [0, 1] behind both.
+    """
+
+    time: float
+    view: int
+    prediction: torch.Tensor
+    truth: torch.Tensor
+    prediction_matte: torch.Tensor
+    truth_matte: torch.Tensor
+    background: float
+
+
+@dataclass(frozen=True)
+class Clouds:
+    """The shape at one moment as points in the world, not aligned (under a protocol with `free_scale`: after it).
+
+    Attributes:
+        time: seconds.
+        prediction: centres of Gaussians, float64, [m, 3].
+        truth: on the true surface, float64, [n, 3].
+        diagonal: of the true animal's bounding box at rest, world units; None where unknown.
+    """
+
+    time: float
+    prediction: torch.Tensor
+    truth: torch.Tensor
+    diagonal: float | None
+
+
+class Tally(NamedTuple):
+    """A sum and how many things it is over, so that means over pixels or points pool as they should."""
+
+    total: float
+    count: int = 1
+
+
+class NotComputed(Exception):
+    """Raised by `Metric.measure`: the case has no value; the sentence says why and goes into the record."""
+
+
+class Metric(Protocol):
+    """A metric of another package: entry point `rewild4d.metrics`, whose name is the score's.
+
+    Every run is scored by it beside our metrics. Whatever it raises becomes the reason why there is no value; it never
+    costs a fit.
+    """
+
+    info: MetricInfo
+
+    def measure(self, items: Iterable[Any]) -> Iterable[Tally | float | None]:
+        """Measure one case.
+
+        Args:
+            items: `HeldOut` in the order of the record's items, or `Clouds` in the order of time; each is made when it
+                is asked for, and may be asked for again by a second loop.
+
+        Returns:
+            One entry an item, None where it is not defined there; or a single one for the whole case. A number is a
+            tally of one. The score is the sum of all totals over the sum of all counts.
+
+        Raises:
+            NotComputed: the case has no value.
+        """
         ...

@@ -49,11 +49,11 @@ def result_sources() -> dict[str, bytes]:
 def code_of(method: str) -> dict[str, str]:
     """`code_version`, and of a method that is not ours a digest over the sources of the package that it is from."""
     package = type(load_method(method)).__module__.partition(".")[0]
-    return code_version() | ({} if package == __package__ else {"method": _sources(package)})
+    return code_version() | ({} if package == __package__ else {"method": package_sources(package)})
 
 
 @cache
-def _sources(package: str) -> str:
+def package_sources(package: str) -> str:
     """Return the digest of a loaded package's sources, or of the one file of a module."""
     module = sys.modules[package]
     folders = [Path(folder) for folder in getattr(module, "__path__", ())]

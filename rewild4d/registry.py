@@ -15,7 +15,7 @@ from rewild4d.errors import UserError, unknown_name
 if TYPE_CHECKING:
     import msgspec
 
-    from rewild4d.contracts import MethodInfo
+    from rewild4d.contracts import MethodInfo, Metric
 
 METHODS = {
     "ours": "rewild4d.ours.method:Ours",
@@ -56,7 +56,10 @@ BUILTIN = {"artemis": "rewild4d.datasets.builtin.synthetic:ensure"}
 
 
 def names(kind: str) -> list[str]:
-    """Return every known name of a kind ("methods" or "datasets"), ours first; imports nothing."""
+    """Return every known name of a kind ("methods", "datasets" or "metrics"), ours first; imports nothing.
+
+    Metrics are those of other packages; ours are listed in `metrics.names`.
+    """
     return list(_table(kind))
 
 
@@ -92,12 +95,15 @@ def load_config(name: str) -> type[msgspec.Struct]:
 def dataset_title(name: str) -> str:
     """Return what a data set is in one line, without importing its reader if it is ours.
 
+    One of another package says it by an attribute ``title``, or by the first line of its docstring.
+
     Raises:
         UserError: as `load_dataset`.
     """
     if name in TITLES:
         return TITLES[name]
-    first, *_ = (load_dataset(name).__doc__ or "no description").strip().splitlines()
+    reader = load_dataset(name)
+    first, *_ = (getattr(reader, "title", "") or reader.__doc__ or "no description").strip().splitlines()
     return first.rstrip(".")
 
 
@@ -121,6 +127,27 @@ def load_dataset(name: str) -> Any:
     return _load("datasets", name)
 
 
+def load_metric(name: str) -> Metric:
+    """Return an instance of the metric of another package that is called ``name``.
+
+    Raises:
+        UserError: no such metric, with the nearest name; one whose package cannot be imported.
+    """
+    metric: Metric = _load("metrics", name)()
+    return metric
+
+
+def package_of(kind: str, name: str) -> dict[str, str]:
+    """Return "package" and "version" of what adds a name of a kind; nothing where it is ours."""
+    own = _OWN.get(kind, {})
+    entry = next((entry for entry in plugged_in(kind) if entry.name == name and name not in own), None)
+    if entry is None:
+        return {}
+    if entry.dist is None:
+        return {"package": entry.module.partition(".")[0], "version": "unknown"}
+    return {"package": entry.dist.name, "version": entry.dist.version}
+
+
 def load_builtin(name: str) -> Any:
     """Return the function that makes a data set's built-in folder, or None where there is none."""
     target = BUILTIN.get(name)
@@ -129,22 +156,29 @@ def load_builtin(name: str) -> Any:
 
 def _load(kind: str, name: str) -> Any:
     require_name(kind, name)
-    target = _table(kind)[name]
+    target, said = _table(kind)[name], f"{kind.removesuffix('s')} '{name}'"
+    if name not in _OWN[kind] and len({entry.value for entry in plugged_in(kind) if entry.name == name}) > 1:
+        raise UserError(f"{said}: expected one package that adds this name, got several; uninstall all but one.")
     try:
         return _resolve(target)
-    except (ImportError, AttributeError) as error:
-        raise UserError(f"{kind.removesuffix('s')} '{name}': expected an object at {target}, but {error}.") from error
+    except Exception as error:
+        if name in _OWN[kind] and not isinstance(error, ImportError | AttributeError):
+            raise
+        kind_of_error = "" if isinstance(error, ImportError | AttributeError) else f"{type(error).__name__}: "
+        raise UserError(f"{said}: expected an object at {target}, but {kind_of_error}{error}.") from error
+
+
+_OWN: dict[str, dict[str, str]] = {"methods": METHODS, "datasets": DATASETS, "metrics": {}}
 
 
 def _table(kind: str) -> dict[str, str]:
-    own = {"methods": METHODS, "datasets": DATASETS}[kind]
     plugged = {entry.name: entry.value for entry in plugged_in(kind)}
-    return own | {name: target for name, target in plugged.items() if name not in own}
+    return _OWN[kind] | {name: target for name, target in plugged.items() if name not in _OWN[kind]}
 
 
 @cache
 def plugged_in(kind: str) -> tuple[metadata.EntryPoint, ...]:
-    """Return what installed packages add to "methods", "datasets" or "protocols".
+    """Return what installed packages add to "methods", "datasets", "metrics" or "protocols".
 
     Read once a process: it opens a file of every package in the environment.
     """

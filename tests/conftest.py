@@ -3,7 +3,8 @@ that tests of several folders use."""
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -85,3 +86,31 @@ def tiny_footage(one_thread: None, monkeypatch: pytest.MonkeyPatch) -> None:
     from films import TINY
 
     monkeypatch.setattr("rewild4d.priors.choose.FOOTAGE", TINY)
+
+
+@pytest.fixture
+def install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[..., None]]:
+    """Pretend that a package with these entry points and files is installed."""
+
+    def call(*entries: tuple[str, str, str], files: dict[str, str]) -> None:
+        for name, text in files.items():
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+            (tmp_path / name).write_text(text)
+        monkeypatch.syspath_prepend(str(tmp_path))
+        for module in [name for name in sys.modules if name.split(".")[0] == "their_package"]:
+            monkeypatch.delitem(sys.modules, module)
+        made = [metadata.EntryPoint(name, value, f"rewild4d.{group}") for group, name, value in entries]
+        own = metadata.entry_points
+
+        def entry_points(*, group: str) -> object:
+            return (
+                [entry for entry in made if entry.group == group] if group.startswith("rewild4d.") else own(group=group)
+            )
+
+        monkeypatch.setattr(metadata, "entry_points", entry_points)
+        plugged_in.cache_clear()
+
+    from rewild4d.registry import plugged_in
+
+    yield call
+    plugged_in.cache_clear()

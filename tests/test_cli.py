@@ -72,7 +72,7 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
         (["run", "--threads", "0"], "--threads: expected a number of at least 1, got 0"),
         (["run", "--data", "/no/such/folder"], "/no/such/folder: expected"),
         (["table", "--runs", "/no/such/folder"], "/no/such/folder: expected a folder of runs"),
-        (["check"], "check: expected either --dataset (with --data) or --method"),
+        (["check"], "check: expected one of --dataset (with --data), --method and --metric"),
         (["evaluate", "/no/such/run"], "/no/such/run/record.json: expected a run record"),
         (["make", "artemi"], "Did you mean 'artemis'?"),
         (["make", "zoo", "--seeds", "150", "--out", "x"], "zoo: expected a seed of 0 to 99 (development) or of 1000"),

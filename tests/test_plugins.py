@@ -1,9 +1,6 @@
 """What other packages add by entry points: methods, data sets, protocols; a broken one is a sentence."""
 
-import sys
-from collections.abc import Callable, Iterator
-from importlib import metadata
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 
@@ -12,7 +9,7 @@ from rewild4d.errors import UserError
 from rewild4d.evaluation.image_scores import summarize
 from rewild4d.evaluation.protocol import find_protocol, load_protocols
 from rewild4d.metrics.names import COLOR_METRICS, IMAGES
-from rewild4d.registry import load_method, plugged_in
+from rewild4d.registry import load_method
 
 PROTOCOL = """
 name = "mine-64-v1"
@@ -30,32 +27,6 @@ size = 64
 framing = "full"
 """
 Install = Callable[..., None]
-
-
-@pytest.fixture
-def install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Install]:
-    """Pretend that a package with these entry points and files is installed."""
-
-    def call(*entries: tuple[str, str, str], files: dict[str, str]) -> None:
-        for name, text in files.items():
-            (tmp_path / name).parent.mkdir(exist_ok=True)
-            (tmp_path / name).write_text(text)
-        monkeypatch.syspath_prepend(str(tmp_path))
-        for module in [name for name in sys.modules if name.split(".")[0] == "their_package"]:
-            monkeypatch.delitem(sys.modules, module)
-        made = [metadata.EntryPoint(name, value, f"rewild4d.{group}") for group, name, value in entries]
-        own = metadata.entry_points
-
-        def entry_points(*, group: str) -> object:
-            return (
-                [entry for entry in made if entry.group == group] if group.startswith("rewild4d.") else own(group=group)
-            )
-
-        monkeypatch.setattr(metadata, "entry_points", entry_points)
-        plugged_in.cache_clear()
-
-    yield call
-    plugged_in.cache_clear()
 
 
 def test_a_package_brings_its_data_sets_protocols(install: Install) -> None:

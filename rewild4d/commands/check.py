@@ -1,4 +1,4 @@
-"""`check`: verify a data set's folder, or a method's contract."""
+"""`check`: verify a data set's folder, or the contract of a method or of another package's metric."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,9 +9,11 @@ from rewild4d.commands.shared import open_dataset
 from rewild4d.config import parse_flags
 from rewild4d.contracts import Finding
 from rewild4d.errors import UserError
+from rewild4d.registry import require_name
 
 DESCRIPTION = """Verify a data set's folder and list every fault, or verify that a method keeps its contract: the same
-result from the same seed, the same pixels after saving and loading, resuming, a clear error on an empty mask."""
+result from the same seed, the same pixels after saving and loading, resuming, a clear error on an empty mask; or that
+a metric of another package keeps its own."""
 SIGNS = {"ok": "ok     ", "warning": "warning", "error": "ERROR  "}
 
 
@@ -25,6 +27,7 @@ class CheckChoice:
         sheets: folder for contact sheets, pictures of the masks over their frames.
         method: verify this method instead.
         preset: settings to verify the method with.
+        metric: verify this metric of another package instead.
     """
 
     dataset: str | None = None
@@ -32,6 +35,7 @@ class CheckChoice:
     sheets: Path = Path("check")
     method: str | None = None
     preset: str = "quick"
+    metric: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,10 +45,15 @@ class Options(DataFlags, CheckChoice):
 
 def main(arguments: list[str]) -> int:
     options = parse_flags(Options, arguments, prog="rewild4d-bench check", description=DESCRIPTION)
-    if (options.dataset is None) == (options.method is None):
-        raise UserError("check: expected either --dataset (with --data) or --method.")
+    if [options.dataset, options.method, options.metric].count(None) != 2:
+        raise UserError("check: expected one of --dataset (with --data), --method and --metric.")
     if options.dataset is not None:
         findings = _check_data(options.dataset, options)
+    elif options.metric is not None:
+        require_name("metrics", options.metric)
+        from rewild4d.running.conformance import check_metric
+
+        findings = check_metric(options.metric)
     else:
         from rewild4d.running.conformance import check_method
 

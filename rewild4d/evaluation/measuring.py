@@ -11,16 +11,21 @@ from torch import Tensor
 from rewild4d.cameras.input_view import finite_at, input_camera
 from rewild4d.cameras.placement import IDENTITY, Placement
 from rewild4d.cameras.rendering import render
-from rewild4d.contracts import Log, Reconstruction
+from rewild4d.contracts import Clouds, HeldOut, Log, NotComputed, Reconstruction
 from rewild4d.errors import UserError
 from rewild4d.evaluation import geometry_scores, image_scores, novel_views, placing
 from rewild4d.evaluation.networks import Networks, families_of, family_of, load_networks
+from rewild4d.evaluation.plugged import Source, score_plugged
 from rewild4d.evaluation.protocol import Protocol
+from rewild4d.io.sampling import sample_gaussians
 from rewild4d.metrics import names
 from rewild4d.metrics.samples import batches
 from rewild4d.metrics.score import Distance, Score
 from rewild4d.metrics.sets import FILE, Compared, write_features
 from rewild4d.types import Clip, Frame, Truth
+
+POINTS = 20_000
+"""Points of each cloud that metrics of other packages get where the protocol names no number."""
 
 
 class Evaluation(NamedTuple):
@@ -33,6 +38,7 @@ class Evaluation(NamedTuple):
         alignments: of the shapes with the truth.
         networks: SHA-256 of the weights of every network used.
         sets: the features behind ``distances``.
+        metrics: of each score that is another package's: what the record says of it.
     """
 
     scores: dict[str, Score]
@@ -41,6 +47,7 @@ class Evaluation(NamedTuple):
     alignments: list[dict[str, Any]]
     networks: dict[str, str]
     sets: list[Compared]
+    metrics: dict[str, dict[str, str]]
 
     def keep(self, folder: Path) -> dict[str, Any]:
         """Return the fields of a record, and write the features of sets into its folder (`metrics.sets.pool`)."""
@@ -52,7 +59,7 @@ class Evaluation(NamedTuple):
 def evaluate(
     reconstruction: Reconstruction, clip: Clip, truth: Truth, protocol: Protocol, log: Log, device: torch.device
 ) -> Evaluation:
-    """Score a reconstruction by all that a protocol asks for.
+    """Score a reconstruction by all that a protocol asks for, then by the metrics of other packages.
 
     Args:
         reconstruction: of the clip.
@@ -87,7 +94,9 @@ def evaluate(
         scores |= novel_views.as_scores(distances, sets, dict(networks.missing))
     used = {name: network.digest for name, network in networks.lpips.items()}
     used |= {distance.extractor: distance.digest for distance in distances}
-    return Evaluation({name: scores[name] for name in protocol.scores}, items, distances, alignments, used, compared)
+    found = {name: scores[name] for name in protocol.scores}
+    added, metrics = score_plugged(_sources(reconstruction, clip, truth, protocol, placed.scale))
+    return Evaluation(found | added, items, distances, alignments, used, compared, metrics)
 
 
 @torch.no_grad()
@@ -142,6 +151,38 @@ def _score_images(
     scores = {name: _noted(image_scores.summarize(name, items), asked[name].note) for name, items in values.items()}
     scores |= {name: image_scores.without_value(name, reason) for name, reason in absent.items() if reason}
     return scores, labels
+
+
+def _sources(
+    reconstruction: Reconstruction, clip: Clip, truth: Truth, protocol: Protocol, placement: Placement
+) -> dict[str, Source]:
+    """Return what metrics of other packages may ask for (`MetricInfo.needs`), made when they do."""
+
+    def images() -> Iterator[HeldOut]:
+        for batch in batches(truth.held_out, 16, _size):
+            shown = _beside(batch, list(_render_frames(reconstruction, batch, placement)), protocol.background)
+            assert shown.prediction_matte is not None
+            for i, frame in enumerate(batch):
+                yield HeldOut(
+                    frame.time, frame.view, shown.prediction[i], shown.truth[i], shown.prediction_matte[i],
+                    frame.mask.clone(), protocol.background,
+                )  # fmt: skip
+
+    def clouds() -> Iterator[Clouds]:
+        count = protocol.points or POINTS
+        for time in clip.times:
+            assert truth.sample is not None
+            cloud = placement.apply(sample_gaussians(reconstruction.at(time), count, 0))
+            if not len(cloud):
+                raise NotComputed("the prediction has no points")
+            yield Clouds(time, cloud.clone(), truth.sample(time, count, 1).clone(), truth.diagonal)
+
+    unseen = placement.reason or ("" if truth.held_out else "no image")
+    shapeless = placement.reason or ("" if truth.sample else "the data set has no geometry")
+    return {
+        "images": Source(images, len(truth.held_out), unseen, "image"),
+        "points": Source(clouds, len(clip.times), shapeless, "moment"),
+    }
 
 
 def _placing(name: str) -> str:

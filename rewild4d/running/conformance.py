@@ -1,12 +1,12 @@
-"""Check a method against the contract on a tiny case: `check --method NAME`.
+"""Check a method, or a metric of another package, against the contract on a tiny case: `check --method NAME`.
 
 A method that passes can be run, resumed, evaluated again and compared.
 """
 
+import contextlib
 import math
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,9 @@ import torch
 
 from rewild4d.cameras.rendering import render
 from rewild4d.config import load_preset
-from rewild4d.contracts import Finding, Method, Reconstruction
+from rewild4d.contracts import Clouds, Finding, HeldOut, Method, NotComputed, Reconstruction
 from rewild4d.errors import UserError
+from rewild4d.evaluation.plugged import Source, find_metric, measure
 from rewild4d.files import digest
 from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.kinematics import pose
@@ -26,7 +27,7 @@ from rewild4d.progress import Progress
 from rewild4d.registry import load_method
 from rewild4d.running.runner import save_reconstruction
 from rewild4d.transforms import camera_in_object, look_at, similarity, transform_splats
-from rewild4d.types import Camera, Case, Clip, Frame, Splats, Truth
+from rewild4d.types import OBJECT_DIAGONAL, Camera, Case, Clip, Frame, Splats, Truth
 
 
 def check_method(name: str, preset: str) -> list[Finding]:
@@ -47,6 +48,39 @@ def check_method(name: str, preset: str) -> list[Finding]:
     return findings
 
 
+def check_metric(name: str) -> list[Finding]:
+    """Measure two images, or two moments, twice, and report every requirement that a metric breaks."""
+    case, findings = tiny_case(frames=2, views=3), []
+    images = [
+        HeldOut(frame.time, frame.view, 0.9 * frame.over(1.0), frame.over(1.0), frame.mask, frame.mask, 1.0)
+        for frame in case.truth.held_out
+    ]
+    points = case.prior.vertices.double()
+    clouds = [Clouds(time, points + 0.01, points.clone(), OBJECT_DIAGONAL) for time in case.clip.times]
+    values: list[float | None] = []
+
+    def measured() -> str:
+        metric, info = find_metric(name)
+        items: list[Any] = {"images": images, "points": clouds}[info.needs]
+        with contextlib.suppress(NotComputed):
+            values.append(measure(metric, info, Source(lambda: items, len(items), "", "item")).value)
+        return ""
+
+    def repeats() -> str:
+        measured()
+        return "" if len(set(values)) <= 1 else f"expected the same value twice, got {values[0]} and {values[1]}"
+
+    for title, test in (("measures", measured), ("same items, same value", repeats)):
+        try:
+            message = test()
+        except (Exception, SystemExit) as error:  # whatever a plug-in raises is what the check is there to report
+            message = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+        findings.append(Finding("error" if message else "ok", f"{name}: {title}", message or "kept"))
+        if message:
+            break
+    return findings
+
+
 def _checks(
     name: str, method: Method, config: Any, case: Case, folder: Path
 ) -> Iterator[tuple[str, Callable[[], str]]]:
@@ -54,7 +88,7 @@ def _checks(
     fitted: list[Reconstruction] = []
 
     def fit(clip: Clip = case.clip, workdir: Path | None = None) -> Reconstruction:
-        with closing(Progress(f"check {name}")) as log:
+        with contextlib.closing(Progress(f"check {name}")) as log:
             return method.fit(
                 clip, case.prior, config=config, seed=0, device=torch.device("cpu"), log=log, workdir=workdir
             )
