@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import msgspec
 
@@ -282,7 +282,8 @@ class Clouds:
     diagonal: float | None
 
 
-class Tally(NamedTuple):
+@dataclass(frozen=True)
+class Tally:
     """A sum and how many things it is over, so that means over pixels or points pool as they should."""
 
     total: float

@@ -3,9 +3,9 @@
 import math
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import msgspec
 import torch
@@ -18,7 +18,8 @@ from rewild4d.metrics.score import Score
 from rewild4d.registry import load_metric, names, package_of
 
 
-class Source(NamedTuple):
+@dataclass(frozen=True)
+class Source:
     """What a metric may ask for.
 
     Attributes:
@@ -140,9 +141,8 @@ def _tally(found: Any) -> Tally | None:
     """Check one entry of what a metric returned; a count of 0 has no value."""
     if found is None:
         return None
-    parts: Sequence[Any] = found if isinstance(found, tuple) else (found, 1)
+    total, count = (found.total, found.count) if isinstance(found, Tally) else (found, 1)
     try:
-        total, count = parts
         if math.isfinite(total) and count >= 0 and int(count) == count:
             return Tally(float(total), int(count)) if count else None
     except (TypeError, ValueError):

@@ -61,7 +61,7 @@ def check_metric(name: str) -> list[Finding]:
 
     def measured() -> str:
         metric, info = find_metric(name)
-        items: list[Any] = {"images": images, "points": clouds}[info.needs]
+        items: list[Any] = [*(images if info.needs == "images" else clouds)]
         with contextlib.suppress(NotComputed):
             values.append(measure(metric, info, Source(lambda: items, len(items), "", "item")).value)
         return ""
