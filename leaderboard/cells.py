@@ -2,21 +2,27 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from rewild4d.leaderboard.layout import Cell
 from rewild4d.leaderboard.records import RunRecord
+from rewild4d.leaderboard.remarks import FEW
 from rewild4d.leaderboard.statistics import Cases, Estimate, estimate, paired
 from rewild4d.leaderboard.titles import digits_of
+from rewild4d.leaderboard.variants import version_of
 from rewild4d.metrics.names import ALL, KINDS, split_name
 from rewild4d.metrics.score import Score
 
 
 def cell(records: Sequence[RunRecord], cases: Sequence[str], name: str, absent: str = "") -> Cell:
-    """Compute mean and spread of a score over cases, or say why there is none: unequal sets are not averaged.
+    """Compute mean and spread of a score over cases, or say why there is none.
+
+    A row that was not run on some of the cases has the mean over its own, `Cell.partial`, which says so; one that
+    failed on a case, or has no value there, has none. Values of unlike versions of code or weights are not averaged.
 
     Args:
         records: of one row under one condition.
-        cases: every one must have a value.
+        cases: of all rows.
         name: of the score.
         absent: why the row can have no records, or "".
     """
@@ -27,14 +33,20 @@ def cell(records: Sequence[RunRecord], cases: Sequence[str], name: str, absent: 
     missing = [case for case in cases if all(record.case != case for record in good)]
     if failed := next((record for case in missing for record in wanted if record.case == case), None):
         return Cell("failed", note=f"{failed.case}, {failed.method}: failed: {failed.error}")
-    if missing:
-        return Cell("n/a", note=f"not computed: no result for {', '.join(missing)}")
     values = values_of(good, name)
     if empty := next((record for record in good if record.case not in values), None):
         return Cell("n/a", note=f"not computed: {_reason(empty, name)}")
     if said := _unlike(good, name):
         return Cell("n/a", note=said)
-    return figure(estimate(values), digits_of(name, _unit(good, name)), _left_out(wanted, name))
+    found = figure(estimate(values), digits_of(name, _unit(good, name)), _left_out(wanted, name))
+    return _partial(found, [case for case in cases if case not in missing], len(cases)) if missing else found
+
+
+def _partial(found: Cell, cases: Sequence[str], total: int) -> Cell:
+    """Mark a mean that is not over all cases."""
+    named = f": {', '.join(cases)}" if len(cases) <= FEW else ""
+    note = "; ".join(filter(None, (f"{len(cases)} of {total} cases{named}", found.note)))
+    return replace(found, note=note, partial=True)
 
 
 def figure(found: Estimate, digits: int, note: str, interval: tuple[float, float] | None = None) -> Cell:
@@ -57,7 +69,7 @@ def difference(records: Sequence[RunRecord], reference: Sequence[RunRecord], nam
     shared = [case for case in values if case in others]
     if not shared:
         return Cell("n/a", note=absent or _no_difference(records, reference, name))
-    if said := _unlike([run for run in (*records, *reference) if run.case in shared], name):
+    if said := _unlike([run for run in (*records, *reference) if run.case in shared], name, one_row=False):
         return Cell("n/a", note=said)
     found, digits = paired(values, others), digits_of(name, _unit(records, name))
     interval = " [" + ", ".join(_signed(end, digits) for end in found.interval) + "]" if found.interval else ""
@@ -81,8 +93,13 @@ def values_of(
     return dict(values)
 
 
-def _unlike(records: Sequence[RunRecord], name: str) -> str:
-    """Say that values of a score are by unlike weights or versions of its metric; "" where they are not."""
+def _unlike(records: Sequence[RunRecord], name: str, one_row: bool = True) -> str:
+    """Say that values of a score are by unlike versions of a metric, of weights or, in one row, of code; "" where they
+    are not."""
+    versions = {version_of(record): record.case for record in reversed(records) if record.scores.get(name)}
+    if one_row and len(versions) > 1:
+        listed = " and ".join(f"{case} by {said or 'unknown code'}" for said, case in sorted(versions.items()))
+        return f"not averaged: {listed}"
     found: dict[str, str] = {}
     for record in records:
         score = record.scores.get(name)

@@ -37,6 +37,7 @@ class Cell:
         value: the figure, None where there is none.
         deviation: the spread, None where there is none.
         interval: ends of the 95 % interval of a difference, None for other figures.
+        partial: whether it is over some of the cases that other rows have; such figures are not ranked.
     """
 
     text: str
@@ -46,6 +47,7 @@ class Cell:
     value: float | None = None
     deviation: float | None = None
     interval: tuple[float, float] | None = None
+    partial: bool = False
 
 
 @dataclass(frozen=True)

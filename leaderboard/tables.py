@@ -74,8 +74,9 @@ def markdown(records: Sequence[RunRecord]) -> str:
 def protocol_tables(records: Sequence[RunRecord]) -> list[Table]:
     """Make a table per (data set, protocol): a row per case and method, and the mean where cases are several.
 
-    A cell is the mean over seeds, with the standard deviation where there are several. Methods are averaged over cases
-    only where they were run on the same set of cases; otherwise a note says which are missing.
+    A cell is the mean over seeds, with the standard deviation where there are several. A method that was not run on all
+    cases has the mean over its own, says how many they are and is not ranked. Runs by several versions of the code
+    stand in rows of their own.
     """
     tables = []
     for group in by_protocol(records):
@@ -290,7 +291,10 @@ def _timed_row(variant: Variant, cases: list[str], scores: Sequence[str]) -> Row
     good = [run for run in runs if run.status == "ok"]
     whole = {run.case for run in good} == set(cases)
     mean = len(cases) > 1
-    seeds = "" if mean else str(len(good)) if len(good) == len(runs) else f"{len(good)} of {len(runs)}"
+    run_on = len({run.case for run in runs})
+    seeds = str(len(good)) if len(good) == len(runs) else f"{len(good)} of {len(runs)}"
+    if mean:
+        seeds = f"{run_on} of {len(cases)} cases" if run_on < len(cases) else ""
     seconds = f"{statistics.fmean(run.timing.fit_seconds for run in good):.0f}" if whole else "-"
     cells = (*(cell(runs, cases, name) for name in scores), Cell(seeds), Cell(seconds))
     said = marks(variant.records)
@@ -315,7 +319,7 @@ def ranked(rows: Sequence[Row], columns: Sequence[Column]) -> list[Row]:
     found = []
     for place, column in enumerate(columns):
         cells = [row.cells[place] if row.kind == "method" else Cell("") for row in rows]
-        known = [None if c.value is None else Estimate(c.value, c.deviation, 0) for c in cells]
+        known = [None if c.value is None or c.partial else Estimate(c.value, c.deviation, 0) for c in cells]
         digits = max((len(c.text.partition(" ")[0].partition(".")[2]) for c in cells), default=0)
         found.append(ranks(known, column.better, digits))
     return _apart([

@@ -15,14 +15,16 @@ T = TypeVar("T")
 
 _BUILT_IN = re.compile(r"(builtin-v\d+)-[0-9a-f]{12}")
 """A folder of the built-in animals: their version, then a digest of the sources that made them."""
+_WITHOUT_PRIOR = ("empty",)
+"""Lower bounds without Gaussians: no prior changes their scores."""
 
 
 class Variant(NamedTuple):
     """A method with its settings.
 
     Attributes:
-        label: method, with what tells it from other variants of it: preset, settings, prior.
-        records: all its runs.
+        label: method, with what tells it from other variants of it: preset, settings, prior, version of the code.
+        records: all its runs, of one version of code and weights (`version_of`).
     """
 
     label: str
@@ -46,14 +48,16 @@ def by_protocol(records: Iterable[RunRecord]) -> list[list[RunRecord]]:
 def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
     """Choose the records that may stand in one table, and say in sentences which are left out.
 
-    Of equal runs by several versions of the code the latest one counts. Of a case whose data has changed, and of a
-    protocol that has, only the runs on the latest one count. The built-in animals of one version, and folders that were
-    rendered by one recipe, are the same data on every processor, although the last digits of its arithmetic, and with
-    them some pixels, differ.
+    Of equal runs by several versions of the code the latest one counts, and a lower bound is one run whatever preset it
+    was run beside. Of a case whose data has changed, and of a protocol that has, only the runs on the latest one count.
+    The built-in animals of one version, and folders that were rendered by one recipe, are the same data on every
+    processor, although the last digits of its arithmetic, and with them some pixels, differ.
     """
     remarks = []
     kept: list[RunRecord] = []
     rounded: dict[str, list[str]] = defaultdict(list)
+    records, older = _on_one_protocol(records)
+    remarks += older
     cases = grouped(records, lambda record: (record.dataset, record.protocol["name"], record.case))
     for (_, protocol, case), runs in cases.items():
         newest = max(runs, key=_age)
@@ -70,15 +74,62 @@ def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
     ]
     versions = {record.code.get("sources", "") for record in kept if record.code}
     if len(versions) > 1:
-        remarks.append(f"Runs of {len(versions)} versions of the code.")
+        remarks.append(f"Runs of {len(versions)} versions of the code; no mean is over two of them.")
+    return kept, remarks
+
+
+def _on_one_protocol(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
+    """Leave out records of a protocol that has changed under its name since, and say so."""
+    kept, remarks = [], []
+    for (_, name), group in grouped(records, lambda run: (run.dataset, run.protocol["name"])).items():
+        newest = max(group, key=_age).protocol.get("digest")
+        same = [run for run in group if run.protocol.get("digest") == newest]
+        gone = sorted({run.case for run in group} - {run.case for run in same})
+        if gone:
+            remarks.append(f"{name}: records of {', '.join(gone)} by another protocol of that name left out.")
+        kept += [run for run in group if run.case not in gone]
     return kept, remarks
 
 
 def variants(records: Sequence[RunRecord]) -> list[Variant]:
-    """Group records by method, preset, settings and prior, in the order in which they are met."""
+    """Group records by method, preset, settings, prior and version, in the order in which they are met."""
     groups = grouped(records, _identity).values()
     firsts = [group[0] for group in groups]
-    return [Variant(_label(group[0], firsts), tuple(group)) for group in groups]
+    return [
+        Variant(_label(group[0], firsts) + version, part)
+        for group in groups
+        for version, (part,) in by_version([tuple(group)]).items()
+    ]
+
+
+def by_version(conditions: Sequence[Sequence[RunRecord]]) -> dict[str, tuple[tuple[RunRecord, ...], ...]]:
+    """Split the records of one row where those of a condition are of several versions of code or weights.
+
+    Args:
+        conditions: records of the row, under each condition.
+
+    Returns:
+        End of the row's label (" [code 1a2b3c4d]") -> its records under each condition; "" -> all of them where no
+        mean would be over two versions.
+    """
+    if all(len({version_of(run) for run in found}) <= 1 for found in conditions):
+        return {"": tuple(map(tuple, conditions))}
+    versions = dict.fromkeys(version_of(run) for found in conditions for run in found)
+    return {
+        f" [{version or 'code unknown'}]": tuple(
+            tuple(run for run in found if version_of(run) == version) for found in conditions
+        )
+        for version in versions
+    }
+
+
+def version_of(record: RunRecord) -> str:
+    """Name the versions of what made a result beside its settings: our code, another's, weights of the prior."""
+    parts = {
+        "code": record.code.get("sources"), "method": record.code.get("method"),
+        "program": record.code.get("program_digest"), "prior weights": record.prior.get("weights"),
+    }  # fmt: skip
+    return ", ".join(f"{name} {digest[:8]}" for name, digest in parts.items() if digest)
 
 
 def is_floor(record: RunRecord) -> bool:
@@ -139,6 +190,8 @@ def _digests(record: RunRecord) -> tuple[Any, Any]:
 
 def _settings(record: RunRecord) -> dict[str, Any]:
     """Flatten all that tells variants of a method apart: {"deform.enabled": False, ...}."""
+    if record.method in _WITHOUT_PRIOR and is_floor(record):
+        return flat(record.config)
     fit = json.dumps(record.prior.get("config"), sort_keys=True).encode()
     seen = record.prior.get("keypoints", "none")
     return flat(record.config) | {
@@ -157,14 +210,19 @@ def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _identity(record: RunRecord) -> str:
-    return json.dumps([record.method, record.preset, _settings(record)], sort_keys=True)
+    return json.dumps([record.method, _preset(record), _settings(record)], sort_keys=True)
+
+
+def _preset(record: RunRecord) -> str:
+    """Return the preset of a method; a lower bound has none, it is named after the rows that it was run beside."""
+    return "" if is_floor(record) else record.preset
 
 
 def _label(record: RunRecord, others: Sequence[RunRecord]) -> str:
     """Name the method, its preset where there are several, and the settings and prior that tell it from the others."""
     kin = [other for other in others if other.method == record.method]
-    peers = [_settings(other) for other in kin if other.preset == record.preset]
-    preset = f" ({record.preset})" if len({other.preset for other in kin}) > 1 else ""
+    peers = [_settings(other) for other in kin if _preset(other) == _preset(record)]
+    preset = f" ({record.preset})" if len(set(map(_preset, kin))) > 1 else ""
     changed = []
     for name, value in _settings(record).items():
         counts = Counter(json.dumps(peer.get(name)) for peer in peers).most_common(2)

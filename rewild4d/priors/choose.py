@@ -127,6 +127,11 @@ class PriorChoice:
             )
         return Path(path)
 
+    @property
+    def weights_digest(self) -> str:
+        """Sixteen hex digits of the SHA-256 of a learned prior's weights; "" for other priors."""
+        return digest(self._weights_file.read_bytes())[:16] if self.is_learned else ""
+
     def trained(self) -> Trained:
         """Return what takes part in the fit: of a learned prior its points, of a template headings and shapes.
 

@@ -13,7 +13,7 @@ from rewild4d.evaluation.protocol import load_protocols, newest_version
 from rewild4d.leaderboard.records import RunRecord
 from rewild4d.leaderboard.specs import Condition, Line, Reported, Spec, load_reported
 from rewild4d.leaderboard.tables import Entrant, Frame
-from rewild4d.leaderboard.variants import is_floor, latest
+from rewild4d.leaderboard.variants import by_version, is_floor, latest
 from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import PRESETS as PRIOR_PRESETS
 from rewild4d.priors.config import STANDARD
@@ -143,7 +143,7 @@ def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[
             for found in under
         )
         notes += _notes(own)
-        rows.append(Entrant(row.label, own, "", notes))
+        rows += [Entrant(row.label + version, part, "", notes) for version, part in by_version(own).items()]
     shown = {row.method for row in spec.rows}
     # Lower bounds are shown for the cases of the other rows.
     cases = [{r.case for row in rows for r in row.records[index]} for index in range(len(under))]
@@ -153,7 +153,9 @@ def entrants(name: str, spec: Spec, records: Sequence[RunRecord]) -> tuple[list[
             tuple(r for r in found if r.method == floor and r.case in cases[index]) for index, found in enumerate(under)
         )
         if any(own):
-            rows.append(Entrant(floor, own, "", _notes(own)))
+            config = max((run for found in own for run in found), key=lambda run: run.timing.started).config
+            own = tuple(tuple(run for run in found if run.config == config) for found in own)
+            rows += [Entrant(floor + version, part, "", _notes(part)) for version, part in by_version(own).items()]
     return rows, [*left_out, *_missing(spec, cases)]
 
 

@@ -34,6 +34,11 @@ def prior_of(prior: Prior | None) -> dict[str, Any]:
     return found | ({"notes": list(prior.notes)} if prior.notes else {})
 
 
+def weights(choice: PriorChoice) -> dict[str, str]:
+    """Return the digest of a learned prior's weights."""
+    return {"weights": found} if (found := choice.weights_digest) else {}
+
+
 def left_out(clip: Clip, shown: Clip | None) -> dict[str, list[int]]:
     """Return rows of the frames that the method was not shown, because the prior does not know their cameras."""
     times = set(clip.times if shown is None else shown.times)

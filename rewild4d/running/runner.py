@@ -300,7 +300,7 @@ class Job:
                      "truth": self.truth.digest, "surface": self.truth.source,
                      **provenance.reading(plan.reader, self.clip)},
             "prior": {"choice": plan.prior.name, "config": msgspec.to_builtins(plan.prior.settings(self.clip)),
-                      **provenance.keypoints(plan.prior, self.clip),
+                      **provenance.weights(plan.prior), **provenance.keypoints(plan.prior, self.clip),
                       **provenance.prior_of(case.prior if case else None),
                       **provenance.left_out(self.clip, case.clip if case else None)},
             "protocol": {"digest": plan.protocol.digest, **msgspec.to_builtins(plan.protocol)},

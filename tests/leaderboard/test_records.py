@@ -86,12 +86,12 @@ def test_table_shows_mean_and_spread_over_seeds() -> None:
     assert "| wolf/Run | ours | 20.00 ± 1.00 | 3 | 60 |" in table
 
 
-def test_table_averages_cases_only_over_equal_sets() -> None:
+def test_a_mean_over_fewer_cases_than_others_have_says_so() -> None:
     full = [record(case=case, scores=psnr(value)) for case, value in (("a/x", 10.0), ("b/x", 30.0))]
     assert "| **mean** | ours | 20.00 |" in markdown(full)
     partial = [*full, record(method="gart", case="a/x", scores=psnr(12.0))]
-    assert "| **mean** | gart | n/a [1] |" in markdown(partial)
-    assert "[1] not computed: no result for b/x" in markdown(partial)
+    assert "| **mean** | gart | 12.00 [1] | 1 of 2 cases | - |" in markdown(partial)
+    assert "[1] 1 of 2 cases: a/x" in markdown(partial)
 
 
 def test_a_failure_is_a_row() -> None:

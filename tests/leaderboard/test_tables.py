@@ -108,12 +108,17 @@ def test_less_is_better_where_the_record_says_so() -> None:
     assert "PSNR ↓" in markdown(made)
 
 
-def test_unequal_sets_of_cases_are_not_averaged() -> None:
-    made = table(ours=runs({"a": [10.0], "b": [30.0]}), gart=runs({"a": [40.0]}))
-    assert texts(made) == {"ours": ("20.00", "", ""), "gart": ("n/a", "", "")}
-    assert made.notes == ("not computed: no result for b",)
-    assert "| gart | n/a [1] |" in markdown(made) and "[1] not computed: no result for b" in markdown(made)
-    assert r"gart & n/a\textsuperscript{1}" in latex(made)
+def test_a_row_on_fewer_cases_says_so_and_is_not_ranked() -> None:
+    made = table(
+        ours=runs({"a": [10.0], "b": [30.0]}), gart=runs({"a": [40.0]}), d3dgs=runs({"a": [10.0], "b": [20.0]})
+    )
+    assert texts(made) == {"ours": ("20.00", "", "best"), "gart": ("40.00", "", ""), "d3dgs": ("15.00", "", "second")}
+    assert made.notes == ("1 of 2 cases: a",)
+    assert "| gart | 40.00 [1] |" in markdown(made) and "[1] 1 of 2 cases: a" in markdown(made)
+    assert r"gart & 40.00\textsuperscript{1}" in latex(made)
+    many = {str(case): [1.0] for case in range(20)}
+    made = table(ours=runs({**many, "one more": [1.0]}), gart=runs(many))
+    assert made.notes == ("20 of 21 cases",), "more cases than can be read are counted"
 
 
 def test_what_has_no_number_says_why() -> None:
