@@ -1,7 +1,8 @@
 """Anybody's program as a competitor: it gets the clip as files and leaves Gaussians or meshes as files.
 
 `--command "conda run -n theirs python run.py {clip} {out}"` runs a program; `--folder results/{case}` takes what one
-left before. `external_folder.README` says what the two folders hold, `--profile` names other layouts.
+left before; `--file theirs.toml` does what a method file says (`external_file`). `external_folder.README` says what the
+two folders hold, `--profile` names other layouts.
 
 A result in other coordinates than the input cameras is rotated, scaled and shifted to the best input-view PSNR,
 as the paper does for such methods. It has then been shown the answer, so it carries the mark "upper bound" in its
@@ -22,8 +23,10 @@ from torch import Tensor
 
 from rewild4d.baselines.external_alignment import UPS, Placement, place_by_search, place_fauna
 from rewild4d.baselines.external_config import INFO, ExternalConfig
+from rewild4d.baselines.external_file import facts, resolved
 from rewild4d.baselines.external_folder import (
     crop_box,
+    environment_name,
     find_outputs,
     program_digest,
     require_program,
@@ -95,12 +98,25 @@ class External:
     def inputs(self, config: ExternalConfig, case: str) -> str:
         """Digest of the files that decide the result beside the settings: those that the command names, or those of a
         folder that is already there."""
+        said = [msgspec.json.encode(resolved(config))] if config.file else []
+        config = resolved(config)
         if not config.folder:
-            return program_digest(config.command, _file_name(case))
+            found = program_digest(config.command, _file_name(case))
+            return digest(*said, found) if said else found
         folder = _folder(config, case)
         paths = sorted(folder.rglob("*"), key=lambda path: path.parts)  # Windows would sort without case
-        return digest(*(part for path in paths if path.is_file()
-                        for part in (path.relative_to(folder).as_posix(), path.read_bytes())))  # fmt: skip
+        return digest(*said, *(part for path in paths if path.is_file()
+                               for part in (path.relative_to(folder).as_posix(), path.read_bytes())))  # fmt: skip
+
+    def describe(self, config: ExternalConfig) -> dict[str, str]:
+        """Return for the record whose program it is, and a digest of what its command names (contracts.Method)."""
+        told, config = facts(config), resolved(config)
+        profile = _profile(config)
+        about = {"program": config.program or (profile.title if profile.paper else ""), **told}
+        if config.command:
+            about["environment"] = environment_name(config.command)
+            about["program_digest"] = program_digest(config.command, "")
+        return {name: text for name, text in about.items() if text}
 
     def require(self, config: ExternalConfig, cases: Sequence[str]) -> None:
         """Say what no case could be made with before any is (`Method`).
@@ -108,9 +124,12 @@ class External:
         Raises:
             UserError: an unknown profile, both or neither of command and folder, or one that cannot be used.
         """
+        config = resolved(config)
         _profile(config)
         if bool(config.command) == bool(config.folder):
-            raise UserError("external: expected either --command (a program to run) or --folder (its results).")
+            raise UserError(
+                "external: expected either --command (a program to run) or --folder (its results), or --file for both."
+            )
         if config.command:
             require_program(config.command)
         elif not any(_folder(config, case).is_dir() for case in cases):
@@ -123,6 +142,7 @@ class External:
     ) -> ExternalReconstruction:  # fmt: skip
         """Run the program, or take what it left, and read it; see contracts.Method."""
         self.require(config, [clip.name])
+        config = resolved(config)
         profile = _profile(config)
         for frame in clip.frames:
             crop_box(frame.mask)  # an empty mask is said before hours of work
@@ -130,7 +150,7 @@ class External:
             return _read(_folder(config, clip.name), clip, prior, profile, config, seed, log)
         with tempfile.TemporaryDirectory() as spare:
             work = workdir or Path(spare)
-            _run(work, clip, prior, profile, config, seed)
+            _run(work, clip, prior, profile, config, seed, device.type == "cuda")
             try:
                 return _read(work / "out", clip, prior, profile, config, seed, log)
             except Exception:
@@ -162,7 +182,9 @@ def _file_name(case: str) -> str:
     return case.replace("/", "__")
 
 
-def _run(work: Path, clip: Clip, prior: Prior, profile: Profile, config: ExternalConfig, seed: int) -> None:
+def _run(
+    work: Path, clip: Clip, prior: Prior, profile: Profile, config: ExternalConfig, seed: int, gpu: bool
+) -> None:  # fmt: skip
     """Run the program, unless it has already run in this folder on the same input to its end."""
     identity = digest(msgspec.json.encode(config), clip.digest, prior.digest, str(seed))
     done = work / DONE
@@ -173,7 +195,7 @@ def _run(work: Path, clip: Clip, prior: Prior, profile: Profile, config: Externa
     write_clip(work / "clip", clip, prior, profile.crops)
     run_program(
         config.command, clip=work / "clip", out=work / "out", case=_file_name(clip.name), seed=seed,
-        timeout=config.timeout, log=work / "program.log",
+        timeout=config.timeout, log=work / "program.log", gpu=gpu,
     )  # fmt: skip
     write_text(done, json.dumps(identity) + "\n")
 

@@ -20,7 +20,11 @@ class ExternalConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     """Layout of its files: frames, glb, gvfdiffusion, dreammesh4d or 3d-fauna."""
     command: str = ""
     """Words that start it; {clip} and {out} stand for the two folders, {case} and {seed} for what they say. A file that
-    a word names counts as a setting: edit it and it is another run. What such a file reads or imports does not."""
+    a word names counts as a setting: edit it and it is another run. What such a file reads or imports does not.
+    venv:PATH or docker:IMAGE before them runs it in that environment."""
+    file: str = ""
+    """A method file (.toml) that says command, environment, licence and more, instead of a command; the same as
+    --method FILE.toml."""
     folder: str = ""
     """Where its results are already, instead of a command; {case} stands for <animal>__<motion>."""
     placed: Literal["profile", "yes", "no"] = "profile"

@@ -4,7 +4,6 @@ import json
 import math
 import os
 import re
-import shutil
 import string
 from collections.abc import Mapping
 from itertools import pairwise
@@ -19,6 +18,7 @@ from torch.nn.functional import interpolate
 from rewild4d.baselines.external_profiles import Profile
 from rewild4d.errors import UserError
 from rewild4d.files import command_words, digest, write_text
+from rewild4d.foreign.environments import Here, environment_of
 from rewild4d.foreign.programs import run_foreign
 from rewild4d.priors.io import save_prior
 from rewild4d.types import Clip, Frame, Prior
@@ -90,14 +90,17 @@ def crop_box(mask: Tensor) -> tuple[float, float, float]:
 
 
 def program_digest(command: str, case: str) -> str:
-    """Digest of the files that a command names, in a word or in a part of one ("--config=FILE"); "" for none."""
+    """Digest of the files that a command names, in a word or in a part of one ("--config=FILE"), and of what its
+    environment has installed; "" for none."""
     try:
         words = {*command_words(command), *re.split(r"[\s='\";]+", command)}
     except ValueError:  # a quote that does not end is said when the program is to start
         return ""
     named = sorted(word.replace("{case}", case) for word in words)
     files = [word for word in named if os.path.isfile(word) and os.access(word, os.R_OK)]
-    return digest(*(part for file in files for part in (file, _content(Path(file))))) if files else ""
+    installed = next((environment_of(word).identity() for word in command_words(command)[:1]), "")
+    parts = [part for file in files for part in (file, _content(Path(file)))] + ([installed] if installed else [])
+    return digest(*parts) if parts else ""
 
 
 def _content(file: Path) -> bytes | str:
@@ -106,38 +109,59 @@ def _content(file: Path) -> bytes | str:
 
 
 def require_program(command: str) -> None:
-    """Fail on a command whose words are wrong, or whose first is no program.
+    """Fail on a command whose words are wrong, whose environment is not there, or whose program cannot be started.
 
     Raises:
         UserError: so it is.
     """
-    program = _words(command, dict.fromkeys(("clip", "out", "case", "seed"), "x"))[0]
-    if shutil.which(program) is None:
-        raise UserError(f"--command: expected a program that can be started, but '{program}': No such file or program.")
+    environment, words = _parted(_words(command, dict.fromkeys(("clip", "out", "case", "seed"), "x")))
+    environment.require(words[0])
 
 
-def run_program(command: str, *, clip: Path, out: Path, case: str, seed: int, timeout: float, log: Path) -> None:
+def environment_name(command: str) -> str:
+    """Return "venv:PATH" or "docker:IMAGE" of a command, "" for neither."""
+    return environment_of(next(iter(command_words(command)), "")).name
+
+
+def run_program(
+    command: str, *, clip: Path, out: Path, case: str, seed: int, timeout: float, log: Path, gpu: bool = False
+) -> None:
     """Run a program of others until it ends.
 
     Args:
-        command: its words, with {clip} and {out} for the two folders, and {case} and {seed} where it wants them.
+        command: its words, with {clip} and {out} for the two folders, and {case} and {seed} where it wants them, and
+            its environment before them (`foreign.environments`).
         clip: what `write_clip` wrote.
         out: where it writes; made, and empty.
         case: name of the case.
         seed: of the run.
         timeout: seconds.
         log: file for what it prints; of more than `programs.HEAD` + 2 `programs.TAIL` bytes the middle is left out.
+        gpu: whether a container may use the GPU.
 
     Raises:
         UserError: it cannot be started, does not end in time, or ends with another status than 0.
     """
-    words = _words(command, {"clip": str(clip), "out": str(out), "case": case, "seed": str(seed)})
+    environment = environment_of(command_words(command)[0])
+    places = dict(zip(("clip", "out"), environment.places(clip, out), strict=True))
+    _, words = _parted(_words(command, {**places, "case": case, "seed": str(seed)}))
     out.mkdir(parents=True, exist_ok=True)
-    ended = run_foreign(words, timeout=timeout, log=log)
+    call = environment.call(words, clip, out, gpu)
+    with environment.watched(out):
+        ended = run_foreign(call.words, timeout=timeout, log=log, environment=call.variables)
     if ended.status != 0:
         raise UserError(
             f"{words[0]}: ended with status {ended.status}; its last words: '{ended.said or 'none'}' (log: {log})."
         )
+
+
+def _parted(words: list[str]) -> tuple[Here, list[str]]:
+    """Part a command's words into its environment and its program with arguments."""
+    environment = environment_of(words[0])
+    rest = words[1:] if environment.name else words
+    if not rest:
+        raise UserError(f"--command: expected a program behind '{words[0]}', got nothing.")
+    return environment, rest
 
 
 def _words(command: str, given: Mapping[str, str]) -> list[str]:

@@ -191,14 +191,20 @@ def _digests(record: RunRecord) -> tuple[Any, Any]:
 def _settings(record: RunRecord) -> dict[str, Any]:
     """Flatten all that tells variants of a method apart: {"deform.enabled": False, ...}."""
     if record.method in _WITHOUT_PRIOR and is_floor(record):
-        return flat(record.config)
+        return _config(record)
     fit = json.dumps(record.prior.get("config"), sort_keys=True).encode()
     seen = record.prior.get("keypoints", "none")
-    return flat(record.config) | {
+    return _config(record) | {
         "--prior": record.prior.get("choice", record.prior.get("name")),
         "prior fit": hashlib.sha256(fit).hexdigest()[:4],
         **({"--use-keypoints": seen} if seen != "none" else {}),
     }
+
+
+def _config(record: RunRecord) -> dict[str, Any]:
+    """Flatten the method's settings; a program of others is told by its name, not by where its file lies."""
+    left_out = ("file", "program") if "program" in record.code else ()
+    return {name: value for name, value in flat(record.config).items() if name not in left_out}
 
 
 def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -210,7 +216,12 @@ def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _identity(record: RunRecord) -> str:
-    return json.dumps([record.method, _preset(record), _settings(record)], sort_keys=True)
+    return json.dumps([_method(record), _preset(record), _settings(record)], sort_keys=True)
+
+
+def _method(record: RunRecord) -> str:
+    """Return the method's name, with that of the program of others that it ran."""
+    return ": ".join(filter(None, (record.method, record.code.get("program"))))
 
 
 def _preset(record: RunRecord) -> str:
@@ -220,7 +231,7 @@ def _preset(record: RunRecord) -> str:
 
 def _label(record: RunRecord, others: Sequence[RunRecord]) -> str:
     """Name the method, its preset where there are several, and the settings and prior that tell it from the others."""
-    kin = [other for other in others if other.method == record.method]
+    kin = [other for other in others if _method(other) == _method(record)]
     peers = [_settings(other) for other in kin if _preset(other) == _preset(record)]
     preset = f" ({record.preset})" if len(set(map(_preset, kin))) > 1 else ""
     changed = []
@@ -232,4 +243,4 @@ def _label(record: RunRecord, others: Sequence[RunRecord]) -> str:
             changed.append(f"{name}={json.dumps(value)}")
         elif name == "--prior" and record.prior.get("choice", "template") != "template":
             changed.append(f"{name}={json.dumps(PurePath(value).name)}")
-    return record.method + preset + (f" [{', '.join(changed)}]" if changed else "")
+    return _method(record) + preset + (f" [{', '.join(changed)}]" if changed else "")

@@ -101,7 +101,8 @@ class Method(Protocol):
 
     `Config` is a frozen msgspec.Struct; its presets are TOML tables in baselines/presets/<name>.toml. A method that
     reads files beside the clip has ``inputs(config, case)`` too, a digest of them, so that other files are another run;
-    one that cannot run with every config has ``require(config, cases)``, which says so before anything is fitted.
+    one that cannot run with every config has ``require(config, cases)``, which says so before anything is fitted; one
+    that runs somebody else's program has ``describe(config)``, facts for the record (whose, licence, digests).
     """
 
     info: MethodInfo

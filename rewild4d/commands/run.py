@@ -31,7 +31,7 @@ class RunChoice:
     """Flags that only `run` has.
 
     Attributes:
-        method: which method (see `list`).
+        method: which method (see `list`), or a method file of somebody else's program, FILE.toml.
         dataset: which data set (see `list`).
         case: names or patterns of cases ("wolf/Run", "wolf/*"); all (of real videos: quadrupeds) where it is left out.
         protocol: what is held out and measured (see `list`); the data set's default where it is left out.
@@ -72,6 +72,7 @@ def main(arguments: list[str]) -> int:
         from rewild4d.commands import run_table
 
         return run_table.main(arguments)
+    arguments = _with_method_file(arguments)
     wanted = _peek(arguments, "--method") or Options.method
     preset = _peek(arguments, "--preset") or Options.preset
     options: Any = parse_flags(
@@ -125,6 +126,18 @@ def make_plan(options: Options, config: msgspec.Struct) -> Plan:
         prior=prior,
         **chosen,
     )
+
+
+def _with_method_file(arguments: list[str]) -> list[str]:
+    """Return the arguments with `--method external --file FILE.toml` for `--method FILE.toml`."""
+    named = _peek(arguments, "--method") or ""
+    if not named.endswith(".toml"):
+        return arguments
+    if f"--method={named}" in arguments:
+        at = arguments.index(f"--method={named}")
+        return [*arguments[:at], "--method", "external", "--file", named, *arguments[at + 1 :]]
+    at = arguments.index("--method")
+    return [*arguments[:at], "--method", "external", "--file", named, *arguments[at + 2 :]]
 
 
 def _peek(arguments: list[str], flag: str) -> str | None:

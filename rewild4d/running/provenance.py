@@ -1,12 +1,15 @@
 """Describe a run in its record: data, prior, inputs, marks and diagnostics."""
 
+import contextlib
 import json
 from typing import Any
 
 import msgspec
 
 from rewild4d.contracts import DatasetReader, Reconstruction
+from rewild4d.errors import UserError
 from rewild4d.evaluation.measuring import input_psnr
+from rewild4d.machine import code_of
 from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import STANDARD
 from rewild4d.registry import load_method
@@ -76,6 +79,15 @@ def inputs(method: str, config: msgspec.Struct, case: str) -> dict[str, str]:
     """Return the digest of files that a method reads besides its settings, if any."""
     asked = getattr(load_method(method), "inputs", None)
     return {"inputs": asked(config, case)} if asked else {}
+
+
+def code(method: str, config: msgspec.Struct) -> dict[str, str]:
+    """Return the versions of the code behind a run, and what a method that runs another program says of that."""
+    describe = getattr(load_method(method), "describe", None)
+    found: dict[str, str] = {}
+    with contextlib.suppress(UserError):  # of a file that went away; the record of that failure is written all the same
+        found = describe(config) if describe else {}
+    return found | code_of(method)
 
 
 def marks(method: str, prior: str, reconstruction: Reconstruction) -> list[str]:

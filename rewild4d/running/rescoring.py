@@ -82,7 +82,7 @@ def _scored(folder: Path, data: Path | None, device: torch.device, rasterizer: s
     renewed = msgspec.structs.replace(
         record, **fields, coverage=coverage(clip, truth), timing=_timing(record, spent, seconds),
         protocol={"digest": protocol.digest, **msgspec.to_builtins(protocol)},
-        code=code_of(record.method), machine=machine(device, rasterizer),
+        code=record.code | code_of(record.method), machine=machine(device, rasterizer),
     )  # fmt: skip
     return read_record(write_record(renewed, folder))
 

@@ -304,7 +304,8 @@ class Job:
                       **provenance.prior_of(case.prior if case else None),
                       **provenance.left_out(self.clip, case.clip if case else None)},
             "protocol": {"digest": plan.protocol.digest, **msgspec.to_builtins(plan.protocol)},
-            "code": code_of(self.entry.method), "machine": machine(plan.device, plan.rasterizer),
+            "code": provenance.code(self.entry.method, self.entry.config),
+            "machine": machine(plan.device, plan.rasterizer),
         }  # fmt: skip
         return RunRecord(**{**fields, **found})
 

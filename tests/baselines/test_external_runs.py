@@ -6,23 +6,18 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 import torch
 from artemis_animals import write_animal
-from external_program import CPU, UPPER, bodies, fit, settings
-from one_case import OneCase
+from external_program import CPU, UPPER, a_plan, bodies, fit, settings
 
 from rewild4d import cli
 from rewild4d.baselines.external import External, ExternalConfig
 from rewild4d.baselines.external_folder import crop_box, program_digest, write_clip
 from rewild4d.errors import UserError
-from rewild4d.evaluation.protocol import find_protocol
 from rewild4d.leaderboard.tables import standings
-from rewild4d.priors.choose import PriorChoice
-from rewild4d.priors.config import STANDARD
-from rewild4d.priors.io import load_prior, save_prior
+from rewild4d.priors.io import load_prior
 from rewild4d.running import runner
 from rewild4d.running.conformance import tiny_case
 from rewild4d.types import Case
@@ -39,17 +34,6 @@ FAILURES = {
     "cut": r"frame_0000.ply: expected 4000 rows of 'vertex', but the file ends before",
     "huge": r"frame_0000.ply: expected scales \(.*\) of at most 1e\+06, got 1.65e\+38 in vertex 0",
 }
-
-
-def a_plan(case: Case, tmp_path: Path, *configs: ExternalConfig) -> runner.Plan:
-    """Runs on the tiny case with its own prior, scored by two quick scores."""
-    save_prior(case.prior, tmp_path / "prior.npz")
-    protocol = msgspec.structs.replace(find_protocol("artemis", None), scores=("psnr", "iou"))
-    return runner.Plan(
-        dataset="artemis", reader=OneCase(case), root=tmp_path, cases=(case.clip.name,), protocol=protocol,
-        entries=tuple(runner.Entry("external", "default", config, (7,)) for config in configs),
-        prior=PriorChoice(str(tmp_path / "prior.npz"), STANDARD), device=CPU, out=tmp_path / "runs",
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize("what", FAILURES)

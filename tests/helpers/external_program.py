@@ -6,13 +6,20 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import torch
+from one_case import OneCase
 from torch import Tensor
 
 from rewild4d.baselines.external import External, ExternalConfig, ExternalReconstruction
 from rewild4d.cameras.rendering import render
+from rewild4d.evaluation.protocol import find_protocol
 from rewild4d.io.meshes import Mesh, discs
+from rewild4d.priors.choose import PriorChoice
+from rewild4d.priors.config import STANDARD
+from rewild4d.priors.io import save_prior
 from rewild4d.priors.motion import pose_at
+from rewild4d.running import runner
 from rewild4d.transforms import skin_points
 from rewild4d.types import Case
 
@@ -69,3 +76,14 @@ def psnr(found: ExternalReconstruction, case: Case, held_out: bool = False) -> f
         color, alpha = render(found.at(frame.time), frame.camera)
         values.append(-10 * math.log10(float((color + 1 - alpha - frame.over(1.0)).square().mean())))
     return sum(values) / len(values)
+
+
+def a_plan(case: Case, tmp_path: Path, *configs: ExternalConfig) -> runner.Plan:
+    """Runs on the tiny case with its own prior, scored by two quick scores."""
+    save_prior(case.prior, tmp_path / "prior.npz")
+    protocol = msgspec.structs.replace(find_protocol("artemis", None), scores=("psnr", "iou"))
+    return runner.Plan(
+        dataset="artemis", reader=OneCase(case), root=tmp_path, cases=(case.clip.name,), protocol=protocol,
+        entries=tuple(runner.Entry("external", "default", config, (7,)) for config in configs),
+        prior=PriorChoice(str(tmp_path / "prior.npz"), STANDARD), device=CPU, out=tmp_path / "runs",
+    )  # fmt: skip
