@@ -22,6 +22,7 @@ COMMANDS = {
     "view": ("view", "look at runs in the browser, from any side at any time"),
     "report": ("report", "write one HTML page of a run, with a player of its Gaussians"),
     "score": ("score", "score two folders of images or clips, or two .ply files, without our methods"),
+    "definitions": ("definitions", "score a saved run by the definitions of several papers"),
     "table": ("table", "print a table of what was found"),
     "leaderboard": ("leaderboard", "make a static page of what was found"),
     "list": ("overview", "methods, data sets, protocols, presets and tables"),
