@@ -29,9 +29,11 @@ DIGITS = {
     "kid_v": 4,
     "fvd_f": 1,
     "fvd_diag": 1,
+    "half sides/step": 4,
+    "sides/s²": 1,
 }
 """Printed after the point, by the score's name or unit; three for all others."""
-LESS_IS_BETTER = ("lpips", "chamfer", "kid", "fvd", "kvd")
+LESS_IS_BETTER = ("lpips", "chamfer", "kid", "fvd", "kvd", "mpjve", "accel")
 """Beginnings of such scores' names; asked only where no record says it."""
 
 

@@ -115,6 +115,9 @@ PICTURES = {
 }
 """Scores of images."""
 
+NAMES = (*TRANSFER, *PICTURES, *(f"{name}_{source}" for source in KEYPOINT_SOURCES for name in KEYPOINTS))
+"""Every full name."""
+
 
 def definition(name: str) -> Definition:
     """Return the definition behind a score's name.

@@ -2,10 +2,13 @@
 
 The name of an image score is a metric and a region: "psnr", "ssim_fg", "lpips_alex_crop"; without a region it covers
 the full frame; "_rigid" behind it says that a rigid motion laid the reconstruction on the true shape first. The name of
-a geometry score is a quantity, an alignment, a sampling of the prediction and a number of points.
+a geometry score is a quantity, an alignment, a sampling of the prediction and a number of points. What other papers
+define otherwise has a name of its own (`metrics.definitions`): "psnr_black", "pck@0.1_mask_area_bones".
 """
 
 from typing import Literal
+
+from rewild4d.metrics.definitions import NAMES as DEFINED
 
 REGIONS = ("full", "fg", "union", "crop")
 COLOR_METRICS = {
@@ -45,7 +48,10 @@ KINDS = {
 """Kind of sets -> its scores, in the order of `metrics.sets.distances`, and the title of each distance."""
 SETS = tuple(name for scores in KINDS.values() for name in scores)
 
-ALL = (*HELD_OUT, SCALE, *GEOMETRY, *SETS)
+FILM = tuple(name for name in DEFINED if name not in IMAGES)
+"""Scores of a film as other papers define them (`metrics.definitions`)."""
+
+ALL = (*HELD_OUT, SCALE, *GEOMETRY, *SETS, *FILM)
 
 
 def split_name(name: str) -> tuple[str, str]:

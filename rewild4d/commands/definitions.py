@@ -97,26 +97,31 @@ def _scored(options: Options) -> tuple[dict[str, Score], list[Table]]:
 
 
 def _frames(run: OpenedRun, which: str) -> list[Frame]:
-    """Return the frames to score in the order of time; a video's clip holds its held-out frames too."""
+    """Return the frames to score in the order of time, each once."""
     held_out = list(run.truth.held_out)
-    if which == "held-out":
-        if not held_out:
-            raise UserError(f"{run.folder}: expected held-out frames, its protocol has none: leave --frames out.")
-        return held_out
-    filmed = all(frame.crop is not None for frame in run.clip.frames)
-    return sorted([*run.clip.frames, *([] if filmed else held_out)], key=lambda frame: (frame.time, frame.view))
+    if which == "held-out" and not held_out:
+        raise UserError(f"{run.folder}: expected held-out frames, its protocol has none: leave --frames out.")
+    chosen = held_out if which == "held-out" else [*run.clip.frames, *held_out]
+    return [frame for _, frame in sorted({(frame.time, frame.view): frame for frame in chosen}.items())]
+
+
+def _shown(run: OpenedRun, frames: Sequence[Frame]) -> int:
+    """Return how many of the frames the method was shown: the opened clip of a video holds its held-out frames too."""
+    held_out = len(run.truth.held_out)
+    merged = all(frame.crop is not None for frame in run.clip.frames)
+    shown = len(run.clip.frames) - (held_out if merged else 0)
+    everything = len({(frame.time, frame.view) for frame in [*run.clip.frames, *run.truth.held_out]})
+    return shown if len(frames) == everything else shown + held_out - everything
 
 
 def _remarks(run: OpenedRun, frames: Sequence[Frame]) -> list[str]:
-    held_out = {(frame.time, frame.view) for frame in run.truth.held_out}
-    count = sum((frame.time, frame.view) in held_out for frame in frames)
     sizes = sorted({f"{frame.mask.shape[2]}x{frame.mask.shape[1]}" for frame in frames})
     filmed = all(frame.crop is not None for frame in frames)
     cut = (
         "squares that follow the animal, where papers may score whole frames" if filmed else "as the protocol has them"
     )
     return [
-        f"{len(frames)} frames of {' and '.join(sizes)} pixels, {cut}; {len(frames) - count} were shown to the method.",
+        f"{len(frames)} frames of {' and '.join(sizes)} pixels, {cut}; {_shown(run, frames)} were shown to the method.",
         f"Data as protocol {run.record.protocol['name']} reads them. PCK, KT, IoU and SSIM are shares, which papers "
         "may print times 100.",
     ]

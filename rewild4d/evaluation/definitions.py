@@ -28,8 +28,10 @@ from rewild4d.evaluation.film_pictures import Drawn, score_pictures
 from rewild4d.evaluation.joints import NotThere, joint_tracks, point_tracks
 from rewild4d.evaluation.networks import Networks
 from rewild4d.leaderboard.layout import Cell, Column, Row, Table
-from rewild4d.metrics.definitions import KEYPOINT_SOURCES, KEYPOINTS, TRANSFER, definition
+from rewild4d.metrics.definitions import KEYPOINT_SOURCES, KEYPOINTS, PICTURES, TRANSFER, definition
 from rewild4d.metrics.score import Score
+from rewild4d.priors.landmarks import load_mapping
+from rewild4d.registry import load_dataset
 from rewild4d.types import Frame
 
 Scores = dict[str, Score]
@@ -76,6 +78,34 @@ PICTURE_LINES = (
 )
 SOURCES = {"bones": "bones", "map_other_half": "map, other half", "map_test_frames": "map, TEST frames"}
 """Short words for the sources of keypoints."""
+
+
+def film_scores(
+    reconstruction: Reconstruction,
+    frames: Sequence[Frame],
+    dataset: str,
+    networks: Networks,
+    log: Log,
+    asked: Sequence[str],
+) -> Scores:
+    """Compute the scores of `metrics.names.FILM` that a protocol asks for.
+
+    Args:
+        reconstruction: of the film.
+        frames: that are scored, in any order.
+        dataset: whose reader says which keypoint is which landmark.
+        networks: of LPIPS.
+        log: progress.
+        asked: names.
+    """
+    scores: Scores = {}
+    if any(name not in PICTURES for name in asked):
+        ordered = sorted(frames, key=lambda frame: (frame.time, frame.view))
+        mapping = getattr(load_dataset(dataset), "keypoint_mapping", None)
+        scores |= joint_scores(reconstruction, ordered, load_mapping(mapping) if mapping else {})
+    if any(name in PICTURES for name in asked):
+        scores |= picture_scores(reconstruction, frames, networks, log)
+    return {name: scores[name] for name in asked}
 
 
 def joint_scores(reconstruction: Reconstruction, frames: Sequence[Frame], mapping: Mapping[str, str]) -> Scores:

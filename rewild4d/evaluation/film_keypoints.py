@@ -104,7 +104,7 @@ def annotated(frames: Sequence[Frame], known: Sequence[str] | None = None) -> An
     first = next((frame.keypoints for frame in frames if frame.keypoints is not None), None)
     if first is None:
         return None
-    names = tuple(known or first.names)
+    names = tuple(first.names if known is None else known)
     sizes = {tuple(frame.mask.shape[1:]) for frame in frames}
     (height, width), *others = sizes
     if others or height != width:

@@ -75,18 +75,17 @@ class Drawn:
 
 @dataclass
 class _Found:
-    """Values of each frame, and sums over all."""
+    """Values of each frame (None where it has none, such as an empty mask), and sums over all."""
 
-    values: dict[str, list[float]] = field(default_factory=dict)
+    values: dict[str, list[float | None]] = field(default_factory=dict)
     overlaps: list[Tally] = field(default_factory=list)
     squares: float = 0.0
     adjusted: Tensor = field(default_factory=lambda: torch.zeros(len(brightness_factors()), dtype=torch.float64))
     count: int = 0
 
     def add(self, name: str, value: float | None) -> None:
-        """Keep one frame's value; a frame without one (an empty mask) is left out."""
-        if value is not None and not math.isnan(value):
-            self.values.setdefault(name, []).append(value)
+        """Keep one frame's value; a NaN is none."""
+        self.values.setdefault(name, []).append(None if value is None or math.isnan(value) else value)
 
 
 def score_pictures(
@@ -146,8 +145,8 @@ def _sums(frame: Drawn, lpips: Mapping[str, LpipsNetwork], found: _Found) -> Non
 def _adjusted(frame: Drawn, factor: float, lpips: Mapping[str, LpipsNetwork], found: _Found) -> None:
     """Add what 4DEquine scores after the brightness of the whole sequence is chosen."""
     prediction, target = brightened(frame.drawn_on(1.0), factor), frame.true_cut(frame.mask >= HALF, 1.0)
-    if min(target.shape[2:]) >= WINDOW:
-        found.add("ssim_brightness", float(ssim(prediction, target)[0]))
+    fits = min(target.shape[2:]) >= WINDOW
+    found.add("ssim_brightness", float(ssim(prediction, target)[0]) if fits else None)
     _unscaled("lpips_alex_unscaled_brightness", prediction, target, lpips, found)
 
 
@@ -159,15 +158,17 @@ def _learned(
     name: str, network: str, prediction: Tensor, target: Tensor, lpips: Mapping[str, LpipsNetwork], found: _Found
 ) -> None:
     least = {"lpips_alex": 31, "lpips_vgg": 16}[network]
-    if network in lpips and min(target.shape[2:]) >= least:
-        found.add(name, float(lpips[network](prediction, target)[0]))
+    if network in lpips:
+        fits = min(target.shape[2:]) >= least
+        found.add(name, float(lpips[network](prediction, target)[0]) if fits else None)
 
 
 def _score(name: str, found: _Found, factor: float, missing: Mapping[str, str]) -> Score:
     """Return the score of all frames, or why there is none."""
     defined = PICTURES[name]
     worst = name.removesuffix("_worst5")
-    values = found.values.get(worst, [])
+    items = found.values.get(worst, [])
+    values = [item for item in items if item is not None]
     value: float | None = float(np.mean(values)) if values else None
     count, note, reason = len(values), "", "no frame in which it is defined"
     family = next((family for family in missing if name.startswith(family.replace("-", "_"))), None)
@@ -188,4 +189,4 @@ def _score(name: str, found: _Found, factor: float, missing: Mapping[str, str]) 
         note = f"brightness × {factor:.4f}"
     if value is None:
         return Score(None, defined.unit, defined.better, 0, note=f"not computed: {reason}")
-    return Score(value, defined.unit, defined.better, count, list(values) if worst == name else [], note)
+    return Score(value, defined.unit, defined.better, count, list(items) if worst == name else [], note)

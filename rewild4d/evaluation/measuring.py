@@ -13,7 +13,7 @@ from rewild4d.cameras.placement import IDENTITY, Placement
 from rewild4d.cameras.rendering import render
 from rewild4d.contracts import Clouds, HeldOut, Log, NotComputed, Reconstruction
 from rewild4d.errors import UserError
-from rewild4d.evaluation import geometry_scores, image_scores, novel_views, placing
+from rewild4d.evaluation import definitions, geometry_scores, image_scores, novel_views, placing
 from rewild4d.evaluation.networks import Networks, families_of, family_of, load_networks
 from rewild4d.evaluation.plugged import Source, score_plugged
 from rewild4d.evaluation.protocol import Protocol
@@ -83,6 +83,9 @@ def evaluate(
     measured, items = _score_images(reconstruction, truth, protocol, networks, log, drawn)
     scores |= measured
     alignments += placed.alignments
+    film = [name for name in protocol.scores if name in names.FILM]
+    if film:
+        scores |= definitions.film_scores(reconstruction, truth.held_out, protocol.dataset, networks, log, film)
     sets = [name for name in protocol.scores if name in names.SETS]
     distances: list[Distance] = []
     compared: list[Compared] = []

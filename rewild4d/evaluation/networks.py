@@ -74,6 +74,8 @@ def family_of(score: str) -> str:
     """Return the family of an image score or of a score of sets, such as "lpips-alex" or "kid"."""
     if score in names.SETS:
         return "kid" if score == "kid_v" else "fvd"
+    if score in names.FILM and score.startswith("lpips_"):
+        return "-".join(score.split("_")[:2])
     metric, _ = names.split_name(score)
     return "silhouette" if metric in names.SILHOUETTES else metric.replace("_", "-")
 
