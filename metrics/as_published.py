@@ -7,7 +7,9 @@ import math
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
+from rewild4d.metrics.image import WINDOW, ssim
 from rewild4d.metrics.tallies import Floats, Tally
 
 SMOOTH = 1e-6
@@ -88,6 +90,21 @@ def pooled_psnr(squares: float, count: int) -> float:
         20.0
     """
     return 10 * math.log10(count / squares)
+
+
+def ssim_reflected(prediction: Tensor, target: Tensor) -> Tensor:
+    """Compute `image.ssim` over every pixel, the border continued by its reflection, [B, 3, H, W] -> float64, [B].
+
+    So torchmetrics' StructuralSimilarityIndexMeasure (1.9.0) has it, which 4DEquine uses; `image.ssim` takes the mean
+    over the windows that lie inside of the image, so that a plain border counts less.
+
+    Examples:
+        >>> black, white = torch.zeros(1, 3, 16, 16), torch.ones(1, 3, 16, 16)
+        >>> ssim_reflected(white, white).tolist(), ssim_reflected(black, white).round(decimals=4).tolist()
+        ([1.0], [0.0001])
+    """
+    half = WINDOW // 2
+    return ssim(*(pad(images, (half, half, half, half), mode="reflect") for images in (prediction, target)))
 
 
 def brightness_factors() -> Tensor:

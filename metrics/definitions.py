@@ -73,6 +73,7 @@ TRANSFER = {
 }
 
 _ADJUSTED = "of 100 brightness factors in [0, 2] on the rendered pixels the one of the best pooled PSNR"
+_REFLECTED = "on white, border pixels too, with reflected surroundings"
 _UNSCALED = "LPIPS on AlexNet fed [0, 1], where it expects [-1, 1]"
 
 PICTURES = {
@@ -103,7 +104,8 @@ PICTURES = {
         "PSNR", "dB", "higher", f"PSNR: of all frames' mean squared error, on white, {_ADJUSTED}", EQUINE_LOOKS
     ),
     "ssim": Definition("SSIM", "1", "higher", "SSIM: whole image on white, mean over frames", OURS),
-    "ssim_brightness": Definition("SSIM", "1", "higher", f"SSIM: on white, {_ADJUSTED}", EQUINE_LOOKS),
+    "ssim_reflected": Definition("SSIM", "1", "higher", f"SSIM: {_REFLECTED}", EQUINE_LOOKS),
+    "ssim_reflected_brightness": Definition("SSIM", "1", "higher", f"SSIM: {_REFLECTED}, {_ADJUSTED}", EQUINE_LOOKS),
     "lpips_alex": Definition("LPIPS", "1", "lower", "LPIPS: AlexNet, whole image on white, mean over frames", OURS),
     "lpips_vgg_black": Definition(
         "LPIPS", "1", "lower", "LPIPS: VGG, whole image at 256 pixels on black, mean over frames", AVATARS

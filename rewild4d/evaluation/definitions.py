@@ -72,9 +72,9 @@ PICTURE_LINES = (
     Line("4D-Animal", (*_AVATARS, "iou@0.7_worst5", "psnr_black_worst5")),
     Line(
         "4DEquine, appearance",
-        ("psnr_pooled_white_brightness", "ssim_brightness", "lpips_alex_unscaled_brightness"),
+        ("psnr_pooled_white_brightness", "ssim_reflected_brightness", "lpips_alex_unscaled_brightness"),
     ),
-    Line("the same, brightness as drawn", ("psnr_pooled_white", "lpips_alex_unscaled")),
+    Line("the same, brightness as drawn", ("psnr_pooled_white", "ssim_reflected", "lpips_alex_unscaled")),
 )
 SOURCES = {"bones": "bones", "map_other_half": "map, other half", "map_test_frames": "map, TEST frames"}
 """Short words for the sources of keypoints."""

@@ -23,9 +23,10 @@ from rewild4d.metrics.as_published import (
     pooled_psnr,
     psnr_of_rmse,
     smoothed_iou,
+    ssim_reflected,
 )
 from rewild4d.metrics.definitions import PICTURES
-from rewild4d.metrics.image import WINDOW, ssim
+from rewild4d.metrics.image import WINDOW
 from rewild4d.metrics.score import Score
 from rewild4d.metrics.tallies import Tally, worst_mean
 
@@ -139,15 +140,20 @@ def _sums(frame: Drawn, lpips: Mapping[str, LpipsNetwork], found: _Found) -> Non
     found.squares += float((prediction - target).double().square().sum())
     found.adjusted += brightness_errors(prediction, target)
     found.count += target.numel()
+    _reflected("ssim_reflected", prediction, target, found)
     _unscaled("lpips_alex_unscaled", prediction, target, lpips, found)
 
 
 def _adjusted(frame: Drawn, factor: float, lpips: Mapping[str, LpipsNetwork], found: _Found) -> None:
     """Add what 4DEquine scores after the brightness of the whole sequence is chosen."""
     prediction, target = brightened(frame.drawn_on(1.0), factor), frame.true_cut(frame.mask >= HALF, 1.0)
-    fits = min(target.shape[2:]) >= WINDOW
-    found.add("ssim_brightness", float(ssim(prediction, target)[0]) if fits else None)
+    _reflected("ssim_reflected_brightness", prediction, target, found)
     _unscaled("lpips_alex_unscaled_brightness", prediction, target, lpips, found)
+
+
+def _reflected(name: str, prediction: Tensor, target: Tensor, found: _Found) -> None:
+    fits = min(target.shape[2:]) >= WINDOW
+    found.add(name, float(ssim_reflected(prediction, target)[0]) if fits else None)
 
 
 def _unscaled(name: str, prediction: Tensor, target: Tensor, lpips: Mapping[str, LpipsNetwork], found: _Found) -> None:

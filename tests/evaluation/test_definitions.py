@@ -181,7 +181,7 @@ def test_the_search_for_a_brightness_hides_an_error_of_exposure() -> None:
     plain, searched = (found[f"psnr_pooled_white{end}"].value or 0 for end in ("", "_brightness"))
     assert searched > plain + 20  # 0.4 x 1.2525 is 0.501
     assert found["psnr_pooled_white_brightness"].note == f"brightness × {124 / 99 * 1:.4f}"
-    assert (found["ssim_brightness"].value or 0) > (found["ssim"].value or 0)
+    assert (found["ssim_reflected_brightness"].value or 0) > (found["ssim_reflected"].value or 0)
     # half of the scale is a quarter of a squared error
     assert found["lpips_alex_unscaled"].value == pytest.approx((found["lpips_alex"].value or 0) / 4)
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from skimage.metrics import peak_signal_noise_ratio
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from rewild4d.metrics.as_published import (
     brightened,
@@ -16,10 +16,10 @@ from rewild4d.metrics.as_published import (
     pooled_psnr,
     psnr_of_rmse,
     smoothed_iou,
+    ssim_reflected,
 )
-from rewild4d.metrics.image import psnr
+from rewild4d.metrics.image import psnr, ssim
 from rewild4d.metrics.silhouette import mask_iou
-
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -76,6 +76,17 @@ def test_the_psnr_of_a_sequence_equals_scikit_image_on_its_frames_together() -> 
     wanted = peak_signal_noise_ratio(target.double().numpy(), prediction.double().numpy(), data_range=1)
     assert pooled_psnr(squares, target.numel()) == pytest.approx(wanted, abs=1e-6)
     assert pooled_psnr(squares, target.numel()) <= float(psnr(prediction, target).mean())
+
+
+def test_ssim_with_reflected_borders_equals_scikit_image_on_continued_images() -> None:
+    prediction, target = images(side=20)
+    for a, b in zip(prediction, target, strict=True):
+        padded = (np.pad(x.double().numpy(), ((0, 0), (5, 5), (5, 5)), mode="reflect") for x in (a, b))
+        wanted = structural_similarity(
+            *padded, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=0
+        )
+        assert float(ssim_reflected(a[None], b[None])) == pytest.approx(wanted, abs=1e-9)
+        assert abs(float(ssim(a[None], b[None])) - wanted) > 0.001  # another number than that of the windows inside
 
 
 def test_brightness_is_a_factor_that_leaves_white_and_stops_at_one() -> None:
