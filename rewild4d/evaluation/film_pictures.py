@@ -28,7 +28,7 @@ from rewild4d.metrics.as_published import (
 from rewild4d.metrics.definitions import PICTURES
 from rewild4d.metrics.image import WINDOW
 from rewild4d.metrics.score import Score
-from rewild4d.metrics.tallies import Tally, worst_mean
+from rewild4d.metrics.tallies import WORST, Tally, worst_mean
 
 SMALL = 256
 """Longer side of the pictures of Animal Avatars and 4D-Animal; smaller ones stay as they are."""
@@ -181,7 +181,7 @@ def _score(name: str, found: _Found, factor: float, missing: Mapping[str, str]) 
     if family is not None:
         reason = missing[family]
     if worst != name:
-        value = worst_mean(values, defined.better)
+        value, count = worst_mean(values, defined.better), int(WORST * len(values))
         reason = f"5 % of {len(values)} frames is no frame, it takes 20"
     elif name == "iou_pooled":
         tally = sum(found.overlaps[1:], found.overlaps[0]) if found.overlaps else Tally(np.zeros(0), np.zeros(0, int))

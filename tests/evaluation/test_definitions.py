@@ -158,7 +158,9 @@ def drawn(error: float, shift: int, side: int = 32) -> Drawn:
 
 def test_images_of_a_square_have_the_numbers_of_arithmetic() -> None:
     frames = [drawn(0.1, 0), *[drawn(0.1, 4)] * 20]
-    scores = {name: score.value for name, score in score_pictures(frames, LPIPS, {}, silent).items()}
+    found = score_pictures(frames, LPIPS, {}, silent)
+    scores = {name: score.value for name, score in found.items()}
+    assert (found["psnr_black"].count, found["psnr_black_worst5"].count) == (21, 1)
     assert scores["iou"] == pytest.approx((1 + 20 * 12 / 20) / 21)
     assert scores["iou@0.7"] == pytest.approx(scores["iou"], abs=1e-6)
     assert scores["iou_pooled"] == pytest.approx((16 + 20 * 12) / (16 + 20 * 20))
