@@ -145,8 +145,8 @@ class Selection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Which frames a method gets and which are held out, and at what size: the data part of a protocol.
 
     Attributes:
-        cameras: "fixed" (one camera), "sweep" (the camera index advances per frame), "random" (a seeded one a frame) or
-            "unknown" (a video, of whose camera nothing is known).
+        cameras: "fixed" (one camera), "sweep" (the camera index advances per frame), "random" (a seeded one a frame),
+            "unknown" (a video, of whose camera nothing is known) or "known" (a video with a camera for each frame).
         size: longest image side in pixels.
         framing: "full" keeps the frame's aspect, "letterbox" pads it to a square, "crop" takes one square window that
             holds the animal in every selected image of a view; of a video, a smoothly moving square around the animal.
@@ -154,17 +154,31 @@ class Selection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         step: for "sweep": camera indices advanced per frame.
         stride: keep every stride-th frame of the motion.
         seed: of "random".
-        split: for "unknown": every split-th usable frame is held out.
+        split: of a video: every split-th usable frame is held out; or two numbers, of which the first says how many
+            frames are shown and the second how many after them are held out, again and again. (1, 0) shows every frame
+            and scores it too.
+        frames: of a video: the most that are used, from its start.
+        mask_threshold: of a video: a mask is solid above this, in [0, 1], and empty elsewhere; None leaves it soft.
     """
 
-    cameras: Literal["fixed", "sweep", "random", "unknown"]
+    cameras: Literal["fixed", "sweep", "random", "unknown", "known"]
     size: int
     framing: Literal["full", "letterbox", "crop"] = "full"
     placements: tuple[Literal["side", "oblique", "frontal"], ...] = ()
     step: int = 1
     stride: int = 1
     seed: int = 0
-    split: int | None = None
+    split: int | tuple[int, int] | None = None
+    frames: int | None = None
+    mask_threshold: float | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.split, tuple) and (self.split[0] < 1 or self.split[1] < 0):
+            raise ValueError("'split' needs at least one shown frame and no negative number")
+        if self.mask_threshold is not None and not 0 <= self.mask_threshold < 1:
+            raise ValueError("'mask_threshold' is at least 0 and below 1")
+        if self.frames is not None and self.frames < 1:
+            raise ValueError("'frames' is at least 1")
 
 
 @dataclass(frozen=True)
@@ -200,9 +214,9 @@ class DatasetReader(Protocol):
     """Reads one dataset folder into clips and truths.
 
     It may have more: ``title``, what `list` says of it; ``originals(case, selection)``, the whole frames that the
-    images of the clip and of the truth were cut from, in the order of time, uint8 [h, w, 3] each, one after the other;
-    for pictures of a finished run, never for a method; ``default_cases(selection)``, what is run where no case is
-    named; ``settings``, options for the record.
+    images of the clip and of the truth were cut from, in the order of time, uint8 [h, w, 3] each, one after the other,
+    or None where the data set lacks them; for pictures of a finished run, never for a method;
+    ``default_cases(selection)``, what is run where no case is named; ``settings``, options for the record.
     """
 
     licence: str

@@ -43,12 +43,16 @@ DATASETS = {
     "davis": "rewild4d.datasets.video.davis:Davis",
     "aptv2": "rewild4d.datasets.video.aptv2:AptV2",
     "online": "rewild4d.datasets.video.online:Online",
+    "aim": "rewild4d.datasets.aim.reader:Aim",
+    "cop3d": "rewild4d.datasets.cop3d.reader:Cop3d",
 }
 TITLES = {
     "artemis": "Artemis / DFA folders: one animal, or a folder of animals",
     "davis": "DAVIS 2016 and 2017: real videos with true masks",
     "aptv2": "APTv2 and APT-36K: short real clips with keypoints",
     "online": "A person's own video, with masks",
+    "aim": "Animal-in-Motion (AiM): crops of 23 species out of films, with masks and predicted keypoints",
+    "cop3d": "CoP3D: films of cats and dogs with cameras and soft masks",
 }
 """What our data sets are: the first line of each reader's docstring, readable without importing it."""
 BUILTIN = {"artemis": "rewild4d.datasets.builtin.synthetic:ensure"}

@@ -110,11 +110,14 @@ class Keypoints:
         names: of the points.
         points: (column, row) in the image's pixels, pixel centres at +0.5; meaningless where not visible, [n, 2].
         visible: which of them were annotated, bool, [n].
+        confidence: where a network placed them and not a person: its score of each, in [0, 1], float32, [n]; all points
+            have a meaning then.
     """
 
     names: tuple[str, ...]
     points: Tensor
     visible: Tensor
+    confidence: Tensor | None = None
 
 
 @dataclass(frozen=True)

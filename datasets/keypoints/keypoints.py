@@ -1,6 +1,7 @@
 """Named points that people annotated: BADJA's joints on DAVIS, and COCO-like ones as in APTv2 and APT-36K."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -53,11 +54,13 @@ def badja_joints(entry: Entry) -> tuple[str, list[tuple[float, float]], list[boo
     return Path(path).stem, [(column + 0.5, row + 0.5) for row, column in places], [bool(value) for value in visible]
 
 
-def bounded(names: Sequence[str], points: Tensor, seen: Tensor, size: tuple[int, int]) -> Keypoints:
+def bounded(
+    names: Sequence[str], points: Tensor, seen: Tensor, size: tuple[int, int], confidence: Tensor | None = None
+) -> Keypoints:
     """Return keypoints [n, 2] (column, row), of which those outside their frame (width, height) are not visible."""
     seen = seen & inside(points, size)
     # what is not finite would spread through arithmetic that weighs it with zero
-    return Keypoints(tuple(names), torch.where(torch.isfinite(points), points, -1.0), seen)
+    return Keypoints(tuple(names), torch.where(torch.isfinite(points), points, -1.0), seen, confidence)
 
 
 def inside(points: Tensor, size: tuple[int, int]) -> Tensor:
@@ -115,4 +118,4 @@ def coco_keypoints(values: Sequence[float], names: Sequence[str], size: tuple[in
 
 def in_crop(keypoints: Keypoints | None, crop: Crop, size: int) -> Keypoints | None:
     """Return the same points in the pixels of a crop."""
-    return keypoints and Keypoints(keypoints.names, crop.from_original(keypoints.points, size), keypoints.visible)
+    return keypoints and replace(keypoints, points=crop.from_original(keypoints.points, size))

@@ -60,20 +60,27 @@ def check_video(video: Video, sheets: Path | None) -> list[Finding]:
     if troubles[_SECOND] or troubles[_TWO]:
         told = "where other parts are not the animal, --parts main keeps to its own (see the contact sheet)"
         findings.append(Finding("warning", video.name, told))
-    try:
-        layout = lay_out(video, facts, SPLIT)
-        findings += [Finding("warning", video.name, note) for note in layout.notes]
-        train = layout.tested.count(False)
-        said = f"{count} frames of {video.size[0]}x{video.size[1]} at {video.fps:.4g} a second: {train} to learn from, "
-        findings.append(Finding("ok", video.name, f"{said}{len(layout.used) - train} to test"))
-    except UserError as error:
-        findings.append(finding_of(error))
+    findings += _usable(video, facts)
     if sheets is not None:
         marked = {index for indices in troubles.values() for index in indices}
         path = sheets / f"{video.name.replace('/', '__')}.png"
         _save(path, contact_sheet(tiles, [moment.label for moment in video.moments], marked))
         findings.append(Finding("ok", video.name, f"contact sheet: {path}"))
     return findings
+
+
+def _usable(video: Video, facts: Sequence[MaskFacts | None]) -> list[Finding]:
+    """Return how many frames there are and, where they are chosen here, how many to learn from and to test."""
+    said = f"{len(video.moments)} frames of {video.size[0]}x{video.size[1]} at {video.fps:.4g} a second"
+    if video.is_placed:
+        return [Finding("ok", video.name, said)]
+    try:
+        layout = lay_out(video, facts, SPLIT)
+    except UserError as error:
+        return [finding_of(error)]
+    train = layout.tested.count(False)
+    told = Finding("ok", video.name, f"{said}: {train} to learn from, {len(layout.used) - train} to test")
+    return [*(Finding("warning", video.name, note) for note in layout.notes), told]
 
 
 def finding_of(error: UserError) -> Finding:

@@ -56,8 +56,11 @@ class VideoDataset(ABC):
         """Decode one case; its errors are those of `video`."""
         return split_video(self.video(case), selection)
 
-    def originals(self, case: str, selection: Selection) -> Iterator[np.ndarray]:
-        """Return the whole frames behind the images of a clip, uint8 [h, w, 3]; its errors are those of `video`."""
+    def originals(self, case: str, selection: Selection) -> Iterator[np.ndarray] | None:
+        """Return the whole frames behind the images of a clip, uint8 [h, w, 3]; its errors are those of `video`.
+
+        None where the data set lacks them.
+        """
         return original_images(self.video(case), selection)
 
     def judge_masks(self, case: str) -> Verdict:

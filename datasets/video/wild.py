@@ -17,11 +17,12 @@ from rewild4d.contracts import Selection
 from rewild4d.datasets.keypoints.keypoints import in_crop
 from rewild4d.datasets.masking.facts import MaskFacts, mask_facts
 from rewild4d.datasets.video.crops import cut, follow, lost_share
+from rewild4d.datasets.video.splits import scores_shown, split_frames
 from rewild4d.datasets.video.travel import TravelMeter
 from rewild4d.errors import UserError
 from rewild4d.files import atomic, cache_folder, digest, file_state, write_text
 from rewild4d.foreign.texts import read_json
-from rewild4d.types import Clip, Crop, Frame, Keypoints, Truth
+from rewild4d.types import Camera, Clip, Crop, Frame, Keypoints, Truth
 
 LEAST_FRAMES = 4
 """Usable frames without which nothing is reconstructed: three to learn from and one to test."""
@@ -44,11 +45,17 @@ class Moment:
         label: what a sentence calls it: a file's name or "frame 12".
         time: seconds from the start of the video.
         keypoints: annotated points in the original frame's pixels.
+        place: number among all frames of the video, missing ones too, where the data set counts them.
+        camera: world camera of the frame where the data set knows it.
+        crop: which square of an original frame it is, where the data set cut it.
     """
 
     label: str
     time: float
     keypoints: Keypoints | None = None
+    place: int = -1
+    camera: Camera | None = None
+    crop: Crop | None = None
 
 
 @dataclass(frozen=True)
@@ -85,6 +92,11 @@ class Video:
     notes: tuple[str, ...] = ()
     masks_without: Callable[[Collection[int]], Masks] | None = None
 
+    @property
+    def is_placed(self) -> bool:
+        """Whether the data set says where each frame is: its camera, or the crop that it is (`placed`)."""
+        return all(moment.camera is not None or moment.crop is not None for moment in self.moments)
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -119,14 +131,19 @@ def split_video(video: Video, selection: Selection) -> tuple[Clip, Truth]:
     Raises:
         UserError: too few usable frames, or files that cannot be read.
     """
-    if selection.framing != "crop" or selection.cameras != "unknown" or not selection.split or selection.split < 2:
+    split = selection.split
+    is_split = isinstance(split, tuple) or (split is not None and split >= 2)
+    if selection.framing != "crop" or selection.cameras != "unknown" or not is_split:
         raise UserError(
             f"{video.title}: expected a protocol for videos (cameras = 'unknown', framing = 'crop', split = 2 or more)."
         )
+    if selection.frames is not None or selection.mask_threshold is not None:
+        raise UserError(f"{video.title}: expected a protocol without 'frames' and 'mask_threshold', which cuts frames.")
     layout, folder = _laid_out(video, selection)
     rgba = np.load(folder / "rgba.npy", mmap_mode="r")
     shown = _Frames(video, layout, rgba, layout.shown)
-    hidden = _Frames(video, layout, rgba, [row for row, tested in enumerate(layout.tested) if tested])
+    held_out = [row for row, tested in enumerate(layout.tested) if tested]
+    hidden = _Frames(video, layout, rgba, layout.shown if scores_shown(split) else held_out)
     sides = torch.tensor([layout.crops[row].side for row in layout.shown[1:]])
     # in pixels of the crop that each step leads to
     travel = torch.tensor(layout.travel).reshape(-1, 2) * (selection.size / sides)[:, None]
@@ -162,10 +179,10 @@ def usable(
     twins = [i for i in used if seen[i].second > TWIN]
     twin_note = "with two parts of like size (two animals?) taken as one animal (--parts main takes one)"
     notes = (
-        _told(video, missing, "without a mask left out"),
-        _told(video, empty, "without the animal left out"),
-        _told(video, is_cut, cut_note),
-        _told(video, twins, twin_note),
+        told(video, missing, "without a mask left out"),
+        told(video, empty, "without the animal left out"),
+        told(video, is_cut, cut_note),
+        told(video, twins, twin_note),
     )
     if len(used) < least:
         reasons = [f"{len(missing)} have no mask" if missing else "", f"{len(empty)} an empty one" if empty else ""]
@@ -218,13 +235,13 @@ def _crops(
     return tuple(follow(times, [box for _, box in shown], [video.moments[i].time for i in used], video.size))
 
 
-def split_frames(count: int, split: int) -> list[bool]:
-    """Return which usable frames are held out: the middle one of every ``split``, never the first or the last."""
-    return [i % split == split // 2 and 0 < i < count - 1 for i in range(count)]
+def told(video: Video, indices: Sequence[int], what: str) -> str:
+    """Return a sentence about some frames of a video, "" about none."""
+    return listed([moment.label for moment in video.moments], indices, what)
 
 
-def _told(video: Video, indices: list[int], what: str) -> str:
-    """Return a sentence about some frames, with runs as ranges."""
+def listed(labels: Sequence[str], indices: Sequence[int], what: str) -> str:
+    """Return a sentence about some frames of so many labels, with runs as ranges; "" about none."""
     if not indices:
         return ""
     runs: list[list[int]] = []
@@ -233,11 +250,9 @@ def _told(video: Video, indices: list[int], what: str) -> str:
             runs[-1][1] = index
         else:
             runs.append([index, index])
-    labels = [
-        video.moments[a].label if a == b else f"{video.moments[a].label} to {video.moments[b].label}" for a, b in runs
-    ]
-    shown = ", ".join(labels[:6]) + (", ..." if len(labels) > 6 else "")
-    return f"{len(indices)} of {len(video.moments)} frames {what}: {shown}"
+    names = [labels[a] if a == b else f"{labels[a]} to {labels[b]}" for a, b in runs]
+    named = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
+    return f"{len(indices)} of {len(labels)} frames {what}: {named}"
 
 
 def _fill(video: Video, layout: Layout, size: int, folder: Path) -> None:
@@ -263,7 +278,7 @@ def _fill(video: Video, layout: Layout, size: int, folder: Path) -> None:
                 lost.append(index)
         if written < len(layout.used):
             raise UserError(f"{video.title}: expected {len(layout.used)} frames to cut, got {written}: it is cut off.")
-        note = _told(video, lost, f"held out reach over their crop with more than {LOST:.0%} of the animal")
+        note = told(video, lost, f"held out reach over their crop with more than {LOST:.0%} of the animal")
         notes, travel = (*layout.notes, note) if note else layout.notes, tuple(meter.result().tolist())
         write_text(folder / "layout.json", json.dumps(asdict(replace(layout, notes=notes, travel=travel))))
 

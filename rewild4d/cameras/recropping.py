@@ -56,7 +56,9 @@ def all_moments(clip: Clip, truth: Truth) -> Clip:
     """
     if any(frame.crop is None for frame in clip.frames):
         return clip
-    frames = sorted((*clip.frames, *truth.held_out), key=lambda frame: frame.time)
+    shown = {*clip.times}  # a protocol may score the frames that it shows
+    hidden = [frame for frame in truth.held_out if frame.time not in shown]
+    frames = sorted((*clip.frames, *hidden), key=lambda frame: frame.time)
     return replace(clip, frames=tuple(frames), travel=None)
 
 

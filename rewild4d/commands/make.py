@@ -1,8 +1,11 @@
-"""`make`: render a rigged, animated glTF, or random animals, as a data set with exact truth."""
+"""`make`: render a rigged, animated glTF, or random animals, as a data set with exact truth, or as other formats."""
 
 import re
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from rewild4d.commands.shared import call_subcommand
 from rewild4d.config import parse_flags
@@ -11,13 +14,20 @@ from rewild4d.errors import UserError
 LONGEST_SIDE = 8192
 """Longest side of an image, pixels."""
 USAGE = """usage: rewild4d-bench make artemis --rig FILE.glb --clip NAME --out DIR [--views 36] [--frames 24]
-       rewild4d-bench make zoo --seeds 0 1 2 --out DIR [--views 24] [--frames 24]"""
+       rewild4d-bench make zoo --seeds 0 1 2 --out DIR [--views 24] [--frames 24]
+       rewild4d-bench make aim --out DIR [--seeds 0 7] [--frames 24]
+       rewild4d-bench make cop3d --out DIR [--seeds 0 3] [--frames 24]"""
 DESCRIPTION = """Render a skinned, animated glTF from a ring of cameras and write it as an Artemis folder: images,
 mattes, cameras, bones and the voxel volume with its skinning weights."""
 ZOO_DESCRIPTION = """Render random animals, one a seed, as Artemis folders: twenty kinds (dogs, stags, elephants,
 crocodiles, ostriches, crows, ...) of random proportions, coats and motions, with exact truth. Seeds 0 to 99 are for
 development: choose settings on them. Seeds from 1000 on are the test set: score them once, at the end, and never tune
 on them. Animals that DIR holds are not rendered again. DIR/sheet.png shows the animals of this call, a row each."""
+
+AIM_DESCRIPTION = """Film random animals (those of `make zoo`) with a moving camera and write the films in the layout of
+Animal-in-Motion: crops, masks, keypoints and metadata, to see the format and to try it."""
+COP3D_DESCRIPTION = """Film cats and dogs of `make zoo` with a moving camera and write the films in the layout of CoP3D:
+images, soft masks and cameras, to see the format and to try it."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +70,46 @@ class ZooOptions:
     size: str = "384x216"
 
 
+@dataclass(frozen=True)
+class AimOptions:
+    """Flags of `make aim`.
+
+    Attributes:
+        out: the new folder, for `--data`.
+        seeds: one animal each, as of `make zoo`.
+        frames: of each film.
+        size: width x height of the films in pixels.
+        crop: width and height of the crops in pixels.
+    """
+
+    out: Path
+    seeds: tuple[int, ...] = (0, 7)
+    frames: int = 24
+    size: str = "640x360"
+    crop: int = 512
+
+
+@dataclass(frozen=True)
+class Cop3dOptions:
+    """Flags of `make cop3d`.
+
+    Attributes:
+        out: the new folder, for `--data`.
+        seeds: one animal each, as of `make zoo`: those of cats and dogs.
+        frames: of each film.
+        size: width x height of the films in pixels.
+        intrinsics: the form in which cameras are written.
+    """
+
+    out: Path
+    seeds: tuple[int, ...] = (0, 3)
+    frames: int = 24
+    size: str = "360x640"
+    intrinsics: Literal["ndc_norm_image_bounds", "ndc_isotropic"] = "ndc_norm_image_bounds"
+
+
 def main(arguments: list[str]) -> int:
-    kinds = {"artemis": _make_artemis, "zoo": _make_zoo}
+    kinds = {"artemis": _make_artemis, "zoo": _make_zoo, "aim": _make_aim, "cop3d": _make_cop3d}
     return call_subcommand(arguments, USAGE, "kind of data set to make", kinds)
 
 
@@ -86,12 +134,10 @@ def _make_zoo(arguments: list[str]) -> int:
     options = parse_flags(ZooOptions, arguments, prog="rewild4d-bench make zoo", description=ZOO_DESCRIPTION)
     width, height = parse_size(options.size)
     _require_positive(options.views, options.frames)
-    if not options.seeds:
-        raise UserError("--seeds: expected at least one number, got none.")
+    seeds = _distinct(options.seeds)
     from rewild4d.datasets.builtin.zoo import animals, sheet
     from rewild4d.progress import Progress
 
-    seeds = tuple(dict.fromkeys(options.seeds))
     progress = Progress(f"zoo: {len(seeds)} {'animal' if len(seeds) == 1 else 'animals'}")
     made = animals.render(
         options.out, seeds, views=options.views, frames=options.frames, width=width, height=height, progress=progress
@@ -101,6 +147,41 @@ def _make_zoo(arguments: list[str]) -> int:
     for folder in made:
         print(folder)
     return 0
+
+
+def _make_aim(arguments: list[str]) -> int:
+    options = parse_flags(AimOptions, arguments, prog="rewild4d-bench make aim", description=AIM_DESCRIPTION)
+    size, seeds = parse_size(options.size), _distinct(options.seeds)
+    _require_positive(1, options.frames)
+    if not 16 <= options.crop <= LONGEST_SIDE:
+        raise UserError(f"--crop: expected 16 to {LONGEST_SIDE} pixels, got {options.crop}.")
+    from rewild4d.datasets.aim.writer import write_aim
+    from rewild4d.progress import Progress
+
+    with closing(Progress(f"aim: {len(seeds)} films")) as progress:
+        made = write_aim(options.out.absolute(), seeds, options.frames, size, options.crop, progress)
+    print(*made, sep="\n")
+    return 0
+
+
+def _make_cop3d(arguments: list[str]) -> int:
+    options = parse_flags(Cop3dOptions, arguments, prog="rewild4d-bench make cop3d", description=COP3D_DESCRIPTION)
+    size, seeds = parse_size(options.size), _distinct(options.seeds)
+    _require_positive(1, options.frames)
+    from rewild4d.datasets.cop3d.writer import write_cop3d
+    from rewild4d.progress import Progress
+
+    with closing(Progress(f"cop3d: {len(seeds)} films")) as progress:
+        made = write_cop3d(options.out.absolute(), seeds, options.frames, size, options.intrinsics, progress)
+    print(*made, sep="\n")
+    return 0
+
+
+def _distinct(seeds: Sequence[int]) -> tuple[int, ...]:
+    """Return each seed once; a `UserError` where there is none."""
+    if not seeds:
+        raise UserError("--seeds: expected at least one number, got none.")
+    return tuple(dict.fromkeys(seeds))
 
 
 def _require_positive(views: int, frames: int) -> None:

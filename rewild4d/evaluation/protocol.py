@@ -87,7 +87,8 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         given = msgspec.to_builtins(self)
         novel, selection = given["novel"], given["selection"]
         newer = ((given, "points"), (novel, "upright"), (given, "novel"), (selection, "split"),
-                 (given, "even_alignment"), (given, "free_scale"))  # fmt: skip
+                 (given, "even_alignment"), (given, "free_scale"), (selection, "frames"),
+                 (selection, "mask_threshold"))  # fmt: skip
         for part, name in newer:
             if part is not None and part[name] is None:
                 del part[name]

@@ -1,0 +1,1 @@
+"""Animal-in-Motion: crops of animals out of films."""

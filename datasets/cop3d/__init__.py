@@ -1,0 +1,1 @@
+"""CoP3D: films of pets with cameras."""
