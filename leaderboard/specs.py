@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from importlib import resources
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
@@ -95,11 +95,18 @@ class Reported(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     Attributes:
         source: the paper and its table.
         note: why a comparison is loose.
+        status: "printed" where it was read in the paper, "unconfirmed" where it was only read in notes on the paper.
     """
 
     source: str
     note: str
     rows: tuple[ReportedRow, ...]
+    status: Literal["printed", "unconfirmed"] = "printed"
+
+    @property
+    def mark(self) -> str:
+        """What stands behind the label of a row."""
+        return "reported" if self.status == "printed" else "reported, unconfirmed"
 
 
 def load_specs() -> dict[str, Spec]:

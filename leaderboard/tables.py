@@ -132,7 +132,7 @@ def named_table(frame: Frame, entrants: Sequence[Entrant], reported: Reported | 
     remarks = [*rests_on(frame, entrants), *frame.remarks, *definitions_said(runs_of(entrants), frame.scores)]
     if reported is not None:
         rows += _reported_rows(reported, columns)
-        remarks += [f"Reported: {reported.source}. {reported.note}"]
+        remarks += [f"{reported.mark.capitalize()}: {reported.source}. {reported.note}"]
     return Table(frame.name, frame.title, frame.caption, ("method",), columns, tuple(rows), tuple(remarks))
 
 
@@ -338,7 +338,7 @@ def _reported_rows(reported: Reported, columns: Sequence[Column]) -> list[Row]:
             value, digits = line.cells.get(name), max(3, digits_of(column.score, "1"))
             dash = "—" if name in line.cells else ""
             cells.append(Cell(dash) if value is None else Cell(f"{value:.{digits}f}", value=value))
-        rows.append(Row((f"{line.label} (reported)",), tuple(cells), "reported"))
+        rows.append(Row((f"{line.label} ({reported.mark})",), tuple(cells), "reported"))
     return rows
 
 

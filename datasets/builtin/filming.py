@@ -96,10 +96,8 @@ def _seen(joints: dict[str, tuple[int, np.ndarray]], animal: AnimatedAnimal, fra
 
 def _meadow(seed: int, width: int, height: int) -> np.ndarray:
     """Paint a strip of meadow under a sky, all around, float32 [h, w', 3]."""
-    strip = 4 * width
-    noise = np.random.default_rng(seed).normal(0.0, 1.0, (height, strip)).astype(np.float32)
-    noise = cv2.GaussianBlur(noise, (0, 0), max(1.0, height / 60))
-    noise = 40 * noise[..., None] / max(1e-6, float(noise.std()))
-    share = np.linspace(0, 1, height, dtype=np.float32)[:, None, None]
-    ground = np.where(share > 0.45, np.float32((96, 128, 70)), np.float32((150, 175, 205)))
-    return np.clip(ground + noise, 0, 255)
+    strip, random = 4 * width, np.random.default_rng(seed)
+    noise = cv2.GaussianBlur(random.normal(0.0, 1.0, (height, strip)), (0, 0), max(1.0, height / 60))
+    share = np.linspace(0, 1, height)[:, None, None]
+    ground = np.where(share > 0.45, np.array((96.0, 128.0, 70.0)), np.array((150.0, 175.0, 205.0)))
+    return np.clip(ground + 40 * noise[..., None] / noise.std(), 0, 255).astype(np.float32)

@@ -1,12 +1,18 @@
 """Readers of annotations, masks, videos and TOML, each with a tiny valid file, that damaged files are tried on."""
 
+import contextlib
 import json
 from pathlib import Path
 
+import benchmark_films
 import moving
 import numpy as np
 from mutations import Reader
 
+from rewild4d.datasets.aim.files import read_crop
+from rewild4d.datasets.aim.files import read_keypoints as read_aim_keypoints
+from rewild4d.datasets.cop3d.annotations import FrameAnnotation, read_jgz
+from rewild4d.datasets.cop3d.cameras import to_opencv
 from rewild4d.datasets.keypoints.files import read_keypoints
 from rewild4d.datasets.keypoints.keypoints import read_badja
 from rewild4d.datasets.masking.masks import open_masks
@@ -104,6 +110,26 @@ def _video(path: Path) -> object:
     return video_facts(path), list(read_video(path))
 
 
+def aim_keypoints(folder: Path) -> Path:
+    return benchmark_films.aim(folder, count=1) / "00000003_keypoint.txt"
+
+
+def aim_metadata(folder: Path) -> Path:
+    return benchmark_films.aim(folder, count=1) / "00000003_metadata.json"
+
+
+def cop3d_frames(folder: Path) -> Path:
+    return benchmark_films.cop3d(folder, count=2) / "dog" / "frame_annotations.jgz"
+
+
+def _cameras(path: Path) -> object:
+    found = []
+    for frame in read_jgz(path, list[FrameAnnotation]):
+        with contextlib.suppress(ValueError):  # the reader makes a sentence of it
+            found.append(frame.viewpoint and to_opencv(frame.viewpoint, SIZE))
+    return found
+
+
 READERS = {
     "keypoints of BADJA": Reader(badja, _keypoints),
     "BADJA beside DAVIS": Reader(badja, lambda path: read_badja(path, STEMS, SIZE)),
@@ -114,6 +140,9 @@ READERS = {
     "mapping": Reader(mapping, lambda path: load_mapping(str(path))),
     "protocol": Reader(protocol, lambda path: read_toml(path, "a protocol", Protocol)),
     "table": Reader(table, lambda path: read_toml(path, "a table", Spec)),
+    "keypoints of AiM": Reader(aim_keypoints, lambda path: read_aim_keypoints(path, SIZE)),
+    "metadata of AiM": Reader(aim_metadata, read_crop),
+    "annotations of CoP3D": Reader(cop3d_frames, _cameras),
     "grey mask": Reader(grey_mask, _mask),
     "mask of 16 bits": Reader(deep_mask, _mask),
     "mask with a palette": Reader(palette_mask, _mask),

@@ -45,6 +45,15 @@ def test_every_reported_cell_has_a_column() -> None:
         assert {cell for row in numbers.rows for cell in row.cells} <= names, name
 
 
+def test_what_only_notes_tell_is_marked(capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("table", "aim", "--runs", str(RESULTS / "2026-11-23-artemis-standard")) == 0
+    out = capsys.readouterr().out
+    assert "| 4D-Fauna (reported, unconfirmed) | 0.814 | 0.664 | 0.317 | 0.418 | 0.044 |" in out
+    assert "Reported, unconfirmed: Zhao et al." in out
+    assert load_reported("equine-motion").rows[0].cells["APT-36K/pck@0.1_crop_bones"] == pytest.approx(51.4 / 100)
+    assert {load_reported(name).mark for name in ("artemis", "ablation", "input-view", "novel-view")} == {"reported"}
+
+
 def test_the_protocol_chooses_the_condition_of_its_data_set() -> None:
     for protocol, title in (("aptv2-512", "APTv2"), ("davis-256", "DAVIS"), ("online-512-v1", "Online")):
         found = chosen("input-view", load_specs()["input-view"], planning.Choice(protocol=protocol))
