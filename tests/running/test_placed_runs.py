@@ -31,7 +31,8 @@ def run(reader: Aim | Cop3d, dataset: str, case: str, selection: Selection, out:
     )  # fmt: skip
     config = msgspec.structs.replace(load_method("prior-only").Config(), gaussians=300)
     stages = tuple(msgspec.structs.replace(stage, steps=1, frames=3, size=24) for stage in QUICK.stages)
-    prior = PriorChoice("template:quadruped", msgspec.structs.replace(QUICK, yaw_starts=4, stages=stages))
+    config_of_prior = msgspec.structs.replace(QUICK, yaw_starts=4, stages=stages)
+    prior = PriorChoice("template:quadruped", config_of_prior, getattr(reader, "keypoint_mapping", None), "all")
     plan = runner.Plan(
         dataset=dataset, reader=reader, root=out, cases=(case,), protocol=protocol,
         entries=(runner.Entry("prior-only", "quick", config, (0,)),), prior=prior, device=torch.device("cpu"), out=out,
