@@ -141,6 +141,11 @@ def _write_run(
     made.pictured += bool(names)
 
 
+def is_open(licence: str) -> bool:
+    """Tell whether a licence allows to pass things on."""
+    return bool(_OPEN.match(licence))
+
+
 def _place(record: RunRecord) -> Path:
     """Where a run lies in the collection, as the runner would put it; nothing in a record is taken for a path."""
     run = f"{record.method}-{record.preset}-seed{record.seed}-{record.run_id[:8]}"
@@ -156,7 +161,7 @@ def _first_seeds(records: Sequence[RunRecord]) -> set[str]:
 
 def _may_show(record: RunRecord, pictures: str, made: Collection) -> bool:
     licence = record.data.get("licence", "")
-    if pictures != "open" or _OPEN.match(licence):
+    if pictures != "open" or is_open(licence):
         return pictures != "none"
     remark = f"{record.case}: no pictures, because of its licence ('{licence}'); --pictures all keeps them."
     if remark not in made.remarks:

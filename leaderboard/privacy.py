@@ -1,6 +1,7 @@
 """Paths and user names out of a record, so that it can be handed on."""
 
 import re
+from collections.abc import Iterator
 from typing import Any
 
 import msgspec
@@ -20,6 +21,19 @@ _HOMES = re.compile(r"(?:[A-Za-z]:|[\\/]{2}[^\\/]+|/*)[\\/](?:home|Users)[\\/][^
 def without_paths(record: RunRecord) -> RunRecord:
     """Cut every absolute path in a record to its last part; home folders, which are user names, to "~"."""
     return msgspec.convert(_cleaned(msgspec.to_builtins(record)), RunRecord)
+
+
+def texts_with_paths(tree: Any) -> Iterator[str]:
+    """Find every text in nested containers, however deep, that names an absolute path; keys too."""
+    waiting = [tree]
+    while waiting:
+        item = waiting.pop()
+        if isinstance(item, dict):
+            waiting += [*item.keys(), *item.values()]
+        elif isinstance(item, list | tuple | set | frozenset):
+            waiting += item
+        elif isinstance(item, str) and _cleaned(item) != item:
+            yield item
 
 
 def last_part(path: str) -> str:

@@ -62,11 +62,13 @@ class Part:
         title: heading.
         found: records with the folders that hold them and their pictures.
         tables: named ones, shown above those of the protocols; each with those that belong to it behind it.
+        given: whether somebody submitted them, so that the heading, which says who, is always shown.
     """
 
     title: str
     found: Sequence[Found]
     tables: Sequence[Sequence[Table]] = ()
+    given: bool = False
 
 
 @dataclass(frozen=True)
@@ -155,8 +157,8 @@ def _part(part: Part, key: str, pages: Mapping[str, Page]) -> dict[str, Any]:
     """Fill in a folder of runs on the first page; ``key`` tells its tables from those of other parts."""
     records = [record for _, record in part.found]
     tables = [[_shown(table, key) for table in group] for group in part.tables]
-    sections = _sections(records, key, pages)
-    return {"title": part.title, "counts": _counts(part.found), "tables": tables, "sections": sections}
+    counts, sections = _counts(part.found), _sections(records, key, pages)
+    return {"title": part.title, "given": part.given, "counts": counts, "tables": tables, "sections": sections}
 
 
 def _shown(table: Table, key: str) -> dict[str, Any]:

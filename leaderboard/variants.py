@@ -61,7 +61,7 @@ def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
     cases = grouped(records, lambda record: (record.dataset, record.protocol["name"], record.case))
     for (_, protocol, case), runs in cases.items():
         newest = max(runs, key=_age)
-        same = [run for run in runs if _comparable(run, newest)]
+        same = [run for run in runs if comparable(run, newest)]
         if len(same) < len(runs):
             remarks.append(f"{protocol}, {case}: {len(runs) - len(same)} older records of other data left out.")
         if len({_digests(run) for run in same}) > 1:
@@ -170,7 +170,7 @@ def _age(record: RunRecord) -> tuple[str, str]:
     return record.timing.started, record.run_id
 
 
-def _comparable(run: RunRecord, other: RunRecord) -> bool:
+def comparable(run: RunRecord, other: RunRecord) -> bool:
     """Tell whether two runs of a case are of one protocol and of one data set."""
     recipe = _recipe(run)
     same = _digests(run) == _digests(other) or (recipe is not None and recipe == _recipe(other))

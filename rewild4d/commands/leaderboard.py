@@ -1,4 +1,4 @@
-"""`leaderboard`: collect records for a repository, and build a static page from them."""
+"""`leaderboard`: collect records for a repository, submit and verify them, and build a static page from them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,11 @@ if TYPE_CHECKING:
     from rewild4d.leaderboard.layout import Table
     from rewild4d.leaderboard.records import RunRecord
 
-USAGE = "usage: rewild4d-bench leaderboard build|collect --runs DIR --out DIR      (... build --help lists options)"
+USAGE = """usage: rewild4d-bench leaderboard build|collect --runs DIR --out DIR
+       rewild4d-bench leaderboard submit RUNS... --out BUNDLE.zip
+       rewild4d-bench leaderboard verify BUNDLE.zip [--data FOLDER]
+       rewild4d-bench leaderboard add BUNDLE.zip --results FOLDER [--data FOLDER]
+(leaderboard build --help lists the options of build)"""
 BUILD = """Make a static page from records alone: a sortable table per protocol, the named tables that have records, and
 a page per run with its settings, provenance, curves over time and pictures. Every folder of runs is a part of its own,
 and its cases are averaged with no others. It opens from the disk."""
@@ -71,7 +75,11 @@ class CollectOptions:
 
 
 def main(arguments: list[str]) -> int:
-    return call_subcommand(arguments, USAGE, "leaderboard command", {"build": build, "collect": collect_runs})
+    from rewild4d.commands import submission
+
+    commands = {"build": build, "collect": collect_runs, "submit": submission.submit, "verify": submission.verify,
+                "add": submission.add}  # fmt: skip
+    return call_subcommand(arguments, USAGE, "leaderboard command", commands)
 
 
 def build(arguments: list[str]) -> int:
@@ -80,11 +88,13 @@ def build(arguments: list[str]) -> int:
     from rewild4d.leaderboard.collect import title_of
     from rewild4d.leaderboard.records import find_records
     from rewild4d.leaderboard.site import Part, build_site
+    from rewild4d.leaderboard.submission import SUBMISSION
 
     parts = []
     for folder in options.runs:
         found = find_records(folder)
-        parts.append(Part(title_of(folder), found, _named([record for _, record in found], options.preset)))
+        tables = _named([record for _, record in found], options.preset)
+        parts.append(Part(title_of(folder), found, tables, given=(folder / SUBMISSION).is_file()))
     parts = [part for part in parts if part.found]
     _require_records(options.runs, parts)
     print(build_site(parts, options.out.absolute(), timeout=options.timeout, reports=options.reports))
