@@ -29,6 +29,8 @@ PICTURE_WIDTH, VIDEO_WIDTH = 960, 320
 SMALLER = ("-vf", f"scale='min({VIDEO_WIDTH},iw)':-2", "-c:v", "libx264", "-crf", "30", "-preset", "slow", "-pix_fmt",
            "yuv420p", "-threads", "1")  # fmt: skip
 """ffmpeg's options for a film of a few tens of kilobytes."""
+HINT = "; --pictures all keeps them"
+"""End of the remark on pictures that a licence keeps out."""
 DIGITS = 4
 """Significant digits of the value of a single image; means are kept whole."""
 NOTE = (
@@ -163,7 +165,7 @@ def _may_show(record: RunRecord, pictures: str, made: Collection) -> bool:
     licence = record.data.get("licence", "")
     if pictures != "open" or is_open(licence):
         return pictures != "none"
-    remark = f"{record.case}: no pictures, because of its licence ('{licence}'); --pictures all keeps them."
+    remark = f"{record.case}: no pictures, because of its licence ('{licence}'){HINT}."
     if remark not in made.remarks:
         made.remarks.append(remark)
     return False

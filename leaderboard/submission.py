@@ -17,7 +17,7 @@ import msgspec
 from rewild4d import __version__
 from rewild4d.errors import UserError, shown
 from rewild4d.files import replaced_folder, write_text
-from rewild4d.leaderboard.collect import MARKER, Collection, Found, collect, is_open
+from rewild4d.leaderboard.collect import HINT, MARKER, Collection, Found, collect, is_open
 from rewild4d.leaderboard.media import publish
 from rewild4d.leaderboard.predictions import copy_predictions
 from rewild4d.leaderboard.privacy import texts_with_paths
@@ -145,6 +145,7 @@ def assemble(
         UserError: as `collect` and `copy_predictions`.
     """
     made = collect(found, folder, title=about.title, limit=MOST_BYTES, timeout=timeout)
+    made.remarks = [remark.replace(HINT, "") for remark in made.remarks]  # a bundle has no such flag
     sources = {record.run_id: source for source, record in found}
     kept = find_records(folder)
     if predictions:
@@ -190,13 +191,15 @@ def lacking(records: Sequence[RunRecord], cases: Mapping[str, Sequence[str]]) ->
     for protocol, group in grouped(records, lambda record: record.protocol["name"]).items():
         every = sorted({*cases.get(protocol, ()), *(record.case for record in group)})
         for label, runs in variants([record for record in group if not is_floor(record)]):
-            seeds = {seed: {run.case for run in runs if run.seed == seed} for seed in {run.seed for run in runs}}
-            for seed, there in sorted(seeds.items()):
-                absent = [case for case in every if case not in there]
-                if absent:
+            groups: dict[frozenset[str], list[int]] = {}
+            for seed in sorted({run.seed for run in runs}):
+                groups.setdefault(frozenset(run.case for run in runs if run.seed == seed), []).append(seed)
+            for there, seeds in groups.items():
+                if absent := [case for case in every if case not in there]:
                     listed = ", ".join(absent[:5]) + ", ..." * (len(absent) > 5)
                     count = f"{len(there)} of {len(every)} cases"
-                    said.append(f"{protocol}, {label}, seed {seed}: {count}; missing: {listed}.")
+                    named = f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
+                    said.append(f"{protocol}, {label}, {named}: {count}; missing: {listed}.")
     return said
 
 

@@ -26,48 +26,61 @@ DECIBELS, PART, LEAST = 0.01, 1e-3, 1e-4
 TOLERANCE = f"{DECIBELS:g} dB, {100 * PART:g} % of other scores (at least {LEAST:g})"
 
 
-def cases_here(bundle: Bundle, data: Path, dataset: str) -> dict[str, list[str]]:
-    """List all cases that a folder of data has under each protocol of the bundle.
+def runs_here(bundle: Bundle, data: Path, dataset: str) -> tuple[list[str], dict[str, list[str]]]:
+    """List the runs whose data can be read here, and all cases that the data have under each of their protocols.
+
+    Runs whose data were read with files of their own, as other masks, need these here too; without them they are noted.
 
     Raises:
         UserError: the folder cannot be read as that data set.
     """
-    found: dict[str, list[str]] = {}
-    for run, record in _runs(bundle, dataset).items():
-        name = record.protocol["name"]
-        if name not in found:
-            reader = reader_of(bundle.folder / run, record, data)
-            found[name] = list(reader.cases(find_protocol(dataset, name).selection))
-    return found
+    cases: dict[tuple[str, str], list[str] | None] = {}
+    runs = _runs(bundle, dataset)
+    keys = {run: (record.protocol["name"], record.data.get("settings", "{}")) for run, record in runs.items()}
+    for run, key in keys.items():
+        if key in cases:
+            continue
+        try:
+            selection = find_protocol(dataset, key[0]).selection
+            cases[key] = list(reader_of(bundle.folder / run, runs[run], data).cases(selection))
+        except UserError as error:
+            if key[1] == "{}":
+                raise
+            cases[key] = None
+            bundle.unverified.append(f"runs whose data were read with {key[1]}: {str(error).rstrip('.')}")
+    known: dict[str, list[str]] = {}
+    for (name, _), listed in cases.items():
+        if listed is not None:
+            known[name] = sorted({*known.get(name, ()), *listed})
+    return [run for run, key in keys.items() if cases[key] is not None], known
 
 
-def score_some(bundle: Bundle, data: Path, dataset: str, sample: int, device: str, rasterizer: str) -> None:
+def score_some(bundle: Bundle, runs: list[str], data: Path, sample: int, device: str, rasterizer: str) -> None:
     """Hold some runs against the data that are here, and score their predictions again; the bundle takes what is found.
 
     Args:
         bundle: as it was unpacked.
+        runs: whose data can be read here.
         data: folder of the data.
-        dataset: name of its data set.
         sample: how many runs, picked by chance; 0 for all.
         device: auto, cpu or cuda.
         rasterizer: one of `rewild4d.rasterizer.BACKENDS`.
     """
-    good = {run: record for run, record in _runs(bundle, dataset).items() if record.status == "ok"}
+    good = {run: bundle.records[run] for run in runs if bundle.records[run].status == "ok"}
     saved = [run for run in good if bundle.predictions(run)]
     candidates = sorted(saved or good)
     # By chance, not by the bundle's digest: who makes a bundle must not know which runs will be looked at.
-    chosen = sorted(random.SystemRandom().sample(candidates, sample or len(candidates))) \
-        if 0 < sample < len(candidates) else candidates  # fmt: skip
+    some = 0 < sample < len(candidates)
+    chosen = sorted(random.SystemRandom().sample(candidates, sample)) if some else candidates
     for run in chosen:
         if saved:
             _score_one(bundle, run, data, device, rasterizer)
         else:
             with bundle.looking(f"{run}: clip and truth are the data here"):
                 _on_data_here(bundle.folder / run, run, good[run], data)
-    if left := len(_runs(bundle, dataset)) - len(chosen):
-        bundle.unverified.append(
-            f"scores of {counted(left, 'other run')}: no predictions inside, failed, or not in the sample"
-        )
+    if left := len(bundle.records) - len(bundle.rescored):
+        why = "no predictions inside, failed, or not in the sample"
+        bundle.unverified.append(f"scores of {counted(left, 'run')}: {why}")
 
 
 def _runs(bundle: Bundle, dataset: str) -> dict[str, RunRecord]:

@@ -225,9 +225,8 @@ def _verified(options: VerifyOptions, folder: Path) -> Bundle:
         bundle.unverified.append("scores: none was computed again (--data names the data for it)")
     elif bundle.records:
         dataset, data = _dataset(bundle, options.dataset), options.data.absolute()
-        with bundle.looking():
-            known = spot_checks.cases_here(bundle, data, dataset)
-        spot_checks.score_some(bundle, data, dataset, options.sample, options.device, options.rasterizer)
+        runs, known = spot_checks.runs_here(bundle, data, dataset)
+        spot_checks.score_some(bundle, runs, data, options.sample, options.device, options.rasterizer)
     look_at_cases(bundle, known)
     return bundle
 

@@ -185,7 +185,8 @@ def _names(bundle: Bundle) -> None:
     with bundle.looking(right) as found:
         for run, record in bundle.records.items():
             for kind, name in (("methods", record.method), ("datasets", record.dataset)):
-                with bundle.catching(faults := []):
+                faults: list[str] = []
+                with bundle.catching(faults):
                     require_name(kind, name)
                 found += [f"{run}: {fault}" for fault in faults]
             found += [f"{run}: {fault}" for fault in _protocol_faults(record, known)]
@@ -260,9 +261,8 @@ def look_at_cases(bundle: Bundle, known: dict[str, list[str]]) -> None:
 def _pictures(bundle: Bundle, timeout: float) -> None:
     """Decode all pictures, and refuse those of data that may not be passed on."""
     count = sum(len(record.pictures) for record in bundle.records.values())
-    with bundle.looking(
-        f"{counted(count, 'picture or film', 'pictures and films')}: can be decoded, of open data"
-    ) as found:
+    right = f"{counted(count, 'picture or film', 'pictures and films')}: can be decoded, of open data" if count else ""
+    with bundle.looking(right) as found:
         for run, record in bundle.records.items():
             licence = record.data.get("licence", "")
             if (stated := _stated_licence(record.dataset)) not in ("", licence):

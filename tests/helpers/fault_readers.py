@@ -3,24 +3,34 @@
 Another reader is one more entry of `READERS`: a function that writes its file into a folder, and one that reads it.
 """
 
+import hashlib
+import json
 import pickle
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import torch
 from artemis_animals import write_animal
 from mutations import Reader
 from prior_files import a_prior
+from records_for_tests import record
 from rig_files import build
 from scipy import sparse
 
 from rewild4d.baselines.gart_smal import template_prior
+from rewild4d.commands.verifying import Bundle, examine, look_at_cases
 from rewild4d.datasets.artemis import files, volume
 from rewild4d.datasets.rigs.reader import clips, content, load_rig
 from rewild4d.datasets.video.footage import open_footage
+from rewild4d.evaluation.protocol import find_protocol
 from rewild4d.io import meshes, ply
+from rewild4d.leaderboard.bundle import write_bundle
+from rewild4d.leaderboard.records import FILE
+from rewild4d.leaderboard.submission import SUBMISSION, About, assemble
 from rewild4d.metrics.samples import Conditions, Features
 from rewild4d.metrics.sets import Compared, read_features, write_features
 from rewild4d.ours.canonical import Gaussians
@@ -195,6 +205,48 @@ def read_volume(path: Path) -> object:
     return volume.read_voxels(path.parent.parent)
 
 
+def submission(folder: Path) -> Path:
+    """The file that says what is in a bundle, in the folder of one with one run."""
+    protocol = {"digest": "", **msgspec.to_builtins(find_protocol("artemis", "artemis-sweep-128-v1"))}
+    made = folder / "made"
+    assemble(
+        [(folder, record(protocol=protocol))], made, About(name="J", licence="CC0", date="2026-01-31", title="T"), {},
+        predictions=False, timeout=1.0,
+    )  # fmt: skip
+    return made / SUBMISSION
+
+
+def bundle(folder: Path) -> Path:
+    write_bundle(submission(folder).parent, folder / "bundle.zip")
+    return folder / "bundle.zip"
+
+
+def read_bundle(path: Path) -> Bundle:
+    with tempfile.TemporaryDirectory() as scratch:
+        found = examine(path, Path(scratch), timeout=1.0)
+        look_at_cases(found, {})
+        return found
+
+
+def read_submission(path: Path) -> Bundle:
+    with tempfile.TemporaryDirectory() as scratch:
+        write_bundle(path.parent, Path(scratch) / "bundle.zip")
+        return read_bundle(Path(scratch) / "bundle.zip")
+
+
+def submitted_record(folder: Path) -> Path:
+    return next(submission(folder).parent.rglob(FILE))
+
+
+def read_record_of_bundle(path: Path) -> Bundle:
+    """As a forger would have it: the digest is that of the damaged record."""
+    folder = path.parents[3]
+    said = json.loads((folder / SUBMISSION).read_text())
+    said["files"][path.relative_to(folder).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
+    (folder / SUBMISSION).write_text(json.dumps(said))
+    return read_submission(folder / SUBMISSION)
+
+
 READERS = {
     "PLY mesh, ASCII": Reader(ascii_mesh, meshes.read_mesh),
     "PLY mesh, binary": Reader(binary_mesh, meshes.read_mesh),
@@ -216,6 +268,9 @@ READERS = {
     "Artemis voxels": Reader(of_animal("volumes/coords_init.pth"), read_volume),
     "Artemis voxel bones": Reader(of_animal("volumes/volume_indices.pth"), read_volume),
     "Artemis voxel weights": Reader(of_animal("volumes/volume_weights.pth"), read_volume),
+    "bundle": Reader(bundle, read_bundle),
+    "bundle's submission": Reader(submission, read_submission),
+    "bundle's record": Reader(submitted_record, read_record_of_bundle),
     "reconstruction": Reader(reconstruction(STATE), read_ours),
     "reconstruction's settings": Reader(reconstruction(CONFIG), read_ours),
     "picture as array": Reader(array_picture, read_frame),

@@ -11,9 +11,13 @@ import pytest
 from bundles import PROTOCOL, WHO, Change, TwoCases, changed, in_record, run_folder, tiny_runs
 from calling import call, output, refusal
 from PIL import Image
+from records_for_tests import psnr as psnr_of
+from records_for_tests import record
 
+from rewild4d.commands.spot_checks import differences
 from rewild4d.leaderboard.records import FILE, find_records
-from rewild4d.leaderboard.submission import SUBMISSION
+from rewild4d.leaderboard.submission import SUBMISSION, lacking
+from rewild4d.metrics.score import Score
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -90,7 +94,7 @@ def test_predictions_are_scored_again(bundle: Path, tiny_data: None, capsys: pyt
     said = output(capsys, "leaderboard", "verify", bundle, "--data", bundle.parent, "--sample", "1")
     assert said.count(" scores came out again, within 0.01 dB, 0.1 % of other scores") == 1
     assert "verified: every method has all cases of the data here" in said
-    assert "not verified: scores of 3 other runs: no predictions inside, failed, or not in the sample" in said
+    assert "not verified: scores of 3 runs: no predictions inside, failed, or not in the sample" in said
 
 
 def test_forged_scores_are_not_those_of_the_predictions(
@@ -126,11 +130,9 @@ def test_a_verified_bundle_is_on_the_board(bundle: Path, tmp_path: Path, capsys:
     output(capsys, "leaderboard", "build", "--runs", results / "bundle", "--out", page)
     text = (page / "index.html").read_text()
     assert "Two walks (submitted by Jane Doe, 2026-11-28, CC BY 4.0; as submitted, none reproduced)" in text
-    for place, record in kept:
-        assert record.run_id in text
-        assert (page / "runs" / record.run_id / "comparison.webp").read_bytes() == (
-            place / "comparison.webp"
-        ).read_bytes()
+    for place, one in kept:
+        assert one.run_id in text
+        assert (page / "runs" / one.run_id / "comparison.webp").read_bytes() == (place / "comparison.webp").read_bytes()
 
 
 def test_a_bad_bundle_is_not_added(bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -242,6 +244,34 @@ def test_a_forgery_with_right_digests_is_found(
 def test_a_record_that_is_missing_is_named(bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = findings(capsys, changed(bundle, tmp_path / "a.zip", no_run))
     assert any(line.startswith(f"'{OURS}") and line.endswith("names that run.") for line in found)
+
+
+def test_what_comes_out_again_may_differ_in_its_last_digits() -> None:
+    said = record(scores={**psnr_of(20.0), "iou": Score(0.5, "1", "higher", 1, [0.5])})
+
+    def again(decibels: float, iou: float) -> list[str]:
+        return differences(said, record(scores={**psnr_of(decibels), "iou": Score(iou, "1", "higher", 1, [iou])}))
+
+    assert again(20.0 + 0.009, 0.5 + 0.0004) == []
+    assert again(20.0 - 0.011, 0.5) == [
+        "psnr: its record says 20, but its predictions score 19.989; expected at most 0.01 between them."
+    ]
+    assert again(20.0, 0.5 * (1 + 0.002)) == [
+        "iou: its record says 0.5, but its predictions score 0.501; expected at most 0.0005 between them."
+    ]
+    marked = record(scores=said.scores, marks=["upper bound: it saw more"])
+    assert differences(said, marked) == ["expected the mark 'upper bound: it saw more', got none."]
+
+
+def test_seeds_and_cases_that_lack_are_counted() -> None:
+    there = [("a", 0), ("b", 0), ("c", 0), ("a", 1), ("a", 2)]
+    runs = [record(case=case, seed=seed, run_id=f"{case}{seed}") for case, seed in there]
+    floor = record(case="a", method="empty")
+    assert lacking([*runs, floor], {"p-v1": ["a", "b", "c", "d"]}) == [
+        "p-v1, ours, seed 0: 3 of 4 cases; missing: d.",
+        "p-v1, ours, seeds 1, 2: 1 of 4 cases; missing: b, c, d.",
+    ]
+    assert lacking(runs[:3], {}) == [] and lacking([floor], {"p-v1": ["a", "b"]}) == []
 
 
 def test_who_lacks_cases_may_say_why(
