@@ -21,7 +21,6 @@ from rewild4d.leaderboard.submission import SUBMISSION
 from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import STANDARD
 from rewild4d.priors.io import save_prior
-from rewild4d.registry import load_method
 from rewild4d.running import runner
 from rewild4d.running.conformance import tiny_case
 from rewild4d.types import Clip, Truth
@@ -50,18 +49,20 @@ class TwoCases:
 
 
 def tiny_runs(folder: Path) -> Path:
-    """Run `ours` and the empty floor on both cases, and return the folder of the runs."""
+    """Run `ours` on both cases, and return the folder of the runs; one of them keeps its film."""
     reader = TwoCases()
     save_prior(reader.case.prior, folder / "prior.npz")
     runner.execute(
         runner.Plan(
             dataset="artemis", reader=reader, root=folder, cases=("tiny/trot", "tiny/walk"),
             protocol=find_protocol("artemis", PROTOCOL),
-            entries=(runner.Entry("empty", "default", load_method("empty").Config(), (0,)),
-                     runner.Entry("ours", "quick", TINY, (0,))),
+            entries=(runner.Entry("ours", "quick", TINY, (0,)),),
             prior=PriorChoice(str(folder / "prior.npz"), STANDARD), device=torch.device("cpu"), out=folder / "runs",
         )
     )  # fmt: skip
+    for film in folder.rglob("orbit.mp4"):  # to decode one takes longer than all else that is checked
+        if film.parent != run_folder(folder / "runs"):
+            film.unlink()
     return folder / "runs"
 
 
@@ -96,9 +97,9 @@ def redo(folder: Path) -> None:
     (folder / SUBMISSION).write_text(json.dumps(said))
 
 
-def run_folder(folder: Path, method: str = "ours", case: str = "walk") -> Path:
-    """Folder of a run in an unpacked bundle."""
-    return next(folder.glob(f"*/tiny__{case}/{method}-*"))
+def run_folder(folder: Path, case: str = "walk") -> Path:
+    """Folder of a run, in an unpacked bundle or a folder of runs."""
+    return next(folder.glob(f"*/tiny__{case}/ours-*"))
 
 
 def in_record(**fields: Any) -> Change:
