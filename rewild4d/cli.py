@@ -21,6 +21,7 @@ COMMANDS = {
     "export": ("export", "write a reconstruction as .ply, .glb, cameras and films"),
     "view": ("view", "look at runs in the browser, from any side at any time"),
     "report": ("report", "write one HTML page of a run, with a player of its Gaussians"),
+    "status": ("status", "say what of a folder of runs is done, running, failed or waiting, and the time left"),
     "score": ("score", "score two folders of images or clips, or two .ply files, without our methods"),
     "definitions": ("definitions", "score a saved run by the definitions of several papers"),
     "table": ("table", "print a table of what was found"),

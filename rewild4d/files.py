@@ -172,6 +172,25 @@ def held(folder: Path, waiting: str) -> Iterator[None]:
         os.close(handle)
 
 
+def is_held(folder: Path) -> bool | None:
+    """Tell whether a process holds a folder (`held`); None where the system or the file system does not say."""
+    if fcntl is None:
+        return None
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return None
+    finally:
+        os.close(handle)
+    return False
+
+
 def regular_inside(path: Path, folder: Path) -> None:
     """Fail unless a path is a regular file that lies inside a folder when all links are followed.
 

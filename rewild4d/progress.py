@@ -19,6 +19,15 @@ class _Bar(tqdm):
 _Bar.set_lock(RLock())
 
 
+_hidden = False
+
+
+def hide_bars() -> None:
+    """Show no bars in this process from now on: its output is a log that nobody watches."""
+    global _hidden
+    _hidden = True
+
+
 def is_shown() -> bool:
     """Tell whether a bar stands on the last line of standard error."""
     return len(getattr(_Bar, "_instances", ())) > 0
@@ -34,7 +43,7 @@ class Progress:
     def __call__(self, step: int, total: int, values: Mapping[str, float] = MappingProxyType({})) -> None:
         if self.bar is None:
             pause = 0.5 if sys.stderr.isatty() else 10.0
-            self.bar = _Bar(desc=self.title, total=total, file=sys.stderr, mininterval=pause)
+            self.bar = _Bar(desc=self.title, total=total, file=sys.stderr, mininterval=pause, disable=_hidden)
         self.bar.total = total
         self.bar.update(step - self.bar.n)
         if values:

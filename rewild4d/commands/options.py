@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from rewild4d.contracts import Parts
 
@@ -51,7 +52,26 @@ class ComputeFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunFlags(ComputeFlags, DataFlags):
+class ClusterFlags:
+    """Flags of runs on several machines.
+
+    Attributes:
+        executor: local (--jobs processes of this machine) or dask (workers of a Dask cluster, one run at a time each).
+        scheduler: of dask: address of a scheduler that runs already ("tcp://host:8786").
+        cluster: of dask, instead of an address: a TOML or YAML file that says what to start (dask-jobqueue's
+            SLURMCluster, for example); where both are left out, --jobs workers of this machine.
+        records: of dask: shared (workers write into --out, on a file system that all share) or returned (workers write
+            into folders of their own, and this command fetches and writes what they made).
+    """
+
+    executor: Literal["local", "dask"] = "local"
+    scheduler: str = ""
+    cluster: Path | None = None
+    records: Literal["shared", "returned"] = "shared"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFlags(ClusterFlags, ComputeFlags, DataFlags):
     """Flags of commands that fit. Help lists the flags of later base classes first.
 
     Attributes:

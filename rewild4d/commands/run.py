@@ -8,7 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rewild4d.commands.options import RunFlags
-from rewild4d.commands.shared import check_numbers, choose_prior, exit_code, lower_bounds, open_dataset, plan_fields
+from rewild4d.commands.shared import (
+    check_executor,
+    check_numbers,
+    choose_prior,
+    exit_code,
+    lower_bounds,
+    open_dataset,
+    plan_fields,
+    run_plans,
+)
 from rewild4d.config import load_preset, parse_flags
 from rewild4d.errors import UserError
 from rewild4d.evaluation.protocol import find_protocol
@@ -79,12 +88,12 @@ def main(arguments: list[str]) -> int:
         Options, arguments, prog="rewild4d-bench run", description=DESCRIPTION,
         config=load_preset(wanted, load_config(wanted), preset), also=["--table"],
     )  # fmt: skip
+    check_executor(options)
     plan = make_plan(options, options.config)
     from rewild4d.leaderboard.records import to_json
     from rewild4d.leaderboard.tables import markdown
-    from rewild4d.running.runner import execute
 
-    records = execute(plan)
+    records = run_plans([plan], options, f"{options.method} on {options.dataset}")
     if options.json:
         print("[" + ",\n".join(to_json(record) for record in records) + "]")
     else:
@@ -167,7 +176,7 @@ def print_verdicts(records: list[RunRecord], method: str) -> None:
 
 
 def _print_pictures(records: list[RunRecord], options: Options) -> None:
-    from rewild4d.running.runner import run_folder
+    from rewild4d.running.folders import run_folder
 
     print()
     for record in records:

@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from rewild4d.commands.options import RunFlags
-from rewild4d.commands.shared import check_numbers, choose_prior, exit_code, lower_bounds, open_dataset, plan_fields
+from rewild4d.commands.shared import (
+    check_executor,
+    check_numbers,
+    choose_prior,
+    exit_code,
+    lower_bounds,
+    open_dataset,
+    plan_fields,
+    run_plans,
+)
 from rewild4d.config import parse_flags
 from rewild4d.contracts import DatasetReader
 from rewild4d.errors import UserError
@@ -62,12 +71,12 @@ def main(arguments: list[str]) -> int:
             raise UserError(f"--table: expected the name of a table, got none; available: {', '.join(load_specs())}.")
         arguments = ["--help"]
     options = parse_flags(Options, arguments, prog="rewild4d-bench run", description=DESCRIPTION)
+    check_executor(options)
     found = find_spec(options.table)
     from rewild4d.commands.choice import chosen
     from rewild4d.leaderboard.formats import markdown
     from rewild4d.leaderboard.records import to_json
     from rewild4d.running import planning
-    from rewild4d.running.runner import execute
 
     spec = chosen(options.table, found, planning.Choice(options.preset, options.protocol))
     plans = make_plans(options, spec)
@@ -79,7 +88,7 @@ def main(arguments: list[str]) -> int:
         for plan in plans:
             _print_plan(plan, labels)
         return 0
-    records = [record for plan in plans for record in execute(plan)]
+    records = run_plans(plans, options, f"table {options.table}")
     if options.json:
         print("[" + ",\n".join(map(to_json, records)) + "]")
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +14,8 @@ from rewild4d.priors.config import PRESETS, STANDARD, Use
 from rewild4d.registry import load_builtin, load_config, load_dataset
 
 if TYPE_CHECKING:
+    import torch
+
     from rewild4d.commands.options import RunFlags
     from rewild4d.contracts import DatasetReader
     from rewild4d.evaluation.protocol import Protocol
@@ -144,16 +147,71 @@ def check_timeout(seconds: float) -> None:
         raise UserError(f"--timeout: expected more than 0 seconds, got {seconds:g}.")
 
 
+def check_executor(options: RunFlags) -> None:
+    """Fail on flags of a cluster that do not fit each other, before anything is imported."""
+    given = [flag for flag in ("scheduler", "cluster") if getattr(options, flag)]
+    if options.executor == "dask":
+        if len(given) > 1:
+            raise UserError("--cluster: expected either this or --scheduler, got both.")
+        if importlib.util.find_spec("distributed") is None:
+            raise UserError("--executor dask: expected the package distributed, run: pip install -e '.[cluster]'.")
+    elif given or options.records != "shared":
+        raise UserError(f"--{(*given, 'records')[0]}: expected --executor dask with it, got {options.executor}.")
+
+
+def run_plans(plans: Sequence[Plan], options: RunFlags, title: str) -> list[RunRecord]:
+    """Run plans where the flags say; return their records in order.
+
+    Args:
+        plans: what to run.
+        options: of the command.
+        title: of the plans, for people.
+
+    Raises:
+        UserError: as `runner.execute` and `remote.execute_remotely`.
+    """
+    if options.executor == "local":
+        from rewild4d.running.runner import execute
+
+        return [record for plan in plans for record in execute(plan)]
+    from rewild4d.running.cluster import LOCAL, ClusterFile, Site, read_cluster_file
+    from rewild4d.running.remote import execute_remotely
+
+    if options.cluster:
+        file = read_cluster_file(options.cluster)
+    else:
+        file = ClusterFile(LOCAL, workers=max((plan.jobs for plan in plans), default=1))
+    site = Site(options.records, options.scheduler, file, f"--cluster {options.cluster}" if options.cluster else LOCAL)
+    return execute_remotely(plans, site, title)
+
+
+def _device(options: RunFlags) -> tuple[torch.device, str]:
+    """Return device and rasterizer: of this machine, or those that workers with GPUs shall have."""
+    import torch
+
+    from rewild4d.machine import pick_device
+    from rewild4d.rasterizer import pick_rasterizer
+    from rewild4d.rasterizer.backends import MODULES
+
+    elsewhere = options.executor == "dask" and options.device.split(":")[0] == "cuda" and not torch.cuda.is_available()
+    if not elsewhere:
+        device = pick_device(options.device)
+        return device, pick_rasterizer(options.rasterizer, device)
+    if options.rasterizer not in MODULES:
+        raise UserError(
+            f"--device {options.device}: expected --rasterizer triton or gsplat with it: this machine has no GPU to "
+            "tell which one the workers have."
+        )
+    return torch.device(options.device), options.rasterizer
+
+
 def plan_fields(options: RunFlags) -> dict[str, Any]:
     """Choose the kernels, check that `--out` can be written, and return the fields of a plan that these flags set."""
     from rewild4d.kernels.switch import choose_kernels
-    from rewild4d.machine import pick_device
-    from rewild4d.rasterizer import pick_rasterizer
     from rewild4d.running.workers import usable_cores
 
     choose_kernels(options.kernels)
-    device = pick_device(options.device)
-    rasterizer = pick_rasterizer(options.rasterizer, device)
+    device, rasterizer = _device(options)
     require_writable(options.out)
     jobs, out = options.jobs or usable_cores(device), options.out.absolute()
     return {"device": device, "rasterizer": rasterizer, "jobs": jobs, "threads": options.threads, "out": out}

@@ -99,6 +99,11 @@ class PriorChoice:
         return self._kind in ("template", "masks", "learned")
 
     @property
+    def is_made(self) -> bool:
+        """Whether the prior is made for the run, so that `make_prior` keeps it in a file; else it comes from one."""
+        return self.is_fitted or self.is_from_truth
+
+    @property
     def is_own_rig(self) -> bool:
         """Whether the template is a rig file."""
         return self.is_fitted and not self.is_learned and is_rig_file(self.name)
@@ -208,7 +213,7 @@ def make_prior(choice: PriorChoice, clip: Clip, truth: Truth, path: Path, log: L
         UserError: a file that cannot be used or is for another clip, or masks that show nothing.
     """
     footage = not has_cameras(clip)
-    if not choice.is_fitted and not choice.is_from_truth:
+    if not choice.is_made:
         prior = load_prior(Path(choice.name))
         prior = placed(prior, clip) if footage else in_world(prior, clip, choice.name)
         figures = measured(prior, clip.frames)

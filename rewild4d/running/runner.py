@@ -31,9 +31,12 @@ from rewild4d.rasterizer import pick_rasterizer
 from rewild4d.registry import load_method
 from rewild4d.running import provenance
 from rewild4d.running.clock import STAMP, Clock, fit_seconds
+from rewild4d.running.folders import prior_file, run_folder
 from rewild4d.running.scoring import score
 from rewild4d.running.workers import Workers, share_cores, this_process, usable_cores
 from rewild4d.types import Case, Clip, Prior, Truth
+
+LOST = "the process ended: killed, perhaps for memory"
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,7 @@ def execute(plan: Plan) -> list[RunRecord]:
         UserError: none of the cases can be read or the rasterizer cannot be used, before anything is fitted.
         DiskFull: nothing more can be written; what was begun goes on with the next call.
     """
-    plan = _readable(replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device)))
+    plan = readable(replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device)))
     plan.out.mkdir(parents=True, exist_ok=True)
     parts = [(name, entry, seed) for name in plan.cases for entry in plan.entries for seed in entry.seeds]
     floors = [entry.method in plan.protocol.floors for _, entry, _ in parts]
@@ -104,28 +107,39 @@ def execute(plan: Plan) -> list[RunRecord]:
         records = []
         with this_process(threads, plan.rasterizer):
             for name in plan.cases:
-                _prepare(plan, name)
+                prepare(plan, name)
                 records += _run_case(plan, name)
         return records
     gpus = usable_cores(plan.device) if plan.device.type == "cuda" else 0
     with Workers(jobs, threads, plan.rasterizer, gpus) as workers:
         # Every fit of a case starts from its prior, so the priors come first.
-        workers.map(_prepare, [(plan, name) for name in plan.cases], lambda *_: None)
+        workers.map(prepare, [(plan, name) for name in plan.cases], lambda *_: None)
         # Fits come first; lower bounds are short and fill the gaps.
         order = sorted(range(len(parts)), key=floors.__getitem__)
-        made = workers.map(_run_part, [(plan, *parts[i]) for i in order], _lost_part)
+        made = workers.map(_run_part, [(plan, *parts[i]) for i in order], lost_part)
         return [record for _, record in sorted(zip(order, made, strict=True), key=itemgetter(0))]
 
 
-def _readable(plan: Plan) -> Plan:
-    """Drop the cases that cannot be read, and print notes and errors; UserError where none is left."""
+def readable(plan: Plan, visit: Callable[[str, Clip, Truth], None] = lambda *_: None) -> Plan:
+    """Drop the cases that cannot be read, and print notes and errors.
+
+    Args:
+        plan: what is run.
+        visit: called with the name, the clip and the truth of each case that can be read.
+
+    Raises:
+        UserError: none of the cases can be read.
+    """
     notes: list[str] = []
     faults: dict[str, UserError] = {}
     for name in plan.cases:
         try:
-            notes += [f"{name}: {note}" for note in plan.reader.load(name, plan.protocol.selection)[0].notes]
+            clip, truth = plan.reader.load(name, plan.protocol.selection)
         except UserError as error:
             faults[name] = error
+            continue
+        notes += [f"{name}: {note}" for note in clip.notes]
+        visit(name, clip, truth)
     if faults and len(faults) == len(plan.cases):
         raise next(iter(faults.values()))
     for line in (*notes, *(f"{name}: left out: {error}" for name, error in faults.items())):
@@ -135,17 +149,18 @@ def _readable(plan: Plan) -> Plan:
 
 def list_jobs(plan: Plan) -> list["Job"]:
     """List all jobs of the plan that can be read, in its order, finished or not; nothing is run."""
-    plan = _readable(replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device)))
-    return [job for name in plan.cases for job in _jobs(plan, name, *plan.reader.load(name, plan.protocol.selection))]
+    plan, found = replace(plan, rasterizer=pick_rasterizer(plan.rasterizer, plan.device)), list[Job]()
+    readable(plan, lambda name, clip, truth: found.extend(jobs_of(plan, name, clip, truth)))
+    return found
 
 
-def _prepare(plan: Plan, name: str) -> None:
+def prepare(plan: Plan, name: str) -> None:
     """Make the prior of a case where a fit still needs it; print its notes, and masks that cannot be trusted.
 
     Its errors are reported by the fits.
     """
     clip, truth = plan.reader.load(name, plan.protocol.selection)
-    if not all(job.finished() for job in _jobs(plan, name, clip, truth)):
+    if not all(job.finished() for job in jobs_of(plan, name, clip, truth)):
         judge: Callable[[str], Verdict] | None = getattr(plan.reader, "judge_masks", None)
         with contextlib.suppress(UserError, FloatingPointError):
             if judge and (verdict := judge(name)).level != "green":
@@ -155,23 +170,28 @@ def _prepare(plan: Plan, name: str) -> None:
 
 
 def _run_part(plan: Plan, name: str, entry: Entry, seed: int) -> RunRecord:
-    (record,) = _run_case(_part(plan, entry, seed), name)
+    (record,) = _run_case(part_of(plan, entry, seed), name)
     return record
 
 
-def _lost_part(plan: Plan, name: str, entry: Entry, seed: int) -> RunRecord:
-    """Return the record of a run whose process died."""
-    (job,) = _jobs(_part(plan, entry, seed), name, *plan.reader.load(name, plan.protocol.selection))
-    return job.fail("the process ended: killed, perhaps for memory")
+def lost_part(plan: Plan, name: str, entry: Entry, seed: int, why: str = LOST) -> RunRecord:
+    """Record that the process of a run died, and return its record."""
+    (job,) = jobs_of(part_of(plan, entry, seed), name, *plan.reader.load(name, plan.protocol.selection))
+    return job.fail(why)
 
 
-def _part(plan: Plan, entry: Entry, seed: int) -> Plan:
+def part_of(plan: Plan, entry: Entry, seed: int) -> Plan:
+    """Return the part of a plan that is one method with one seed."""
     return replace(plan, entries=(replace(entry, seeds=(seed,)),))
 
 
 def _run_case(plan: Plan, name: str) -> list[RunRecord]:
     clip, truth = plan.reader.load(name, plan.protocol.selection)
-    jobs = _jobs(plan, name, clip, truth)
+    return run_jobs(plan, jobs_of(plan, name, clip, truth), clip, truth)
+
+
+def run_jobs(plan: Plan, jobs: list["Job"], clip: Clip, truth: Truth) -> list[RunRecord]:
+    """Run the jobs of one case that have no finished record; return the records of all."""
     if all(job.finished() for job in jobs):
         return [job.record() for job in jobs]
     try:
@@ -185,13 +205,14 @@ def _run_case(plan: Plan, name: str) -> list[RunRecord]:
     return [job.run(case, seen) for job in jobs]
 
 
-def _jobs(plan: Plan, name: str, clip: Clip, truth: Truth) -> list["Job"]:
+def jobs_of(plan: Plan, name: str, clip: Clip, truth: Truth) -> list["Job"]:
+    """List the jobs of one case, finished or not."""
     prior_id = plan.prior.identity(clip, truth)
     return [Job(plan, name, entry, seed, clip, truth, prior_id) for entry in plan.entries for seed in entry.seeds]
 
 
 def _prior(plan: Plan, clip: Clip, truth: Truth) -> Prior:
-    path = plan.out / "priors" / f"{plan.prior.identity(clip, truth)}.npz"
+    path = prior_file(plan.out, plan.prior.identity(clip, truth))
     with contextlib.closing(Progress(f"{clip.name}: prior")) as progress:
         return make_prior(plan.prior, clip, truth, path, progress)
 
@@ -308,11 +329,6 @@ class Job:
             "machine": machine(plan.device, plan.rasterizer),
         }  # fmt: skip
         return RunRecord(**{**fields, **found})
-
-
-def run_folder(out: Path, protocol: str, case: str, method: str, preset: str, seed: int, run_id: str) -> Path:
-    """Return the folder of a run below the folder of all runs."""
-    return out / protocol / case.replace("/", "__") / f"{method}-{preset}-seed{seed}-{run_id[:8]}"
 
 
 def save_reconstruction(reconstruction: Reconstruction, folder: Path) -> None:

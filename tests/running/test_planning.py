@@ -283,7 +283,7 @@ def test_parts_of_a_case_are_run_side_by_side(demo: Spec, tmp_path: Path, monkey
             return None
 
         def map(self, function: Any, pieces: Any, lost: Any) -> list[Any]:
-            if function is runner._prepare:
+            if function is runner.prepare:
                 return []
             asked.extend((entry.method, getattr(entry.config, "gaussians", 0), seed) for _, _, entry, seed in pieces)
             return [function(*piece) for piece in pieces]

@@ -128,7 +128,7 @@ def test_a_killed_process_takes_only_its_own_piece_with_it() -> None:
 
 def test_a_run_whose_process_was_killed_is_a_failed_record(plan: runner.Plan) -> None:
     plan = replace(plan, rasterizer="numba")
-    record = runner._lost_part(plan, plan.cases[0], plan.entries[0], 0)
+    record = runner.lost_part(plan, plan.cases[0], plan.entries[0], 0)
     assert (record.status, record.error) == ("failed", "the process ended: killed, perhaps for memory")
     assert only_job(plan).record() == record
     (again,) = runner.execute(plan)
