@@ -5,6 +5,7 @@ import importlib
 import importlib.util
 import logging
 import shutil
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -161,7 +162,8 @@ def _started(site: Site, most: int) -> Iterator[Any]:
                 f"{given['processes']} and {given.get('cores')}."
             )
     try:
-        with _deaf():
+        with _deaf(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the dashboard's usual port may be taken; the address is printed
             cluster = kind(**given)
     except (TypeError, ValueError, RuntimeError, OSError) as error:
         raise UserError(f"{site.source}: {site.file.kind} could not be started: {reason(error)}.") from error

@@ -168,7 +168,9 @@ def _settled(part: Part, terms: Terms) -> Iterator[Plan]:
         if (own := code_of(part.entry.method)) != part.code:
             raise _unfit(f"expected the code of the command that plans ({_said(part.code)}), got {_said(own)}.")
         if terms.records == "returned":
-            plan = replace(plan, out=_scratch() / digest(str(plan.out))[:12])
+            from distributed import get_worker
+
+            plan = replace(plan, out=scratch_folder(Path(get_worker().local_directory), plan.out))
         elif not terms.plan_file.is_file():
             raise _unfit(f"{terms.plan_file}: the folder of runs is not shared with it; try --records returned.")
         with this_process(Threads(plan.threads, plan.threads), plan.rasterizer):
@@ -200,11 +202,10 @@ def _said(code: dict[str, str]) -> str:
     return ", ".join(f"{name} {value}" for name, value in code.items())
 
 
-def _scratch() -> Path:
-    """Return a folder of this machine that outlives the worker, beside Dask's own (its setting --local-directory)."""
-    from distributed import get_worker
-
-    return Path(get_worker().local_directory).parent / f"rewild4d-{os.getuid() if hasattr(os, 'getuid') else 'runs'}"
+def scratch_folder(worker: Path, out: Path) -> Path:
+    """Return where a worker keeps the folder of runs of a client: beside Dask's own folder (--local-directory), so that
+    a run that was begun goes on with another worker of this machine."""
+    return worker.parent / f"rewild4d-{os.getuid() if hasattr(os, 'getuid') else 'runs'}" / digest(str(out))[:12]
 
 
 def _taken(folder: Path) -> dict[str, bytes]:

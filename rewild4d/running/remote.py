@@ -83,6 +83,7 @@ class Report:
     parts: list[Part]
     title: str
     running: dict[str, tuple[str, float]] = field(default_factory=dict)
+    priors: int = 0
     workers: int = 0
     runs: dict[str, Run] = field(default_factory=dict)
     said: float = 0.0
@@ -104,9 +105,15 @@ class Report:
         state = "done" if record.status == "ok" else "failed"
         self.runs[part.place] = replace(old, state=state, note=record.error, seconds=seconds)  # type: ignore[arg-type]
 
-    def tell(self, running: dict[str, tuple[str, float]], workers: int) -> None:
-        """Say how it goes: write it for `status`, and print one line."""
-        self.running, self.workers = running, workers
+    def tell(self, running: dict[str, tuple[str, float]], priors: int, workers: int) -> None:
+        """Say how it goes: write it for `status`, and print one line.
+
+        Args:
+            running: folder of each run that a worker makes -> (its address, since when).
+            priors: how many are being made.
+            workers: how many there are.
+        """
+        self.running, self.priors, self.workers = running, priors, workers
         self._write("")
         terminal = sys.stderr.isatty()
         if terminal or time.monotonic() - self.said > QUIET:
@@ -121,7 +128,8 @@ class Report:
             replace(run, state="running", seconds=now - self.running[place][1]) if place in self.running else run
             for place, run in self.runs.items()
         ]
-        return f"{self.title}: {summary(shown, self.workers)}" + ("" if self.workers else "; waiting for a worker")
+        now_at = f"; {self.priors} priors being fitted" if self.priors else ""
+        return f"{self.title}: {summary(shown, self.workers)}{now_at if self.workers else '; waiting for a worker'}"
 
     def end(self) -> None:
         """Print the line of progress for the last time."""
@@ -257,7 +265,7 @@ class Crew:
             for future, (part, is_prior, since) in self.flight.items()
             if not is_prior and future.key in at
         }
-        self.report.tell(running, self.workers)
+        self.report.tell(running, sum(is_prior for _, is_prior, _ in self.flight.values()), self.workers)
 
 
 def _gone(client: "Client") -> UserError:

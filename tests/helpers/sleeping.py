@@ -16,8 +16,11 @@ import torch
 
 from rewild4d.contracts import Log, MethodInfo, Selection
 from rewild4d.errors import UserError
+from rewild4d.evaluation.protocol import find_protocol
 from rewild4d.files import digest
 from rewild4d.metrics.score import Score
+from rewild4d.priors.choose import PriorChoice
+from rewild4d.priors.config import STANDARD
 from rewild4d.priors.io import save_prior
 from rewild4d.running import runner
 from rewild4d.running.conformance import tiny_case
@@ -25,6 +28,7 @@ from rewild4d.types import Case, Clip, Prior, Truth
 
 STEP = 0.05
 """Seconds of one step; a checkpoint is written after each."""
+TOLD = "told.txt"
 PROTOCOL = """
 name = "crowd-32-v1"
 dataset = "crowd"
@@ -117,7 +121,7 @@ class Asleep:
 
 
 class Sleeper:
-    """Sleeps, and writes down in the data's folder when a fit begins and ends, and from which step it goes on."""
+    """Sleeps, and writes down in the folder of all runs when a fit begins and ends, and from which step it goes on."""
 
     info = MethodInfo("Sleeper", "", "MIT", uses_prior=False)
     Config = Nap
@@ -129,7 +133,8 @@ class Sleeper:
         runner.score = _score
         checkpoint = workdir / "checkpoint.pt"
         begin = int(checkpoint.read_text()) if checkpoint.is_file() else 0
-        tell(f"begin {clip.name} {seed} {begin}")
+        file = workdir.parents[3] / TOLD
+        tell(file, f"begin {clip.name} {seed} {begin}")
         for step in range(begin, config.steps):
             time.sleep(STEP)
             if clip.name in config.deadly:
@@ -140,25 +145,41 @@ class Sleeper:
             part.write_text(str(step + 1))
             part.replace(checkpoint)
             log(step + 1, config.steps, {"loss": 1.0})
-        tell(f"end {clip.name} {seed} {config.steps}")
+        tell(file, f"end {clip.name} {seed} {config.steps}")
         return Asleep()
 
     def load(self, folder: Path, device: torch.device) -> Asleep:
         return Asleep()
 
 
-def tell(line: str) -> None:
-    """Append a line, whole, to the file that $SLEEPING names."""
-    handle = os.open(os.environ["SLEEPING"], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+def tell(file: Path, line: str) -> None:
+    """Append a line, whole."""
+    handle = os.open(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
     try:
         os.write(handle, f"{line} {os.getpid()}\n".encode())
     finally:
         os.close(handle)
 
 
-def told(file: Path) -> list[list[str]]:
+def told(out: Path) -> list[list[str]]:
     """Return the words of each line: what, case, seed, step, process."""
+    file = out / TOLD
     return [line.split() for line in file.read_text().splitlines()] if file.is_file() else []
+
+
+def crowd_plan(data: Path, out: Path, config: Nap | None = None, seeds: tuple[int, ...] = (0,)) -> runner.Plan:
+    """Return a plan of all cases of a crowd, whose priors are made."""
+    reader, protocol = Crowd(data), find_protocol("crowd", None)
+    plan = runner.Plan(
+        dataset="crowd", reader=reader, root=data, cases=tuple(reader.cases(protocol.selection)), protocol=protocol,
+        entries=(runner.Entry("sleeper", "quick", config or Nap(), seeds),), prior=PriorChoice("coarse:0.5", STANDARD),
+        device=torch.device("cpu"), out=out,
+    )  # fmt: skip
+    (out / "priors").mkdir(parents=True, exist_ok=True)
+    for case in plan.cases:
+        identity = plan.prior.identity(*reader.load(case, protocol.selection))
+        (out / "priors" / f"{identity}.npz").write_bytes((data / "prior.npz").read_bytes())
+    return plan
 
 
 def _score(*_: Any, folder: Path, **__: Any) -> tuple[dict[str, Any], float]:
