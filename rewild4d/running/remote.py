@@ -205,6 +205,7 @@ class Crew:
         return None
 
     def _submit(self, part: Part, is_prior: bool) -> None:
+        future: Future[Any]
         mark = digest(str(part.plan.out), self.terms.records)[:4]
         if is_prior:
             key: tuple[str, ...] = "prior", part.case, f"{part.prior.stem[:8]}-{mark}"
