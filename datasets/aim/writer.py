@@ -11,6 +11,7 @@ from rewild4d.datasets.aim.files import FPS
 from rewild4d.datasets.builtin import filming
 from rewild4d.datasets.builtin.zoo import animals
 from rewild4d.datasets.rigs.studio import Progress
+from rewild4d.errors import UserError
 from rewild4d.files import replaced_folder
 
 MARKER = "made-by-rewild4d.txt"
@@ -62,6 +63,8 @@ def write_aim(
 
 
 def _write_track(folder: Path, shots: Sequence[filming.Shot], side: int) -> None:
+    if not all((shot.alpha > 127).any() for shot in shots):
+        raise UserError(f"{folder}: expected a film in which the animal can be seen; --size makes it larger.")
     boxes = crop_boxes([shot.alpha for shot in shots])
     for number, (shot, box) in enumerate(zip(shots, boxes, strict=True), FIRST):
         start = folder / f"{number:08d}"

@@ -182,9 +182,9 @@ class _Sequence:
         }
         for what, frames in lacking.items():
             if len(frames) == len(self.every):
+                hint = "" if absent else " (is its part of the download unpacked?)"
                 raise UserError(
-                    f"{self.root / self.name}: expected {what} for its {len(frames)} frames, got none "
-                    "(is its part of the download unpacked?)."
+                    f"{self.root / self.name}: expected {what} for its {len(frames)} frames, got none{hint}."
                 )
         left_out = {frame.frame_number for frames in lacking.values() for frame in frames}
         notes = [self._told(frames, f"without {what} left out") for what, frames in lacking.items()]
