@@ -1,27 +1,20 @@
 """One prediction under every definition: known films, known images, the tables, and the command on a saved run."""
 
-import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
-import moving
 import msgspec
 import numpy as np
 import pytest
 import torch
-from calling import call, output, refusal
 from extractors import SquaredError
-from films import PROTOCOL, SELECTION
-from prior_files import a_prior
-from records_for_tests import record
+from films import PROTOCOL
 from toys import make_toy
 
 from rewild4d.baselines.empty import EmptyReconstruction
 from rewild4d.baselines.floors_config import PriorOnlyConfig
 from rewild4d.baselines.prior_only import PriorOnly, PriorOnlyReconstruction
 from rewild4d.cameras.placement import IDENTITY
-from rewild4d.datasets.video.aptv2 import AptV2
 from rewild4d.errors import UserError
 from rewild4d.evaluation.definitions import LazyDrawn, _draw, joint_scores, picture_scores, tables
 from rewild4d.evaluation.film_keypoints import Annotated, Part, annotated, mapped, score_keypoints, score_transfer
@@ -29,9 +22,7 @@ from rewild4d.evaluation.film_pictures import Drawn, score_pictures
 from rewild4d.evaluation.joints import joint_tracks
 from rewild4d.evaluation.measuring import evaluate
 from rewild4d.evaluation.networks import Networks, families_of
-from rewild4d.leaderboard.records import write_record
 from rewild4d.metrics.definitions import KEYPOINT_SOURCES, KEYPOINTS, PICTURES, TRANSFER, definition
-from rewild4d.priors.bodies.tetrapod import PARENTS
 from rewild4d.priors.landmarks import load_mapping
 from rewild4d.types import Frame, Keypoints, Truth
 
@@ -295,51 +286,6 @@ def test_every_cell_of_the_tables_is_a_number_a_reason_or_no_part_of_the_paper(
     assert {"Animal-in-Motion", "Animal Avatars", "4D-Animal", "4DEquine, appearance"} <= names
     for name, score in scores.items():
         assert (score.unit, score.better) == (definition(name).unit, definition(name).better)
-
-
-@pytest.fixture
-def run(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A saved run of the standing template on a film with keypoints."""
-    protocol = msgspec.structs.replace(PROTOCOL, dataset="aptv2")
-    monkeypatch.setattr("rewild4d.evaluation.protocol.load_protocols", lambda: {protocol.name: protocol})
-    case = "easy/29wolf/v1C1@3"
-    clip, _ = AptV2(moving.apt(tmp_path / "data", keypoints=[20, 30, 2] * 17)).load(case, SELECTION)
-    still = replace(
-        a_prior([1.5] * 10, [1.5] * 10), times=torch.tensor(clip.times).double(), parents=torch.tensor(PARENTS)
-    )
-    made = PriorOnly().fit(clip, still, config=PriorOnlyConfig(gaussians=300), seed=0, device=torch.device("cpu"),
-                           log=silent, workdir=None)  # fmt: skip
-    folder = tmp_path / "runs" / "one"
-    (folder / "reconstruction").mkdir(parents=True)
-    made.save(folder / "reconstruction")
-    found = record(method="prior-only", dataset="aptv2", case=case, data={"root": str(tmp_path / "data")},
-                   protocol=msgspec.to_builtins(protocol))  # fmt: skip
-    write_record(found, folder)
-    return folder
-
-
-def test_the_command_prints_both_tables_of_a_saved_run_and_leaves_its_record(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    before = (run / "record.json").read_bytes()
-    told = output(capsys, "definitions", run)
-    assert "**prior-only (quick, seed 0) on aptv2 easy/29wolf/v1C1@3: keypoints**" in told and ": images**" in told
-    assert "12 frames of 64x64 pixels, squares that follow the animal" in told and "10 were shown to the method" in told
-    rows = json.loads(output(capsys, "definitions", run, "--keypoints", "--json", "--frames", "held-out"))
-    assert {row["name"] for row in rows} == {*TRANSFER, *(f"{n}_{s}" for n in KEYPOINTS for s in KEYPOINT_SOURCES)}
-    assert all(
-        row["source"] and row["rule"] and (row["value"] is None) == ("not computed" in row["note"]) for row in rows
-    )
-    assert output(capsys, "definitions", run, "--keypoints", "--format", "csv").startswith("definition,keypoints from,")
-    assert (run / "record.json").read_bytes() == before
-
-
-def test_wrong_words_of_the_command_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "expected the folder of one run, got 0 of them" in refusal(capsys, "definitions")
-    assert "unknown format 'mdx'. Did you mean 'md'?" in refusal(capsys, "definitions", tmp_path, "--format", "mdx")
-    assert "unknown keypoint mapping 'badga'" in refusal(capsys, "definitions", tmp_path, "--mapping", "badga")
-    assert str(tmp_path) in refusal(capsys, "definitions", tmp_path)
-    assert call("definitions", "--frames", "some", tmp_path) == 2
 
 
 def test_a_protocol_may_ask_for_the_scores_of_other_papers(posed: tuple[list[Frame], PriorOnlyReconstruction]) -> None:
