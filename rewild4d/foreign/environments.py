@@ -123,11 +123,10 @@ class Docker(Here):
     def require(self, program: str) -> None:
         if shutil.which("docker") is None:
             raise UserError(f"{self.name}: expected docker, but there is no such program here.")
-        if not self.identity():
-            raise UserError(
-                f"{self.name}: expected an image that is here, but docker says: '{_inspected(self.image)[1]}'; "
-                f"`docker pull {self.image}` or `docker build` brings it."
-            )
+        found, said = _inspected(self.image)
+        if not found:
+            advice = f"; `docker pull {self.image}` or `docker build` brings it" if "No such image" in said else ""
+            raise UserError(f"{self.name}: expected an image that docker has, but docker says: '{said}'{advice}.")
 
     def places(self, clip: Path, out: Path) -> tuple[str, str]:
         return CLIP, OUT
