@@ -4,11 +4,13 @@ import contextlib
 import importlib
 import importlib.util
 import logging
+import os
 import shutil
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -197,6 +199,8 @@ def _client(address: Any, name: str) -> Iterator["Client"]:
 @contextmanager
 def _deaf() -> Iterator[None]:
     """Start threads and processes that Ctrl-C does not reach: it is for this one, which ends them."""
+    if os.name == "posix":
+        resource_tracker.ensure_running()  # started later, by the first process, it would unblock Ctrl-C
     block_interrupts(True)
     try:
         yield

@@ -27,7 +27,7 @@ walltime = "01:00:00"
 interface = "lo"
 log_directory = "{logs}"
 """
-SETTINGS = ["--iterations", "300", "--warmup.iterations", "0", "--canonical.samples", "600", "--checkpoint-every", "20"]
+SETTINGS = ["--iterations", "160", "--warmup.iterations", "0", "--canonical.samples", "600", "--checkpoint-every", "20"]
 SETTINGS += ["--image-size", "96", "--skinning.resolution", "12", "--seeds", "0", "1"]
 
 
