@@ -58,6 +58,7 @@ def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
     rounded: dict[str, list[str]] = defaultdict(list)
     records, older = _on_one_protocol(records)
     remarks += older
+    spread = _spread(records)
     cases = grouped(records, lambda record: (record.dataset, record.protocol["name"], record.case))
     for (_, protocol, case), runs in cases.items():
         newest = max(runs, key=_age)
@@ -66,7 +67,7 @@ def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
             remarks.append(f"{protocol}, {case}: {len(runs) - len(same)} older records of other data left out.")
         if len({_digests(run) for run in same}) > 1:
             rounded[protocol].append(case)
-        last = {(_identity(run), run.seed): run for run in sorted(same, key=_age)}
+        last = {(_identity(run), run.seed): run for run in sorted(same, key=lambda run: (spread(run), _age(run)))}
         kept += [run for run in same if last[_identity(run), run.seed] is run]
     remarks += [
         f"{protocol}: {', '.join(found)} rendered on several kinds of processor, equal up to rounding."
@@ -76,6 +77,14 @@ def latest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
     if len(versions) > 1:
         remarks.append(f"Runs of {len(versions)} versions of the code; no mean is over two of them.")
     return kept, remarks
+
+
+def _spread(records: Sequence[RunRecord]) -> Callable[[RunRecord], int]:
+    """Return how many cases the version of a lower bound's run has: of doubled ones the version with most stays, so
+    that its row is of one version. Of methods nothing: the latest run counts."""
+    keys = {id(run): (run.protocol["name"], _identity(run), version_of(run)) for run in records if is_floor(run)}
+    cases = Counter(key for key, _ in {(keys[id(run)], run.case) for run in records if id(run) in keys})
+    return lambda run: cases[keys[id(run)]] if id(run) in keys else 0
 
 
 def _on_one_protocol(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:

@@ -109,6 +109,14 @@ def test_a_lower_bound_that_was_run_beside_several_presets_is_one_row() -> None:
     assert len(protocol_tables(of_prior)[0].rows) == 2, "another prior is another lower bound"
 
 
+def test_of_doubled_lower_bounds_the_version_with_most_cases_stays() -> None:
+    later = Timing("2026-02-01T00:00:00+00:00", 1.0, 1.0, 1.0)
+    found = [on(case, 5.0, method="empty", code=OLD) for case in ("a", "b")]
+    found.append(on("a", 5.0, method="empty", code=NEW, timing=later, prior={"choice": "rig"}))
+    (made,) = protocol_tables([on("a", 20.0, code=NEW), on("b", 20.0, code=NEW), *found])
+    assert {stubs[1] for stubs in rows(made)} == {"ours", "empty"} and rows(made)["mean", "empty"] == "5.00"
+
+
 def test_a_named_table_splits_its_rows() -> None:
     config = load_preset("gart", load_config("gart"), "quick")
     protocol = {**PROTOCOL, "name": planning.newest_protocol("artemis-sweep-128")}
