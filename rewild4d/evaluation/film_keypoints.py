@@ -12,7 +12,7 @@ import numpy as np
 
 from rewild4d.errors import UserError
 from rewild4d.metrics.convex import convex_map, mixed
-from rewild4d.metrics.definitions import KEYPOINTS, TRANSFER
+from rewild4d.metrics.definitions import AIM, KEYPOINTS, TRANSFER
 from rewild4d.metrics.keypoints import (
     Bools,
     accel,
@@ -45,6 +45,7 @@ class Annotated:
         names: of the joints.
         true: pixels of each frame's square image; anything where not counted, float64, [T, K, 2].
         counted: what is annotated and counts, bool, [T, K].
+        placed: and what a network placed without being sure of it, which counts for Animal-in-Motion, [T, K].
         present: frames that are annotated, with or without a joint that counts, bool, [T].
         areas: square root of the true masks' areas, pixels, [T].
         boxes: longer sides of the true masks' boxes, pixels, [T].
@@ -55,6 +56,7 @@ class Annotated:
     names: tuple[str, ...]
     true: Floats
     counted: Bools
+    placed: Bools
     present: Bools
     areas: Floats
     boxes: Floats
@@ -64,14 +66,18 @@ class Annotated:
     def only(self, rows: np.ndarray) -> Annotated:
         """Return some of the frames, in their order."""
         return Annotated(
-            self.names, self.true[rows], self.counted[rows], self.present[rows], self.areas[rows], self.boxes[rows],
-            self.side, self.times[rows],
+            self.names, self.true[rows], self.counted[rows], self.placed[rows], self.present[rows], self.areas[rows],
+            self.boxes[rows], self.side, self.times[rows],
         )  # fmt: skip
+
+    def counts_for(self, name: str) -> Bools:
+        """Return what counts for a score: every joint for those of Animal-in-Motion, as its evaluator has it."""
+        return self.placed if (KEYPOINTS | TRANSFER)[name].source == AIM else self.counted
 
     @property
     def rows(self) -> np.ndarray:
-        """Frames in which a joint counts, ascending."""
-        return np.flatnonzero(self.counted.any(axis=1))
+        """Frames in which a joint counts for any score, ascending."""
+        return np.flatnonzero(self.placed.any(axis=1))
 
 
 @dataclass(frozen=True)
@@ -110,6 +116,7 @@ def annotated(frames: Sequence[Frame], known: Sequence[str] | None = None) -> An
     if others or height != width:
         raise UserError(f"keypoints: expected square images of one size, got {sorted(sizes)}.")
     true, counted = np.full((len(frames), len(names), 2), np.nan), np.zeros((len(frames), len(names)), dtype=bool)
+    placed = counted.copy()
     for row, found in enumerate(frame.keypoints for frame in frames):
         if found is not None:
             try:
@@ -117,10 +124,12 @@ def annotated(frames: Sequence[Frame], known: Sequence[str] | None = None) -> An
             except ValueError as error:
                 raise UserError(f"keypoints of frame {row}: {error}.") from error
             true[row], counted[row] = found.points[order].double().numpy(), found.visible[order].numpy()
+            placed[row] = counted[row] if found.confidence is None else True
     masks = np.stack([frame.mask[0].numpy() >= 0.5 for frame in frames])
     present = np.array([frame.keypoints is not None for frame in frames])
     lengths = area_lengths(masks), box_lengths(mask_boxes(masks))
-    return Annotated(names, true, counted, present, *lengths, float(width), np.array([frame.time for frame in frames]))
+    times = np.array([frame.time for frame in frames])
+    return Annotated(names, true, counted, placed, present, *lengths, float(width), times)
 
 
 def mapped(truth: Annotated, points: Floats, halves: bool) -> list[Part]:
@@ -143,7 +152,7 @@ def mapped(truth: Annotated, points: Floats, halves: bool) -> list[Part]:
     parts = []
     for train, test in splits if halves else [(slice(None), slice(None))]:
         shown = truth.only(rows[train])
-        weights = convex_map(points[train], shown.true, shown.counted)
+        weights = convex_map(points[train], shown.true, shown.placed)
         usable: Bools = np.asarray(np.isfinite(weights).all(axis=1), dtype=bool)
         span = np.arange(rows[test][0], rows[test][-1] + 1)
         predicted = np.full((len(span), len(truth.names), 2), np.nan)
@@ -169,7 +178,9 @@ def score_keypoints(truth: Annotated, parts: Sequence[Part], source: str) -> dic
     note = _note(truth, parts, step, fps)
     scores = {}
     for name in KEYPOINTS:
-        tallies = [_tally(name, some, part.points, some.counted & part.counted, step, fps) for some, part in shown]
+        tallies = [
+            _tally(name, some, part.points, some.counts_for(name) & part.counted, step, fps) for some, part in shown
+        ]
         by_frame = name.endswith("_crop") or name.startswith("accel")
         scores[f"{name}_{source}"] = _score(name, reduce(add, tallies), by_frame, note)
     return scores
@@ -186,7 +197,7 @@ def score_transfer(truth: Annotated, points: Floats, seen: Bools) -> dict[str, S
     rows = truth.rows
     if len(rows) < 2:
         return _untransferred("it takes two annotated frames")
-    both: Bools = np.logical_and(truth.counted[rows[0]], truth.counted[rows[-1]])
+    both: Bools = np.logical_and(truth.placed[rows[0]], truth.placed[rows[-1]])
     if not both.any():
         return _untransferred("no joint is annotated both in the first and in the last annotated frame")
     if not seen.any():

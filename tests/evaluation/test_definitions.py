@@ -39,8 +39,10 @@ def film(frames: int = 12, joints: int = 4) -> Annotated:
     start = np.random.default_rng(1).uniform(10, 40, (1, joints, 2))
     true = start + np.arange(frames)[:, None, None] * np.array([1.0, 0.0])
     full = np.ones((frames, joints), dtype=bool)
-    return Annotated(("a", "b", "c", "d")[:joints], true, full, np.ones(frames, dtype=bool), np.full(frames, 20.0),
-                     np.full(frames, 40.0), 64.0, np.arange(frames) / 10)  # fmt: skip
+    return Annotated(
+        ("a", "b", "c", "d")[:joints], true, full, full, np.ones(frames, dtype=bool), np.full(frames, 20.0),
+        np.full(frames, 40.0), 64.0, np.arange(frames) / 10,
+    )  # fmt: skip
 
 
 def whole(truth: Annotated, points: np.ndarray) -> list[Part]:
@@ -56,6 +58,15 @@ def test_one_error_of_three_pixels_has_three_pcks() -> None:
     assert values["pck@0.05_box_bones"] == 0.0 and values["pck@0.05_crop_bones"] == 1.0  # 2 < 3 < 0.05 * 64
     assert values["mpjve_bones"] == pytest.approx(0, abs=1e-9) and scores["mpjve_bones"].count == 11 * 4
     assert scores["pck@0.1_box_bones"].note.startswith("12 annotated frames, 48 joints; 10 steps a second")
+
+
+def test_joints_that_a_network_placed_unsurely_count_for_one_paper_alone() -> None:
+    truth = replace(film(), placed=np.ones((12, 4), dtype=bool))
+    truth.counted[:, 0] = False
+    points = truth.true.copy()
+    points[:, 0] += 30  # far off, and nobody is sure where it is
+    scores = score_keypoints(truth, whole(truth, points), "bones")
+    assert scores["pck@0.1_mask_area_bones"].value == 3 / 4 and scores["pck@0.1_crop_bones"].value == 1.0
 
 
 def test_a_fixed_frame_rate_multiplies_accelerations() -> None:
