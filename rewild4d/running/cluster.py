@@ -155,7 +155,8 @@ def _started(site: Site, most: int) -> Iterator[Any]:
     # machine nothing is killed that the system lets live.
     given = dict(site.file.arguments)
     if site.file.kind == LOCAL:
-        given = {"memory_limit": 0, "threads_per_worker": 1, "processes": True, **given, "n_workers": workers}
+        local = {"memory_limit": 0, "threads_per_worker": 1, "processes": True, "silence_logs": logging.CRITICAL}
+        given = {**local, **given, "n_workers": workers}
     elif hasattr(kind, "job_cls"):
         given = {"processes": given.get("cores", 1), **given}
         if given.get("cores", 1) != given["processes"]:
