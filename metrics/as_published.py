@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from rewild4d.metrics.image import WINDOW, ssim
-from rewild4d.metrics.tallies import Floats, Tally
+from rewild4d.metrics.tallies import Floats, FrameSums
 
 SMOOTH = 1e-6
 """Added by Animal Avatars to an intersection, a union and a root mean squared error."""
@@ -18,11 +18,11 @@ FACTORS = 100
 """Brightness factors that 4DEquine tries."""
 
 
-def overlap(prediction: Tensor, target: Tensor) -> Tally:
+def overlap(prediction: Tensor, target: Tensor) -> FrameSums:
     """Count the pixels of each pair's intersection (sums) and union (counts).
 
-    `Tally.pooled` is then the IoU of a whole sequence (Animal-in-Motion, scripts/run_benchmark.py at 904a443), and
-    `Tally.mean_of_frames` the mean of the frames' IoU; a frame in which both are empty counts nothing.
+    `FrameSums.pooled` is then the IoU of a whole sequence (Animal-in-Motion, scripts/run_benchmark.py at 904a443), and
+    `FrameSums.mean_of_frames` the mean of the frames' IoU; a frame in which both are empty counts nothing.
 
     Args:
         prediction: boolean, [B, 1, H, W].
@@ -35,17 +35,17 @@ def overlap(prediction: Tensor, target: Tensor) -> Tally:
     """
     _check(prediction, target, channels=1)
     both, either = ((f(prediction, target)).flatten(1).sum(1) for f in (torch.logical_and, torch.logical_or))
-    return Tally(both.double().cpu().numpy(), either.cpu().numpy())
+    return FrameSums(both.double().cpu().numpy(), either.cpu().numpy())
 
 
-def smoothed_iou(found: Tally) -> Floats:
+def smoothed_iou(found: FrameSums) -> Floats:
     """Compute (I + 1e-6) / (U + 1e-6) of each frame, [B]: 1 where both masks are empty.
 
     Source: Animal Avatars, losses/loss_utils.py at 4623ecd.
 
     Examples:
         >>> import numpy as np
-        >>> smoothed_iou(Tally(np.array([3.0, 0.0]), np.array([4, 0]))).round(4).tolist()
+        >>> smoothed_iou(FrameSums(np.array([3.0, 0.0]), np.array([4, 0]))).round(4).tolist()
         [0.75, 1.0]
     """
     return (found.sums + SMOOTH) / (found.counts + SMOOTH)

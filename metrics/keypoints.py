@@ -2,7 +2,7 @@
 
 Papers of animals in videos print "PCK@0.1" and mean different numbers: distances are divided by the square root of the
 mask's area, by a crop's side or by a box; all joints count or visible ones; the mean is over joints or over frames.
-So a threshold, a length a frame and the joints that count are arguments here, and the mean is chosen from the `Tally`.
+So a threshold, a length a frame and the joints that count are arguments here, and `FrameSums` give either mean.
 
 Keypoints are (column, row) in pixels of each frame's image, float, [T, K, 2], in one order of joints (`joint_rows`).
 ``counted`` says which joints of which frames count, bool, [T, K]: what does not is never read and may be NaN.
@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rewild4d.metrics.tallies import Floats, Tally
+from rewild4d.metrics.tallies import Floats, FrameSums
 
 Bools = NDArray[np.bool_]
 
@@ -73,14 +73,14 @@ def box_lengths(boxes: Floats) -> Floats:
     return np.asarray(boxes[:, 2:].max(axis=1), dtype=np.float64)
 
 
-def pck(predicted: Floats, true: Floats, counted: Bools, lengths: Floats, threshold: float) -> Tally:
+def pck(predicted: Floats, true: Floats, counted: Bools, lengths: Floats, threshold: float) -> FrameSums:
     """Count keypoints that are nearer to the truth than a threshold times a length (Yang & Ramanan 2013).
 
         correct = |p - g| < threshold * length of the frame
 
     Definitions in use: Animal-in-Motion (scripts/run_benchmark.py at 904a443) takes `area_lengths` and all 17 joints,
-    `Tally.pooled`; 4DEquine (eval_pose.py and amr/utils/pck_accuracy.py at 7f272d8) the side of a square crop and
-    joints of confidence above 0.5, `Tally.mean_of_frames` with 0 for a frame without any; boxes, `box_lengths`.
+    `FrameSums.pooled`; 4DEquine (eval_pose.py and amr/utils/pck_accuracy.py at 7f272d8) the side of a square crop and
+    joints of confidence above 0.5, `FrameSums.mean_of_frames` with 0 for a frame without any; boxes, `box_lengths`.
 
     Args:
         predicted: finite where they count, [T, K, 2].
@@ -143,13 +143,13 @@ def transferred(points: Floats, seen: Bools, keypoints: Floats, target: Floats) 
     return target[rows[distances.argmin(axis=1)]]
 
 
-def mpjve(predicted: Floats, true: Floats, counted: Bools, side: float, step: int = 1) -> Tally:
+def mpjve(predicted: Floats, true: Floats, counted: Bools, side: float, step: int = 1) -> FrameSums:
     """Compute the mean per-joint velocity error, in halves of the image's side a step.
 
         e[t] = |(p[t + 1] - p[t]) - (g[t + 1] - g[t])| * 2 / side
 
     Coordinates are in [-1, 1], and nothing is divided by time. Source: Animal-in-Motion, scripts/run_benchmark.py at
-    904a443 (`Tally.pooled`).
+    904a443 (`FrameSums.pooled`).
 
     Args:
         predicted: finite where they count, [T, K, 2].
@@ -176,12 +176,12 @@ def mpjve(predicted: Floats, true: Floats, counted: Bools, side: float, step: in
     return _tally(_norms(error[step:] - error[:-step], both) * (2 / side), both)
 
 
-def accel(predicted: Floats, true: Floats, counted: Bools, side: float, fps: float, step: int = 1) -> Tally:
+def accel(predicted: Floats, true: Floats, counted: Bools, side: float, fps: float, step: int = 1) -> FrameSums:
     """Compute the error of accelerations, in sides of the image a second squared.
 
         e[t] = |(p[t] - 2 p[t + 1] + p[t + 2]) - (g[t] - 2 g[t + 1] + g[t + 2])| / side * fps^2
 
-    Source: 4DEquine, eval_pose.py at 7f272d8 (`Tally.mean_of_frames` with 0 for a triple without a joint). There
+    Source: 4DEquine, eval_pose.py at 7f272d8 (`FrameSums.mean_of_frames` with 0 for a triple without a joint). There
     ``fps`` is 30 for all data sets, those of 10 frames a second included: the published variant is this with 30.
 
     Args:
@@ -246,8 +246,8 @@ def _norms(vectors: Floats, counted: Bools) -> Floats:
     return np.linalg.norm(np.where(counted[..., None], vectors, 0.0), axis=2)
 
 
-def _tally(values: Floats, counted: Bools) -> Tally:
-    return Tally(np.where(counted, values, 0.0).sum(axis=1), counted.sum(axis=1, dtype=np.int64))
+def _tally(values: Floats, counted: Bools) -> FrameSums:
+    return FrameSums(np.where(counted, values, 0.0).sum(axis=1), counted.sum(axis=1, dtype=np.int64))
 
 
 def _masks(masks: Bools) -> Bools:

@@ -15,7 +15,7 @@ WORST = 0.05
 
 
 @dataclass(frozen=True)
-class Tally:
+class FrameSums:
     """Sums and counts by frame (or by pair of frames).
 
     Attributes:
@@ -23,7 +23,7 @@ class Tally:
         counts: how many values each sum has, int64, [T].
 
     Examples:
-        >>> clip = Tally(np.array([2.0, 1.0]), np.array([4, 1]))
+        >>> clip = FrameSums(np.array([2.0, 1.0]), np.array([4, 1]))
         >>> clip.pooled(), clip.mean_of_frames()
         (0.6, 0.75)
     """
@@ -31,9 +31,9 @@ class Tally:
     sums: Floats
     counts: NDArray[np.int64]
 
-    def __add__(self, other: Tally) -> Tally:
+    def __add__(self, other: FrameSums) -> FrameSums:
         """Put another clip's frames behind these."""
-        return Tally(np.concatenate((self.sums, other.sums)), np.concatenate((self.counts, other.counts)))
+        return FrameSums(np.concatenate((self.sums, other.sums)), np.concatenate((self.counts, other.counts)))
 
     @property
     def total(self) -> int:
@@ -85,22 +85,3 @@ def worst_mean(values: Sequence[float], better: str, share: float = WORST) -> fl
     if not count:
         return None
     return float((ordered[:count] if better == "higher" else ordered[-count:]).mean())
-
-
-def frame_weighted_mean(values: Sequence[float | None], frames: Sequence[int]) -> float | None:
-    """Compute the mean over clips, each weighted by its number of frames.
-
-    Source: Animal-in-Motion, scripts/run_benchmark.py at 904a443, and 4DEquine, eval_pose.py at 7f272d8, weigh every
-    metric so. Clips without a value are left out with their frames.
-
-    Args:
-        values: one a clip.
-        frames: of each clip.
-
-    Examples:
-        >>> frame_weighted_mean([1.0, 0.5, None], [30, 10, 60])
-        0.875
-    """
-    pairs = [(value, count) for value, count in zip(values, frames, strict=True) if value is not None]
-    weight = sum(count for _, count in pairs)
-    return sum(value * count for value, count in pairs) / weight if weight else None

@@ -26,7 +26,7 @@ from rewild4d.metrics.keypoints import (
     usual_step,
 )
 from rewild4d.metrics.score import Score
-from rewild4d.metrics.tallies import Floats, Tally
+from rewild4d.metrics.tallies import Floats, FrameSums
 
 if TYPE_CHECKING:
     from rewild4d.types import Frame
@@ -232,7 +232,7 @@ def without(name: str, reason: str) -> Score:
     return Score(None, defined.unit, defined.better, 0, note=f"not computed: {reason}")
 
 
-def _tally(name: str, part: Annotated, points: Floats, counted: Bools, step: int, fps: float) -> Tally:
+def _tally(name: str, part: Annotated, points: Floats, counted: Bools, step: int, fps: float) -> FrameSums:
     """Return the sums and counts behind a score; of those with a mean over frames, of annotated frames alone."""
     if name == "mpjve":
         return mpjve(points, part.true, counted, part.side, step)
@@ -246,7 +246,7 @@ def _tally(name: str, part: Annotated, points: Floats, counted: Bools, step: int
         lengths = {"mask_area": part.areas, "box": part.boxes, "crop": np.full(len(part.true), part.side)}
         found = pck(points, part.true, counted, lengths[name.partition("_")[2]], threshold_of(name))
         standing = part.present
-    return Tally(found.sums[standing], found.counts[standing]) if len(standing) else found
+    return FrameSums(found.sums[standing], found.counts[standing]) if len(standing) else found
 
 
 def _rate(truth: Annotated, step: int) -> float:
@@ -255,7 +255,7 @@ def _rate(truth: Annotated, step: int) -> float:
     return 1 / float(np.median(gaps)) if len(gaps) else 1.0
 
 
-def _score(name: str, tally: Tally, by_frame: bool, note: str) -> Score:
+def _score(name: str, tally: FrameSums, by_frame: bool, note: str) -> Score:
     """Return the mean that a score's definition takes: of the frames' means, with 0 for an empty one, or of all."""
     defined = (KEYPOINTS | TRANSFER)[name]
     value = tally.mean_of_frames(empty=0.0) if by_frame else tally.pooled()

@@ -28,7 +28,7 @@ from rewild4d.metrics.as_published import (
 from rewild4d.metrics.definitions import PICTURES
 from rewild4d.metrics.image import WINDOW
 from rewild4d.metrics.score import Score
-from rewild4d.metrics.tallies import WORST, Tally, worst_mean
+from rewild4d.metrics.tallies import WORST, FrameSums, worst_mean
 
 SMALL = 256
 """Longer side of the pictures of Animal Avatars and 4D-Animal; smaller ones stay as they are."""
@@ -79,7 +79,7 @@ class _Found:
     """Values of each frame (None where it has none, such as an empty mask), and sums over all."""
 
     values: dict[str, list[float | None]] = field(default_factory=dict)
-    overlaps: list[Tally] = field(default_factory=list)
+    overlaps: list[FrameSums] = field(default_factory=list)
     squares: float = 0.0
     adjusted: Tensor = field(default_factory=lambda: torch.zeros(len(brightness_factors()), dtype=torch.float64))
     count: int = 0
@@ -184,7 +184,9 @@ def _score(name: str, found: _Found, factor: float, missing: Mapping[str, str]) 
         value, count = worst_mean(values, defined.better), int(WORST * len(values))
         reason = f"5 % of {len(values)} frames is no frame, it takes 20"
     elif name == "iou_pooled":
-        tally = sum(found.overlaps[1:], found.overlaps[0]) if found.overlaps else Tally(np.zeros(0), np.zeros(0, int))
+        tally = (
+            sum(found.overlaps[1:], found.overlaps[0]) if found.overlaps else FrameSums(np.zeros(0), np.zeros(0, int))
+        )
         value, count = tally.pooled(), len(found.overlaps)
     elif name.startswith("psnr_pooled"):
         squares = float(found.adjusted.min()) if name.endswith("brightness") else found.squares

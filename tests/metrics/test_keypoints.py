@@ -16,7 +16,7 @@ from rewild4d.metrics.keypoints import (
     transferred,
     usual_step,
 )
-from rewild4d.metrics.tallies import Tally, frame_weighted_mean, worst_mean
+from rewild4d.metrics.tallies import FrameSums, worst_mean
 
 RNG = np.random.default_rng(0)
 
@@ -48,7 +48,7 @@ def test_the_same_prediction_has_another_pck_by_area_box_and_crop() -> None:
 
 
 def test_means_over_joints_and_over_frames_differ_where_frames_show_unequally_many() -> None:
-    found = Tally(np.array([3.0, 0.0, 0.0]), np.array([3, 1, 0]))
+    found = FrameSums(np.array([3.0, 0.0, 0.0]), np.array([3, 1, 0]))
     assert found.pooled() == 3 / 4
     assert found.mean_of_frames() == (1 + 0) / 2
     assert found.mean_of_frames(empty=0.0) == (1 + 0 + 0) / 3
@@ -204,8 +204,6 @@ def test_the_mean_of_the_worst_frames_needs_twenty_of_them() -> None:
     assert worst_mean(values[:20], "higher") == 0.0 and worst_mean(values[:19], "higher") is None
 
 
-def test_clips_weigh_by_their_frames_and_one_without_a_value_weighs_nothing() -> None:
-    assert frame_weighted_mean([1.0, 0.0, None], [30, 10, 99]) == 30 / 40
-    assert frame_weighted_mean([None], [3]) is None
-    both = Tally(np.array([1.0]), np.array([2])) + Tally(np.array([3.0]), np.array([2]))
+def test_clips_that_are_put_together_pool_their_joints() -> None:
+    both = FrameSums(np.array([1.0]), np.array([2])) + FrameSums(np.array([3.0]), np.array([2]))
     assert both.pooled() == 4 / 4
