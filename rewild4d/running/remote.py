@@ -207,7 +207,6 @@ class Crew:
     def _submit(self, part: Part, is_prior: bool) -> None:
         future: Future[Any]
         mark = digest(str(part.plan.out), self.terms.records)[:4]
-        future: Any
         if is_prior:
             key: tuple[str, ...] = "prior", part.case, f"{part.prior.stem[:8]}-{mark}"
             future = self.client.submit(make_prior, part, self.terms, key=key, pure=False)
