@@ -78,7 +78,7 @@ def test_every_image_score_says_which_way_is_better() -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["run", "--table"], "--table: expected the name of a table, got none; available: ablation, artemis"),
+        (["run", "--table"], "--table: expected the name of a table, got none; available: ablation, aim, artemis"),
         (["run", "--tabel", "artemis"], "unknown option '--tabel'. Did you mean '--table'?"),
         (
             ["check", "--method", "prior-only", "--preset", "standrad"],

@@ -18,7 +18,7 @@ import msgspec
 
 from rewild4d.errors import UserError, reason, unknown_name
 from rewild4d.foreign.texts import read_text, read_toml
-from rewild4d.running.interrupts import block_interrupts
+from rewild4d.running.interrupts import block_interrupts, kept_interrupts
 from rewild4d.running.parts import Records
 
 if TYPE_CHECKING:
@@ -102,7 +102,8 @@ def _load_class(kind: str, source: str) -> type:
         return importlib.import_module("distributed").LocalCluster
     if importlib.util.find_spec("dask_jobqueue") is None:
         raise UserError(f"{source}: expected the package dask-jobqueue for {kind}, run: pip install -e '.[cluster]'.")
-    queues = importlib.import_module("dask_jobqueue")
+    with kept_interrupts():
+        queues = importlib.import_module("dask_jobqueue")
     known = [name for name in dir(queues) if name.endswith("Cluster") and name != "JobQueueCluster"]
     if kind not in known:
         raise unknown_name("class of a cluster", kind, [LOCAL, *known])

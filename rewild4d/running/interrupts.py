@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from types import CodeType, FrameType
 
 STATUS = 130
@@ -49,6 +51,17 @@ def answer_interrupts(owner: CodeType, line: str = "") -> bool:
 def _swallows(frame: FrameType) -> bool:
     package = frame.f_globals.get("__name__", "").partition(".")[0]
     return frame.f_code.co_filename.startswith("<frozen importlib") or package in COMPILERS
+
+
+@contextmanager
+def kept_interrupts() -> Iterator[None]:
+    """Keep the handler of Ctrl-C while something is imported that sets another one."""
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        yield
+    finally:
+        if signal.getsignal(signal.SIGINT) is not before:  # only the main thread can have changed it
+            signal.signal(signal.SIGINT, before)
 
 
 def block_interrupts(blocked: bool) -> None:

@@ -1,6 +1,9 @@
 """Cluster files, and flags of clusters: what cannot be is one sentence, before anything is made."""
 
+import signal
 import sys
+from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -10,9 +13,21 @@ from rewild4d.errors import UserError
 from rewild4d.running.cluster import ClusterFile, Site, check_site, connected, read_cluster_file
 
 pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
-pytest.importorskip("dask_jobqueue", reason="the extra `cluster` is not installed")
+if find_spec("dask_jobqueue") is None:
+    pytest.skip("the extra `cluster` is not installed", allow_module_level=True)
 TOML = 'class = "SLURMCluster"\nworkers = 16\n[arguments]\nqueue = "gpu"\ncores = 1\n'
 YAML = "class: SLURMCluster\nworkers: 16\narguments:\n  queue: gpu\n  cores: 1\n"
+
+
+def test_classes_of_queues_leave_ctrl_c_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """dask_jobqueue sets a handler of its own when it is imported."""
+    for name in [name for name in sys.modules if name.partition(".")[0] == "dask_jobqueue"]:
+        monkeypatch.delitem(sys.modules, name)
+    before = signal.getsignal(signal.SIGINT)
+    (tmp_path / "a.toml").write_text(TOML)
+    with suppress(UserError):  # there may be no Slurm here
+        check_site(Site("shared", file=read_cluster_file(tmp_path / "a.toml"), source="a.toml"))
+    assert "dask_jobqueue.runner" in sys.modules and signal.getsignal(signal.SIGINT) is before
 
 
 @pytest.mark.parametrize(("name", "text"), [("a.toml", TOML), ("a.yaml", YAML), ("a.yml", YAML)])

@@ -20,7 +20,7 @@ from rewild4d.commands.shared import exit_code, require_writable
 from rewild4d.errors import UserError
 from rewild4d.evaluation.measuring import evaluate
 from rewild4d.evaluation.protocol import find_protocol
-from rewild4d.machine import _sources, code_of, code_version
+from rewild4d.machine import code_of, code_version, package_sources
 from rewild4d.metrics import weights
 from rewild4d.priors.choose import PriorChoice
 from rewild4d.priors.config import STANDARD
@@ -217,7 +217,7 @@ def test_edited_sources_of_a_plugged_in_method_are_another_run(
     plan = replace(plan, entries=(runner.Entry("mine", "default", SETTINGS, (0,)),))
     ids = [only_job(plan).run_id, only_job(plan).run_id]
     (package / "network.py").write_text("LAYERS = 3\n")
-    _sources.cache_clear()  # a new process
+    package_sources.cache_clear()  # a new process
     ids.append(only_job(plan).run_id)
     assert ids[0] == ids[1] != ids[2]
     assert set(code_of("mine")) == {"version", "sources", "method"}

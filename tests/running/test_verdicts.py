@@ -1,6 +1,5 @@
 """A run says before its fit whether its masks can be trusted, and its record and its first lines say it again."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import moving
@@ -14,17 +13,21 @@ from rewild4d.commands.run import print_verdicts
 from rewild4d.contracts import Verdict
 from rewild4d.datasets.video.online import Online
 from rewild4d.leaderboard.records import to_json
+from rewild4d.priors import choose
 from rewild4d.running import runner
 
 
-def test_a_run_with_masks_that_are_too_large_says_so_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_with_masks_that_are_too_large_says_so_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(choose, "FOOTAGE", TINY)
     moving.frames(tmp_path / "clip")
     for number in range(12):
         mask = moving.mask(number)
         grown = np.maximum.reduce([np.roll(mask, (y, x), (0, 1)) for y in range(-5, 6) for x in range(-5, 6)])
         moving.save(tmp_path / "masks" / f"{number:05d}.png", grown)
     made = plan(Online(tmp_path / "clip", masks=tmp_path / "masks"), "clip", tmp_path / "runs")
-    (record,) = runner.execute(replace(made, prior=replace(made.prior, config=TINY)))
+    (record,) = runner.execute(made)
     before = capsys.readouterr().err
     assert "clip: masks: red: they are too large, or shifted" in before
     levels = {verdict.about: verdict.level for verdict in record.verdicts}
