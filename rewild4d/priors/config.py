@@ -50,6 +50,8 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         density_weight: mean squared deviation from the shapes of random animals, where these are known; instead of the
             two before.
         angle_weight: squared joint angles, in standard deviations; fast motion counts more.
+        straight_weight: squared mean yaw and roll of head, neck, trunk and tail, in standard deviations, where shapes
+            are known: an animal that bends sideways looks shorter to one camera.
         root_weight: squared motion and tilt of the root, in standard deviations; fast motion counts more.
         view_weight: squared cosine between heading and viewing direction, where all cameras look one way: an animal at
             an angle looks like a shorter one.
@@ -72,6 +74,7 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     relief_weight: float = 0.015
     density_weight: float = 0.03
     angle_weight: float = 0.15
+    straight_weight: float = 0.03
     root_weight: float = 0.2
     view_weight: float = 0.01
     heading_weight: float = 0.03

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.priors.bodies.body import Body, Proportions, Template
+from rewild4d.priors.bodies.tetrapod import SPINE
 from rewild4d.priors.config import Stage
 from rewild4d.priors.kinematics import moved, pose
 from rewild4d.priors.silhouettes import PARTS, Targets, rasterized, splat
@@ -174,6 +175,10 @@ class Hypotheses:
         bearing = torch.exp(-(height - height.amin(1, keepdim=True)) / LIFTED)
         travel = (bearing * step.abs()).sum((1, 2))
         return (bearing * step).sum((1, 2)) / (travel + STILL_STEP * bearing.sum((1, 2)))
+
+    def sideways(self) -> Tensor:
+        """Return the mean square of how far the spine of a `Tetrapod` is bent and rolled sideways on average, [B]."""
+        return self.angles[:, 0, :SPINE, 1:].square().mean((1, 2))
 
     def penalties(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return penalties of proportions, relief, joint angles and root motion, each [B].

@@ -147,6 +147,7 @@ class Race:
             penalty = config.shape_weight * shape + config.relief_weight * relief
         else:
             penalty = config.density_weight * self.shapes.penalty(self.guesses.shape, self.guesses.relief)
+            penalty = penalty + config.straight_weight * self.guesses.sideways()
         penalty = penalty + config.angle_weight * swing + config.root_weight * root + self.evidence()
         if not stage.colors:
             return mismatch(self.guesses.silhouettes(targets, stage), targets, sigma) + penalty

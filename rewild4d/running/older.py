@@ -27,7 +27,9 @@ def _older_prior(run: RunRecord) -> str:
         return ""
     if cameras in ("fixed", "unknown"):
         missing = [] if "heading_weight" in settings else ["headings"]
-        missing += ["shapes of random animals"] if cameras == "fixed" and "density_weight" not in settings else []
+        if cameras == "fixed":
+            missing += [] if "density_weight" in settings else ["shapes of random animals"]
+            missing += [] if "straight_weight" in settings else ["a straight spine"]
     else:
         coloured = run.preset == "quick" or any("colors" in stage for stage in settings["stages"])
         missing = [] if coloured else ["colours"]

@@ -26,6 +26,15 @@ def angle(a: Tensor, b: Tensor) -> float:
     return float(torch.rad2deg(torch.arccos(cosine)))
 
 
+def test_a_spine_is_bent_sideways_by_its_mean_yaw_and_roll_alone() -> None:
+    guesses = Hypotheses.start(QUADRUPED, torch.eye(3).repeat(2, 1, 1), torch.zeros(6, 3))
+    guesses.angles[1, 0, 2, 1] = 4.0  # the neck's yaw, of 8 bones with yaw and roll
+    guesses.angles[:, 1:, 2, 1] = 5.0  # swings to and fro
+    guesses.angles[:, :, 2, 0] = 6.0  # nods
+    guesses.angles[:, :, 10, 1] = 7.0  # a leg
+    assert guesses.sideways().tolist() == [0.0, 4.0**2 / 16]
+
+
 def test_a_known_animal_is_found_again() -> None:
     clip = walking_clip(8, "sweep")
     prior = fit_template(clip, config=shortened(25, yaw_starts=8), seed=0, log=silent)

@@ -81,6 +81,8 @@ def test_runs_from_priors_of_masks_alone_stand_for_their_row_with_a_note_until_t
 
     shapeless = {name: value for name, value in then.items() if name != "density_weight"}
     before = {name: value for name, value in shapeless.items() if name != "heading_weight"}
+    bent = {name: value for name, value in then.items() if name != "straight_weight"}
+    assert row(bent, cameras="fixed").notes == (PRIOR.format(parts="a straight spine"),)
     old, new, none = row(then), row(then, now), row(masks)
     fixed, unread = row(then, cameras="fixed"), row(before, cameras="fixed")
     assert [r.run_id for r in old.records[0]] == ["0"] and old.notes == (PRIOR.format(parts="colours"),)

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.priors.bodies.body import Measure
-from rewild4d.priors.bodies.tetrapod import ENDS, Measures, Tetrapod, direction, head_sections, tail_sections
+from rewild4d.priors.bodies.tetrapod import ENDS, SPINE, Measures, Tetrapod, direction, head_sections, tail_sections
 from rewild4d.priors.bodies.tubes import Section, point
 
 HEAD_FORWARD, NOSE_FORWARD, POLL_FORWARD = 0.4, 0.35, 0.1
@@ -107,7 +107,8 @@ class Quadruped(Tetrapod):
     def carriage(self, bones: Tensor, transforms: Tensor) -> Tensor:
         """A head points forwards and lies before the withers, a tail hangs behind the hips."""
         turns = transforms[..., :3, :3]
-        ends = torch.einsum("btjac,bjkc->btjka", turns[:, :, :8], bones[:, :8]) + transforms[:, :, :8, None, :3, 3]
+        spine = transforms[:, :, :SPINE, None, :3, 3]
+        ends = torch.einsum("btjac,bjkc->btjka", turns[:, :, :SPINE], bones[:, :SPINE]) + spine
         nose, poll, withers, tip, hips = (
             ends[:, :, bone, end] for bone, end in ((0, 1), (0, 0), (3, 1), (4, 1), (6, 0))
         )

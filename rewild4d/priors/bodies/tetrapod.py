@@ -19,6 +19,8 @@ from rewild4d.transforms import mirror_points
 
 PARENTS = (1, 2, 3, -1, 5, 6, 7, -1, 9, 10, 3, 12, 13, 7, 15, 16, 7, 18, 19, 3)
 MIRROR = (0, 1, 2, 3, 4, 5, 6, 7, 17, 18, 19, 14, 15, 16, 11, 12, 13, 8, 9, 10)
+SPINE = 8
+"""Bones of head, neck, trunk and tail; they come first."""
 ENDS = (8, 11, 14, 17)
 """Last bone of each limb."""
 
