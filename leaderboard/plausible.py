@@ -7,6 +7,7 @@ from datetime import datetime
 from statistics import fmean
 
 from rewild4d.leaderboard.records import RunRecord
+from rewild4d.metrics.as_published import RMSE_PSNR_CAP
 from rewild4d.metrics.image import PSNR_CAP
 from rewild4d.metrics.names import RIGID, SCALE, SILHOUETTES
 from rewild4d.metrics.score import Score
@@ -14,21 +15,24 @@ from rewild4d.metrics.score import Score
 MEAN_TOLERANCE = 1e-3
 """A mean may differ from that of its items, whose digits are cut, by this part of the largest item."""
 RANGES = {
-    "psnr": (0.0, PSNR_CAP), "ssim": (-1.0, 1.0), "lpips": (0.0, math.inf), "fscore": (0.0, 1.0),
+    "psnr_black": (-math.inf, RMSE_PSNR_CAP), "psnrm": (-math.inf, RMSE_PSNR_CAP), "psnr_pooled": (-math.inf, math.inf),
+    "psnr": (0.0, PSNR_CAP), "pck": (0.0, 1.0), "kt": (0.0, 1.0), "mpjve": (0.0, math.inf), "accel": (0.0, math.inf),
+    "ssim": (-1.0, 1.0), "lpips": (0.0, math.inf), "fscore": (0.0, 1.0),
     "chamfer": (0.0, math.inf), "kid": (-1.0, math.inf), "fvd": (0.0, math.inf),
     **dict.fromkeys(SILHOUETTES, (0.0, 1.0)),
 }  # fmt: skip
-"""Beginning of a score's name -> least and largest value that its definition allows; of colours in [0, 1]. KID is an
-unbiased estimate, which may be below zero."""
+"""Beginning of a score's name -> least and largest value that its definition allows; the first that fits counts, and
+colours are in [0, 1]. KID is an unbiased estimate, which may be below zero."""
 
 
 def implausible(record: RunRecord) -> list[str]:
-    """Say what in a record cannot be, a sentence each."""
+    """Say what in a record cannot be, a sentence each; of metrics of other packages nothing is known but that."""
     faults = [*_run(record)]
-    for name, score in record.scores.items():
+    own = {name: score for name, score in record.scores.items() if name not in record.metrics}
+    for name, score in own.items():
         faults += [f"{name}: {fault}" for fault in _score(name, score)]
     asked = set(record.protocol["scores"]) if record.status == "ok" else set()
-    if given := sorted(asked ^ set(record.scores)):
+    if given := sorted(asked ^ set(own)):
         faults.append(f"expected the scores of its protocol and no others; of one alone: {', '.join(given)}.")
     return faults
 

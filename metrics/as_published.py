@@ -14,6 +14,8 @@ from rewild4d.metrics.tallies import Floats, FrameSums
 
 SMOOTH = 1e-6
 """Added by Animal Avatars to an intersection, a union and a root mean squared error."""
+RMSE_PSNR_CAP = 120.0
+"""PSNR of identical images by `psnr_of_rmse`, dB: 20 log10(1 / `SMOOTH`)."""
 FACTORS = 100
 """Brightness factors that 4DEquine tries."""
 

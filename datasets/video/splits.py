@@ -3,14 +3,6 @@
 Split = int | tuple[int, int]
 """As `contracts.Selection.split`."""
 
-FIFTEEN_OF_TWENTY: Split = (15, 5)
-"""4D-Animal's configuration on CoP3D and the default of Animal Avatars' reader: 15 shown, then 5 held out.
-
-zhongshsh/4D-Animal config/config.yaml @ 2b8a959; facebookresearch/AnimalAvatar data/input_cop.py @ a28e905.
-"""
-ALL_SHOWN: Split = (15, 0)
-"""Animal Avatars' released configuration: every frame is shown and scored (config/config.yaml @ a28e905)."""
-
 
 def split_frames(count: int, split: Split) -> list[bool]:
     """Return which usable frames are held out: the middle one of every ``split``, never the first or the last.

@@ -106,7 +106,10 @@ def _score_one(bundle: Bundle, run: str, data: Path, device: str, rasterizer: st
             raise UserError(f"{run}: {str(error).replace(f'{copy}', run)}") from error
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, ArithmeticError) as error:
             raise UserError(f"{run}: its predictions cannot be scored: {reason(error)}.") from error
-        values = {name: (score.value, again.scores[name].value) for name, score in record.scores.items()}
+        values = {
+            name: (score.value, again.scores[name].value if name in again.scores else None)
+            for name, score in record.scores.items()
+        }
         one_sided = [name for name, pair in values.items() if pair.count(None) == 1]
         found += [f"{run}: {fault}" for fault in differences(record, again)]
         bundle.rescored.append(run)
@@ -136,7 +139,7 @@ def differences(record: RunRecord, again: RunRecord) -> list[str]:
     """Say which scores and marks of a record did not come out again, a sentence each."""
     said = []
     for name, score in record.scores.items():
-        new = again.scores[name].value
+        new = again.scores[name].value if name in again.scores else None  # a metric whose package is not here
         if score.value is not None and new is not None and not abs(new - score.value) <= _allowed(score):
             said.append(
                 f"{name}: its record says {score.value:.6g}, but its predictions score {new:.6g}; expected at most "

@@ -95,7 +95,8 @@ def _load_class(kind: str, source: str) -> type:
     module, colon, name = kind.partition(":")
     if colon:
         try:
-            return getattr(importlib.import_module(module), name)
+            with kept_interrupts():
+                return getattr(importlib.import_module(module), name)
         except (ImportError, AttributeError, ValueError) as error:
             raise UserError(f"{source}: expected a class at {kind}, but {reason(error)}.") from error
     if kind == LOCAL:

@@ -256,6 +256,8 @@ def test_what_comes_out_again_may_differ_in_its_last_digits() -> None:
     assert again(20.0, 0.5 * (1 + 0.002)) == [
         "iou: its record says 0.5, but its predictions score 0.501; expected at most 0.0005 between them."
     ]
+    there = record(scores={**said.scores, "strangeness": Score(7.0, "px", "", 1)})
+    assert differences(there, said) == [], "its package is not here"
     marked = record(scores=said.scores, marks=["upper bound: it saw more"])
     assert differences(said, marked) == ["expected the mark 'upper bound: it saw more', got none."]
 

@@ -16,12 +16,14 @@ from rewild4d.datasets.builtin import filming
 from rewild4d.datasets.cop3d.cameras import FORMATS, Viewpoint, from_opencv, to_opencv
 from rewild4d.datasets.cop3d.reader import Cop3d, evaluation_sequences, refined_sequences
 from rewild4d.datasets.images import read_alpha
-from rewild4d.datasets.video.splits import ALL_SHOWN, FIFTEEN_OF_TWENTY, split_frames
+from rewild4d.datasets.video.splits import split_frames
 from rewild4d.errors import UserError
+from rewild4d.evaluation.protocol import find_protocol
 
 pytestmark = pytest.mark.usefixtures("cache")
 
 CASE = "dog/1_2_3"
+FIFTEEN_OF_TWENTY, ALL_SHOWN = (find_protocol("cop3d", name).selection.split for name in ("cop3d-v1", "cop3d-all-v1"))
 HELD_OUT = Selection(cameras="known", size=96, framing="letterbox", split=FIFTEEN_OF_TWENTY)
 SHOWN = Selection(cameras="known", size=96, framing="full", split=ALL_SHOWN, mask_threshold=0.7)
 
