@@ -168,7 +168,7 @@ def coverage_text(records: Sequence[RunRecord]) -> str:
     """Say how much of an image is animal and how much of it was shown, averaged over the cases."""
     by_case = {record.case: record.coverage for record in records if record.coverage}
     parts = []
-    for key, text in (("foreground", "of a held-out image is animal"), ("seen_surface", "of its surface ever shown")):
+    for key, text in (("foreground", "of a scored image is animal"), ("seen_surface", "of its surface ever shown")):
         values = [found[key] for found in by_case.values() if key in found]
         if values:
             parts.append(f"{100 * statistics.fmean(values):.0f} % {text}")

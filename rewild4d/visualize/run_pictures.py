@@ -31,7 +31,7 @@ def save_pictures(
 ) -> list[str]:
     """Write all pictures of a run into ``folder`` and return their names.
 
-    comparison.png  rows are times; input, render, held-out truth, held-out render
+    comparison.png  rows are times; input, render, and where views are held out their truth and render
     canonical.png   canonical Gaussians coloured by skinning weight (methods that have them)
     input.mp4       input beside render, in the input view
     orbit.mp4       one orbit around the moving animal, upright
@@ -62,7 +62,7 @@ def save_pictures(
 
 
 def comparison(reconstruction: Reconstruction, clip: Clip, truth: Truth, placement: Placement = IDENTITY) -> Tensor:
-    """Draw the comparison picture, its held-out views by ``placement``, [3, H, W]."""
+    """Draw the comparison picture, its held-out views (where there are some) by ``placement``, [3, H, W]."""
     panels, times = [], [frame.time for frame in truth.held_out]
     for row in range(ROWS):
         frame = clip.frames[row * len(clip.frames) // ROWS]
@@ -70,7 +70,8 @@ def comparison(reconstruction: Reconstruction, clip: Clip, truth: Truth, placeme
         images = [frame.over(1.0), _shot(reconstruction, frame)]
         if held:
             other = truth.held_out[held[(len(held) // 3 + row * len(held) // (2 * ROWS)) % len(held)]]
-            images += [other.over(1.0), _shot(reconstruction, other, placement)]
+            if other.view != frame.view:  # some protocols score the frames that were shown
+                images += [other.over(1.0), _shot(reconstruction, other, placement)]
         panels.append(beside(*images))
     titles = ["input", "render", "held-out truth", "held-out render"]
     return torch.cat([header(titles[: len(images)], panels[0].shape[2]), *panels], dim=1)

@@ -24,7 +24,7 @@ from rewild4d.types import Clip, Crop
 from rewild4d.visualize import original_view, turntable
 from rewild4d.visualize.original_view import original_frames, save_original_view
 from rewild4d.visualize.pictures import PANEL, over
-from rewild4d.visualize.run_pictures import save_pictures
+from rewild4d.visualize.run_pictures import comparison, save_pictures
 from rewild4d.visualize.turntable import Framing, find_framing, four_views, orbit_frames
 
 pytestmark = pytest.mark.usefixtures("cache")
@@ -189,6 +189,13 @@ def test_the_turn_starts_at_the_camera_follows_the_animal_and_closes() -> None:
     first = framing.camera(0, framing.azimuth).center - framing.middles[0]
     given = cameras[0.0].center - framing.middles[0]
     assert float(first @ given / first.norm() / given.norm()) > 0.9
+
+
+def test_frames_that_are_shown_and_scored_are_drawn_once() -> None:
+    case = tiny_case()
+    two = comparison(EmptyReconstruction(), case.clip, replace(case.truth, held_out=case.clip.frames))
+    four = comparison(EmptyReconstruction(), case.clip, case.truth)
+    assert two.shape[2] == four.shape[2] / 2
 
 
 def test_nothing_is_drawn_as_white(tmp_path: Path) -> None:
