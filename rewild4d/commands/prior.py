@@ -101,6 +101,7 @@ class TrainOptions:
         epochs: of headings: how often their pictures are gone through.
         two_legged: of headings: share of the animals that have two legs, 0 to 1.
         start: of headings: weights to start from, as an earlier training wrote them; the learning rate is a quarter.
+        augment: of headings: stretch parts of animals, and bend pictures and change their light.
         rounds: of points: of eight animals each; the learning rate falls over all of them.
         seed: of the animals and of the first weights.
         workers: processes that draw (of shapes: fit) animals; of points beside the one that trains; 0 takes the same.
@@ -112,6 +113,7 @@ class TrainOptions:
     epochs: int = 10
     two_legged: float = 0.0
     start: Path | None = None
+    augment: bool = False
     rounds: int = 2000
     seed: int = 0
     workers: int = 2
@@ -167,7 +169,12 @@ def _trained(options: TrainOptions) -> Path:
         return shapes.train(options.out, samples, workers=options.workers, report=print)
     start = "" if options.start is None else str(options.start)
     epochs = headings.TrainingConfig(
-        epochs=options.epochs, seed=options.seed, two_legged=options.two_legged, start=start, **animals
+        epochs=options.epochs,
+        seed=options.seed,
+        two_legged=options.two_legged,
+        start=start,
+        augment=options.augment,
+        **animals,
     )
     return headings.train(options.out, epochs, workers=options.workers, report=print)
 

@@ -27,6 +27,11 @@ TWO_LEGGED = tuple(name for name in KINDS if name not in FOUR_FOOTED)
 """Kinds that animals are mixed of."""
 ADDED = sorted({extra for name in FOUR_FOOTED for extra in KINDS[name].proportions.extras} - {"trunk", "tusks"})
 """Extras that any four-footed animal may have besides its own."""
+STRETCHED = {
+    "trunk": 0.22, "girth": 0.15, "width": 0.1, "neck": 0.22, "neck_girth": 0.12, "head": 0.15, "head_girth": 0.12,
+    "tail": 0.2, "leg_girth": 0.2,
+}  # fmt: skip
+"""Spread of the logarithm of each factor of an animal that is stretched."""
 FOOTFALLS = ((0.0, 0.25, 0.5, 0.75), (0.0, 0.5, 0.5, 0.0), (0.0, 0.0, 0.5, 0.5), (0.0, 0.42, 0.1, 0.54),
              (0.0, 0.5, 0.0, 0.5))  # fmt: skip
 """Touchdown of the feet in a walk, trot, pace, gallop and bound."""
@@ -64,9 +69,16 @@ class VariedAnimal:
     points: np.ndarray
 
 
-def draw_animal(rng: np.random.Generator, kinds: Sequence[str] = FOUR_FOOTED) -> VariedAnimal:
-    """Draw an animal between two of some kinds, of the stance and with extras of the first."""
+def draw_animal(
+    rng: np.random.Generator, kinds: Sequence[str] = FOUR_FOOTED, *, stretched: bool = False
+) -> VariedAnimal:
+    """Draw an animal between two of some kinds, of the stance and with extras of the first.
+
+    One that is ``stretched`` has parts as long, short, thick or thin as no kind has them.
+    """
     plan = _proportions(rng, kinds)
+    if stretched:
+        plan = _stretched(plan, rng)
     palettes, patterns = (tuple(coats.PALETTES), tuple(coats.PATTERNS))
     coat, _ = coats.draw(rng, palettes, patterns, 0.3 * plan.size * float(np.exp(rng.normal(0, 0.4))))
     body = bodies.body(plan)
@@ -85,6 +97,14 @@ def _proportions(rng: np.random.Generator, kinds: Sequence[str]) -> bodies.Propo
     pitch = plan.pitch + float(rng.normal(0, 3.0))
     tail = plan.tail * float(np.exp(rng.normal(0, 0.3)))
     return replace(plan, extras=tuple(dict.fromkeys(extras)), paws=paws, pitch=pitch, tail=tail)
+
+
+def _stretched(plan: bodies.Proportions, rng: np.random.Generator) -> bodies.Proportions:
+    found: dict[str, object] = {}
+    for name, spread in STRETCHED.items():
+        value, factor = getattr(plan, name), float(np.exp(rng.normal(0, spread)))
+        found[name] = value * factor if isinstance(value, float) else tuple(factor * part for part in value)
+    return replace(plan, neck_angle=plan.neck_angle + float(rng.normal(0, 10)), **found)  # type: ignore[arg-type]
 
 
 def mixed(one: bodies.Proportions, two: bodies.Proportions, amount: float) -> bodies.Proportions:

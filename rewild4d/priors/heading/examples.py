@@ -12,13 +12,14 @@ SEQUENCES, FRAMES = 16, 4
 """Drawn of each animal."""
 
 
-def drawn(rng: np.random.Generator, two_legged: float = 0.0) -> Pictures:
+def drawn(rng: np.random.Generator, two_legged: float = 0.0, *, stretched: bool = False) -> Pictures:
     """Draw pictures of one random animal under random cameras, `SEQUENCES` * `FRAMES`.
 
-    A share ``two_legged`` of the animals has two legs.
+    A share ``two_legged`` of the animals has two legs. Those that are ``stretched`` are wider than the zoo's kinds
+    (`varied.draw_animal`).
     """
     kinds = TWO_LEGGED if two_legged and rng.random() < two_legged else FOUR_FOOTED
-    found = draw_sequences(rng, SEQUENCES, FRAMES, kinds=kinds, names=SPINE)
+    found = draw_sequences(rng, SEQUENCES, FRAMES, kinds=kinds, names=SPINE, stretched=stretched)
     rotations, points = (value.flatten(0, 1).double() for value in (found.rotations, found.points))
     ahead = points[:, SPINE.index("withers")] - points[:, SPINE.index("hips")]
     left, away = ground_axes(rotations[:, :, 1])

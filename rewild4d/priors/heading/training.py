@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from rewild4d.files import atomic
+from rewild4d.priors.heading.augmentation import augmented
 from rewild4d.priors.heading.examples import drawn
 from rewild4d.priors.heading.network import HeadingNetwork, likeliest, log_shares, shares_around, wrapped
 from rewild4d.priors.heading.pictures import Pictures, from_bytes, joined
@@ -51,6 +52,7 @@ class TrainingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         seed: of the animals and of the weights.
         two_legged: share of the animals that have two legs.
         start: file of weights to start from; new ones where it is empty.
+        augment: whether parts of animals are stretched, and pictures bent and lit anew (`augmentation`).
     """
 
     animals: int = 1600
@@ -58,6 +60,7 @@ class TrainingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: int = 0
     two_legged: float = 0.0
     start: str = ""
+    augment: bool = False
 
 
 def train(folder: Path, config: TrainingConfig, *, workers: int, report: Callable[[str], None]) -> Path:
@@ -101,7 +104,7 @@ def _drawn(folder: Path, config: TrainingConfig, workers: int, report: Callable[
 def _part(config: TrainingConfig, row: int) -> Arrays:
     numbers = range(row * PART, min((row + 1) * PART, config.animals))
     streams = [np.random.default_rng((STREAM, config.seed, number)) for number in numbers]
-    made = joined([drawn(stream, config.two_legged) for stream in streams])
+    made = joined([drawn(stream, config.two_legged, stretched=config.augment) for stream in streams])
     return {name: value.numpy() for name, value in vars(made).items()}
 
 
@@ -140,7 +143,11 @@ class _Progress:
                 group["lr"] = self.rate * warmth(step, total, warmup=WARMUP, cooling=COOLING)
             shown = given.chosen(chosen)
             shown = shown.mirrored(torch.rand(len(shown), generator=rows) < 0.5)
-            value = _loss(self.network, shown, torch.rand(len(shown), generator=rows) < BLIND)
+            pictures = from_bytes(shown.shown)
+            pictures[torch.rand(len(shown), generator=rows) < BLIND, 1] = 0
+            if self.config.augment:
+                pictures = augmented(pictures, rows)
+            value = _loss(self.network, pictures, shown)
             self.optimizer.zero_grad()
             value.backward()  # type: ignore[no-untyped-call]
             self.optimizer.step()
@@ -161,9 +168,7 @@ class _Progress:
             scratch.write_text(json.dumps(self.curve, indent=1))
 
 
-def _loss(network: HeadingNetwork, shown: Pictures, blind: Tensor) -> Tensor:
-    pictures = from_bytes(shown.shown)
-    pictures[blind, 1] = 0
+def _loss(network: HeadingNetwork, pictures: Tensor, shown: Pictures) -> Tensor:
     return -(shares_around(shown.azimuths) * network(pictures, shown.cameras)).sum(1).mean()
 
 

@@ -26,9 +26,10 @@ def draw_sequences(
     *,
     kinds: Sequence[str] = FOUR_FOOTED,
     names: Sequence[str] = NAMES,
+    stretched: bool = False,
 ) -> Examples:
-    """Draw ``count`` sequences of one random animal between two of some kinds, with the named points."""
-    animal = draw_animal(rng, kinds)
+    """Draw ``count`` sequences of one random animal with the named points; the rest as of `draw_animal`."""
+    animal = draw_animal(rng, kinds, stretched=stretched)
     return joined([_sequence(animal, length, names, rng) for _ in range(count)])
 
 

@@ -3,11 +3,13 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from rewild4d.errors import UserError
 from rewild4d.priors.heading import examples, training
+from rewild4d.priors.heading.augmentation import augmented
 from rewild4d.priors.heading.network import HeadingNetwork
 from rewild4d.priors.heading.training import TrainingConfig, train
 from rewild4d.priors.learned.weights import read_weights
@@ -61,6 +63,31 @@ def test_a_training_starts_from_earlier_weights(tmp_path: Path) -> None:
     assert 0 < (later.state_dict()[name] - before[name]).norm() < 0.2 * (new[name] - before[name]).norm()
     first = [json.loads((tmp_path / which / "curve.json").read_text())[0]["loss"] for which in ("earlier", "later")]
     assert first[1] < first[0] - 0.2
+
+
+def test_augmented_pictures_are_changed_in_place_and_light_and_keep_what_they_hide() -> None:
+    pictures = torch.zeros(64, 2, 48, 48)
+    pictures[:, 0, 12:36, 8:40] = 1
+    pictures[:32, 1, 12:36, 8:24], pictures[:32, 1, 12:36, 24:40] = 0.5, -0.5
+    first, again = (augmented(pictures, torch.Generator().manual_seed(3)) for _ in range(2))
+    assert torch.equal(first, again) and first.shape == pictures.shape
+    assert first[:, 0].min() >= 0 and first[:, 0].max() <= 1
+    areas = first[:, 0].mean((1, 2)) / pictures[0, 0].mean()
+    assert areas.log().mean().abs() < 0.15 and 0.1 < areas.log().std() < 0.5
+    assert first[32:, 1].abs().max() == 0, "no brightness where none was shown"
+    assert first[:32, 1][first[:32, 0] == 0].abs().max() < 1e-6, "none outside the mask"
+    left, right = first[:32, 1].split(24, dim=-1)
+    assert (left.mean((1, 2)) > right.mean((1, 2))).float().mean() > 0.8
+
+
+def test_a_training_augments_where_it_is_asked_to(tmp_path: Path) -> None:
+    plain = train(tmp_path / "plain", TrainingConfig(animals=2, epochs=1), workers=0, report=silent)
+    config = TrainingConfig(animals=2, epochs=1, augment=True)
+    other = train(tmp_path / "other", config, workers=0, report=silent)
+    drawn = [np.load(path.parent / "pictures" / "0-00000.npz")["shown"] for path in (plain, other)]
+    assert drawn[0].shape == drawn[1].shape and not np.array_equal(*drawn), "stretched animals"
+    with pytest.raises(UserError, match=r"checkpoint.pt: expected a training with .*'augment': False.*"):
+        train(tmp_path / "other", TrainingConfig(animals=2, epochs=1), workers=0, report=silent)
 
 
 def test_the_loss_falls(tmp_path: Path) -> None:

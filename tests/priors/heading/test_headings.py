@@ -93,6 +93,13 @@ def test_animals_on_two_legs_are_drawn_where_a_share_is_asked_for() -> None:
     assert two.azimuths.isfinite().all()
 
 
+def test_stretched_animals_have_other_proportions() -> None:
+    usual, stretched = drawn(np.random.default_rng(3)), drawn(np.random.default_rng(3), stretched=True)
+    assert usual.shown.shape == stretched.shown.shape and not torch.equal(usual.shown, stretched.shown)
+    assert torch.equal(stretched.shown, drawn(np.random.default_rng(3), stretched=True).shown)
+    assert stretched.azimuths.isfinite().all()
+
+
 @pytest.mark.parametrize("two_legged", [0.0, 1.0])
 def test_the_network_of_the_package_reads_animals_that_it_did_not_learn_from(two_legged: float) -> None:
     shown = [drawn(np.random.default_rng((1, k)), two_legged) for k in range(4)]
