@@ -17,6 +17,7 @@ sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() != RO
 
 try:
     import rewild4d.datasets  # noqa: F401
+    from rewild4d import progress
 except ImportError:
     pytest.exit("rewild4d is not installed: run `make test`, or `pip install -e . -c constraints.txt`.", returncode=2)
 
@@ -34,6 +35,12 @@ LONG = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first, so that no process has one left when the others are done."""
     items.sort(key=lambda item: not item.path.as_posix().endswith(LONG))
+
+
+@pytest.fixture(autouse=True)
+def bars(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bars are shown again after a test that ran a part of a table in this process."""
+    monkeypatch.setattr(progress, "_hidden", False)
 
 
 @pytest.fixture

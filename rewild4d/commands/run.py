@@ -90,6 +90,7 @@ def main(arguments: list[str]) -> int:
     )  # fmt: skip
     check_executor(options)
     plan = make_plan(options, options.config)
+    from rewild4d.commands.verdicts import print_verdicts
     from rewild4d.leaderboard.records import to_json
     from rewild4d.leaderboard.tables import markdown
 
@@ -157,22 +158,6 @@ def _peek(arguments: list[str], flag: str) -> str | None:
         if word.startswith(f"{flag}="):
             return word.partition("=")[2]
     return None
-
-
-def print_verdicts(records: list[RunRecord], method: str) -> None:
-    """Print what cannot be trusted, red before yellow, and one line where nothing speaks against a run."""
-    own = [record for record in records if record.method == method and record.verdicts]
-    lines = {
-        level: [f"{r.case}, seed {r.seed}: {verdict}" for r in own for verdict in r.verdicts if verdict.level == level]
-        for level in ("red", "yellow")
-    }
-    for line in dict.fromkeys((*lines["red"], *lines["yellow"])):
-        print(line)
-    if own and not any(lines.values()):
-        about = ", ".join(dict.fromkeys(verdict.about for record in own for verdict in record.verdicts))
-        print(f"green: {about}: nothing speaks against them")
-    if own:
-        print()
 
 
 def _print_pictures(records: list[RunRecord], options: Options) -> None:

@@ -74,6 +74,7 @@ def main(arguments: list[str]) -> int:
     check_executor(options)
     found = find_spec(options.table)
     from rewild4d.commands.choice import chosen
+    from rewild4d.commands.verdicts import print_table_verdicts
     from rewild4d.leaderboard.formats import markdown
     from rewild4d.leaderboard.records import to_json
     from rewild4d.running import planning
@@ -92,6 +93,7 @@ def main(arguments: list[str]) -> int:
     if options.json:
         print("[" + ",\n".join(map(to_json, records)) + "]")
     else:
+        print_table_verdicts(records)
         print(markdown(_table(options, spec, records)))
         print(f"\nrecords: {options.out}", file=sys.stderr)
     return exit_code(plans, records)

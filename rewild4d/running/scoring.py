@@ -74,6 +74,6 @@ def _verdicts(
     verdicts = [
         judge(clip.name) if judge else None,
         prior_verdict(quality, len(clip.frames) - len(shown.frames), len(clip.frames)),
-        result_verdict(reconstruction, shown.times, scores),
+        result_verdict(reconstruction, shown, scores, quality.get("mask_iou")),
     ]
     return [verdict for verdict in verdicts if verdict is not None]

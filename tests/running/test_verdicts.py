@@ -9,7 +9,7 @@ import pytest
 from films import TINY, plan
 from records_for_tests import record
 
-from rewild4d.commands.run import print_verdicts
+from rewild4d.commands.verdicts import MOST, print_table_verdicts, print_verdicts
 from rewild4d.contracts import Verdict
 from rewild4d.datasets.video.online import Online
 from rewild4d.leaderboard.records import to_json
@@ -43,6 +43,18 @@ def test_what_is_red_comes_first_and_green_is_one_line(capsys: pytest.CaptureFix
     print_verdicts([record(verdicts=[green]), record(method="gart", verdicts=[red])], "ours")
     assert capsys.readouterr().out == "green: result: nothing speaks against them\n\n"
     print_verdicts([record()], "ours")
+    assert capsys.readouterr().out == ""
+
+
+def test_a_table_says_of_each_case_once_what_its_methods_share(capsys: pytest.CaptureFixture[str]) -> None:
+    green, masks, torn = Verdict("result", "green", "a"), Verdict("masks", "yellow", "b"), Verdict("result", "red", "c")
+    print_table_verdicts([record(verdicts=[masks, green]), record(method="gart", verdicts=[masks, torn]), record()])
+    assert capsys.readouterr().out == "wolf/Run, gart, seed 0: result: red: c\nwolf/Run: masks: yellow: b\n\n"
+    print_table_verdicts([record(verdicts=[green]), record(method="gart", verdicts=[green])])
+    assert capsys.readouterr().out == "green: result: nothing speaks against them\n\n"
+    print_table_verdicts([record(seed=seed, verdicts=[torn]) for seed in range(MOST + 2)])
+    assert capsys.readouterr().out.endswith("2 more verdicts are red: see `verdicts` in the records\n\n")
+    print_table_verdicts([record()])
     assert capsys.readouterr().out == ""
 
 
