@@ -12,7 +12,7 @@ KNOTS = 4
 
 
 def augmented(pictures: Tensor, rows: torch.Generator) -> Tensor:
-    """Return pictures stretched, bent and lit anew; where brightness is not shown (all 0) it stays so.
+    """Return pictures stretched, bent and lit anew, also those whose brightness was not shown (all 0).
 
     Args:
         pictures: mask and brightness (`heading.pictures`), [n, 2, s, s].
@@ -30,8 +30,7 @@ def augmented(pictures: Tensor, rows: torch.Generator) -> Tensor:
     mask, bright = torch.nn.functional.grid_sample(pictures, grid, align_corners=False).unbind(1)
     contrast = (CONTRAST * torch.randn(n, 1, 1, generator=rows)).exp()
     lit = contrast * bright + LIGHT * _smooth(n, 1, size, rows)[:, 0] * mask
-    shown = bright.abs().amax((1, 2), keepdim=True) > 0
-    return torch.stack((mask, torch.where(shown, lit, bright)), dim=1)
+    return torch.stack((mask, lit), dim=1)
 
 
 def _smooth(n: int, channels: int, size: int, rows: torch.Generator) -> Tensor:

@@ -144,9 +144,10 @@ class _Progress:
             shown = given.chosen(chosen)
             shown = shown.mirrored(torch.rand(len(shown), generator=rows) < 0.5)
             pictures = from_bytes(shown.shown)
-            pictures[torch.rand(len(shown), generator=rows) < BLIND, 1] = 0
+            blind = torch.rand(len(shown), generator=rows) < BLIND
             if self.config.augment:
                 pictures = augmented(pictures, rows)
+            pictures[blind, 1] = 0
             value = _loss(self.network, pictures, shown)
             self.optimizer.zero_grad()
             value.backward()  # type: ignore[no-untyped-call]

@@ -65,7 +65,7 @@ def test_a_training_starts_from_earlier_weights(tmp_path: Path) -> None:
     assert first[1] < first[0] - 0.2
 
 
-def test_augmented_pictures_are_changed_in_place_and_light_and_keep_what_they_hide() -> None:
+def test_augmented_pictures_are_changed_in_place_and_light() -> None:
     pictures = torch.zeros(64, 2, 48, 48)
     pictures[:, 0, 12:36, 8:40] = 1
     pictures[:32, 1, 12:36, 8:24], pictures[:32, 1, 12:36, 24:40] = 0.5, -0.5
@@ -74,8 +74,8 @@ def test_augmented_pictures_are_changed_in_place_and_light_and_keep_what_they_hi
     assert first[:, 0].min() >= 0 and first[:, 0].max() <= 1
     areas = first[:, 0].mean((1, 2)) / pictures[0, 0].mean()
     assert areas.log().mean().abs() < 0.15 and 0.1 < areas.log().std() < 0.5
-    assert first[32:, 1].abs().max() == 0, "no brightness where none was shown"
-    assert first[:32, 1][first[:32, 0] == 0].abs().max() < 1e-6, "none outside the mask"
+    assert first[:, 1][first[:, 0] == 0].abs().max() < 1e-6, "no brightness outside the mask"
+    assert first[32:, 1].std() > 0.1, "a flat picture is lit"
     left, right = first[:32, 1].split(24, dim=-1)
     assert (left.mean((1, 2)) > right.mean((1, 2))).float().mean() > 0.8
 
