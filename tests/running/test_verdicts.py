@@ -49,13 +49,13 @@ def test_what_is_red_comes_first_and_green_is_one_line(capsys: pytest.CaptureFix
 def test_a_table_says_of_each_case_once_what_its_methods_share(capsys: pytest.CaptureFixture[str]) -> None:
     green, masks, torn = Verdict("result", "green", "a"), Verdict("masks", "yellow", "b"), Verdict("result", "red", "c")
     print_table_verdicts([record(verdicts=[masks, green]), record(method="gart", verdicts=[masks, torn]), record()])
-    assert capsys.readouterr().out == "wolf/Run, gart, seed 0: result: red: c\nwolf/Run: masks: yellow: b\n\n"
+    assert capsys.readouterr() == ("", "wolf/Run, gart, seed 0: result: red: c\nwolf/Run: masks: yellow: b\n\n")
     print_table_verdicts([record(verdicts=[green]), record(method="gart", verdicts=[green])])
-    assert capsys.readouterr().out == "green: result: nothing speaks against them\n\n"
+    assert capsys.readouterr().err == "green: result: nothing speaks against them\n\n"
     print_table_verdicts([record(seed=seed, verdicts=[torn]) for seed in range(MOST + 2)])
-    assert capsys.readouterr().out.endswith("2 more verdicts are red: see `verdicts` in the records\n\n")
+    assert capsys.readouterr().err.endswith("2 more verdicts are red: see `verdicts` in the records\n\n")
     print_table_verdicts([record()])
-    assert capsys.readouterr().out == ""
+    assert capsys.readouterr().err == ""
 
 
 def test_a_record_keeps_its_verdicts() -> None:
