@@ -55,6 +55,7 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         root_weight: squared motion and tilt of the root, in standard deviations; fast motion counts more.
         view_weight: squared cosine between heading and viewing direction, where all cameras look one way: an animal at
             an angle looks like a shorter one.
+        least_turn: span of headings that a network reads, degrees, from which all guesses turn as the readings do.
         heading_weight: nats below the heading that a network finds likeliest, likewise.
         gait_weight: feet on the ground that move towards the head, when hypotheses are compared.
         travel_weight: heading against the direction of travel, when hypotheses are compared.
@@ -77,6 +78,7 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     straight_weight: float = 0.03
     root_weight: float = 0.2
     view_weight: float = 0.01
+    least_turn: float = 40.0
     heading_weight: float = 0.03
     gait_weight: float = 0.015
     travel_weight: float = 0.08

@@ -4,6 +4,7 @@ The heading is a local minimum (animals look alike from head and tail), so many 
 one is kept until joints and proportions have settled. Kinds of body compete until joints have been fitted once.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,7 @@ from rewild4d.priors.bodies.body import Body, Proportions, diagonal
 from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.config import PriorConfig, without_colors
 from rewild4d.priors.heading.reading import Headings, read_headings
+from rewild4d.priors.heading.turning import turning
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.io import seal
 from rewild4d.priors.kinematics import pose
@@ -66,12 +68,13 @@ def fit_template(
     """Fit the template to a clip's masks under its cameras and to what networks read in its pictures, then to its
     colours too where cameras see several sides.
 
-    The seed is that of the frames drawn for each step. Of several ``bodies`` the one that fits best is taken. Headings
-    are read, and shapes learned from random animals are followed, where all cameras look one way.
+    The seed is that of the frames drawn for each step. Of several ``bodies`` the one that fits best is taken. All
+    guesses turn over time as a network reads in the pictures; where all cameras look one way they follow its headings
+    too, and shapes learned from random animals.
 
     Returns:
-        A prior with one pose per frame; `quality` has mask_iou, cost, facing_margin, starts (their number),
-        start_00_cost, ... (after the first stage), and of several bodies the figures of `decided`.
+        A prior with one pose per frame; `quality` has mask_iou, cost, facing_margin, turn (degrees), starts (their
+        number), start_00_cost, ... (after the first stage), and of several bodies the figures of `decided`.
 
     Raises:
         UserError: a frame has no camera, or no mask shows anything.
@@ -114,9 +117,13 @@ def fit_animal(
             local = torch.linalg.solve(working[:3, :3], (path - working[:3, 3]).T).T
             if trained.points is not None:
                 race.said = PointEvidence.of(read(frames, timesteps, up, name, trained.points), working)
-            if trained.headings is not None and race.view is not None:
-                race.headings = read_headings(frames, timesteps, up, name, trained.headings).in_frame(working)
-            race.begin(Hypotheses.start(body, facings(config.yaw_starts), local.float(), config.root_period))
+            guesses = Hypotheses.start(body, facings(config.yaw_starts), local.float(), config.root_period)
+            if trained.headings is not None:
+                found = read_headings(frames, timesteps, up, name, trained.headings).in_frame(working)
+                guesses.turn = turning(found, count, math.radians(config.least_turn))
+                race.headings = found if race.view is not None else None
+                race.figures["turn"] = math.degrees(float(guesses.turn.max() - guesses.turn.min()))
+            race.begin(guesses)
             race.run(config.stages[0])
             races.append(race)
         starts = torch.cat([race.start_costs for race in races]).tolist()
@@ -161,6 +168,7 @@ class KnownCameras(Race):
         figures = {"cost": float(self.costs.min()), **self.figures}
         seen = "masks and colours" if any(stage.colors for stage in self.config.stages) else "masks"
         seen += ", and to headings that a network reads," if self.headings is not None else ""
+        seen += ", turning as a network reads," if self.headings is None and bool(best.turn.any()) else ""
         seen += " near the shapes of random animals" if self.shapes is not None else ""
         return Animal(best.body, shape, self.working @ local, best.joint_angles()[0], seen, figures)
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from rewild4d.priors.bodies.body import Body, Proportions, Template
 from rewild4d.priors.bodies.tetrapod import SPINE
 from rewild4d.priors.config import Stage
-from rewild4d.priors.kinematics import moved, pose
+from rewild4d.priors.kinematics import moved, pose, rotation_about
 from rewild4d.priors.silhouettes import PARTS, Targets, rasterized, splat
 from rewild4d.transforms import axis_angle_to_matrix, rigid
 
@@ -48,6 +48,7 @@ class Hypotheses:
         relief: of the cross sections, [B, S, 4].
         angles: cosine series of the joint angles, [B, L, J, 3].
         colors: RGB of parts of the surface, see `rasterized`, [B, D, 3]; none before a stage fits them.
+        turn: angle about y at each frame by which all guesses head away from their facing, fixed, radians, [T].
     """
 
     body: Body
@@ -60,6 +61,7 @@ class Hypotheses:
     relief: Tensor
     angles: Tensor
     colors: Tensor
+    turn: Tensor
 
     @classmethod
     def start(cls, body: Body, facing: Tensor, path: Tensor, root_period: int = 4) -> Self:
@@ -80,11 +82,12 @@ class Hypotheses:
             relief=torch.zeros(batch, body.sections, 4),
             angles=torch.zeros(batch, joints, len(body.parents), 3),
             colors=torch.zeros(batch, 0, 3),
+            turn=torch.zeros(count),
         )
 
     def by_guess(self) -> dict[str, Tensor]:
         """Return all tensors with a row for each guess, by name, detached."""
-        names = [field.name for field in fields(self) if field.name not in ("body", "path")]
+        names = [field.name for field in fields(self) if field.name not in ("body", "path", "turn")]
         return {name: getattr(self, name).detach() for name in names}
 
     def select(self, rows: Tensor) -> Self:
@@ -103,7 +106,8 @@ class Hypotheses:
         """Return the rigid root motion without the scale, [B, T, 4, 4]."""
         series = cosine_series(len(self.path), self.rotation.shape[1])
         rotations = axis_angle_to_matrix((series @ self.rotation) * torch.tensor(ROTATION_SPREAD))
-        return rigid(self.facing[:, None] @ rotations, self.path + SHIFT_SPREAD * (series @ self.shift))
+        facings = self.facing[:, None] @ rotation_about(1, self.turn)
+        return rigid(facings @ rotations, self.path + SHIFT_SPREAD * (series @ self.shift))
 
     def heading(self) -> Tensor:
         """Return the mean direction from tail to head, [B, 3]."""

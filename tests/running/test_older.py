@@ -83,6 +83,8 @@ def test_runs_from_priors_of_masks_alone_stand_for_their_row_with_a_note_until_t
     before = {name: value for name, value in shapeless.items() if name != "heading_weight"}
     bent = {name: value for name, value in then.items() if name != "straight_weight"}
     assert row(bent, cameras="fixed").notes == (PRIOR.format(parts="a straight spine"),)
+    stiff = {name: value for name, value in msgspec.to_builtins(STANDARD).items() if name != "least_turn"}
+    assert row(stiff).notes == row(stiff, cameras="fixed").notes == (PRIOR.format(parts="turns that a network reads"),)
     old, new, none = row(then), row(then, now), row(masks)
     fixed, unread = row(then, cameras="fixed"), row(before, cameras="fixed")
     assert [r.run_id for r in old.records[0]] == ["0"] and old.notes == (PRIOR.format(parts="colours"),)

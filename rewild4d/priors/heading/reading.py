@@ -40,13 +40,17 @@ class Headings:
         return Headings(self.timesteps, self.left @ rotation, self.away @ rotation, self.scores)
 
     def distance(self, headings: Tensor) -> Tensor:
-        """Return how much less likely guesses are than the likeliest heading, in nats, mean over frames.
+        """Return the mean over frames of the `nats` of guesses [B, T, 3], [B]."""
+        return self.nats(headings).mean(1)
+
+    def nats(self, headings: Tensor) -> Tensor:
+        """Return how much less likely guesses are than the likeliest heading, in each frame.
 
         Args:
             headings: directions from tail to head at every time, in the frame of `left` and `away`, [B, T, 3].
 
         Returns:
-            [B].
+            [B, v].
         """
         own = headings[:, self.timesteps]
         azimuths = torch.atan2((own * self.left).sum(-1), (own * self.away).sum(-1))
@@ -55,7 +59,7 @@ class Headings:
         share, row = place - lower, lower.long()
         scores = self.scores.expand(len(own), -1, -1)
         first, second = (scores.gather(2, ((row + k) % SECTORS)[..., None])[..., 0] for k in (0, 1))
-        return -((1 - share) * first + share * second).mean(1)
+        return -((1 - share) * first + share * second)
 
 
 def read_headings(

@@ -185,7 +185,7 @@ def test_in_a_film_both_halves_turn_to_the_heading_that_is_read_and_the_network_
     assert len(told) == 4 and not any(cameras.any() for cameras in told)
 
 
-def test_where_cameras_see_several_sides_headings_are_not_read() -> None:
+def test_where_cameras_see_several_sides_headings_are_not_followed() -> None:
     clip, config = walking_clip(3, "sweep"), shortened(1)
     plain, read = (
         fit_template(clip, config=config, seed=0, log=silent, trained=Trained(headings=network))

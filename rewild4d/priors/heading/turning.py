@@ -1,0 +1,49 @@
+"""How an animal turns in the course of a clip, from what a network reads in its frames."""
+
+import math
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter1d
+from torch import Tensor
+
+from rewild4d.priors.heading.network import wrapped
+from rewild4d.priors.heading.reading import Headings
+
+ANGLES = 72
+"""Even headings between which the path chooses."""
+PACE = math.radians(20.0)
+"""Standard deviation of the turn from one frame to the next."""
+SMOOTHING = 0.8
+"""Standard deviation in time of what smooths the path, frames."""
+
+
+def turning(found: Headings, count: int, least: float) -> Tensor:
+    """Return by how much the heading at each of ``count`` times differs from the mean; 0 where it hardly turns at all.
+
+    Of all paths it is the one whose readings, in nats below the likeliest, and squared turns, in `PACE`, sum to least.
+    Readings of an animal that keeps its heading waver too: paths that span less than ``least`` count for nothing.
+
+    Args:
+        found: in a frame whose y axis is up.
+        count: of times; those that nothing was read of are bridged.
+        least: radians.
+
+    Returns:
+        Angles about y, from z to x, without jumps, radians, [count].
+    """
+    angles = torch.arange(ANGLES) * (2 * math.pi / ANGLES) - math.pi
+    heads = torch.stack((angles.sin(), torch.zeros(ANGLES), angles.cos()), dim=1)
+    costs = torch.zeros(count, ANGLES)
+    costs.index_add_(0, found.timesteps, found.nats(heads[:, None].expand(-1, count, -1)).T)
+    turns = 0.5 * (wrapped(angles[:, None] - angles) / PACE).square()
+    total, origins = costs[0], []
+    for cost in costs[1:]:
+        lowest, origin = (turns + total).min(1)
+        total = lowest + cost
+        origins.append(origin)
+    rows = [int(total.argmin())]
+    for origin in reversed(origins):
+        rows.append(int(origin[rows[-1]]))
+    path = gaussian_filter1d(np.unwrap(angles[rows[::-1]].double().numpy()), SMOOTHING, mode="nearest")
+    return torch.from_numpy(path - path.mean()).float() if np.ptp(path) >= least else torch.zeros(count)
