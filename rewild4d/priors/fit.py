@@ -16,7 +16,7 @@ from rewild4d.priors.bodies.body import Body, Proportions, diagonal
 from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.config import PriorConfig, without_colors
 from rewild4d.priors.heading.reading import Headings, read_headings
-from rewild4d.priors.heading.turning import turning
+from rewild4d.priors.heading.turning import along, turning
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.io import seal
 from rewild4d.priors.kinematics import pose
@@ -121,7 +121,7 @@ def fit_animal(
             if trained.headings is not None:
                 found = read_headings(frames, timesteps, up, name, trained.headings).in_frame(working)
                 guesses.turn = turning(found, count, math.radians(config.least_turn))
-                race.headings = found if race.view is not None else None
+                race.headings = along(found, guesses.turn) if race.view is not None else None
                 race.figures["turn"] = math.degrees(float(guesses.turn.max() - guesses.turn.min()))
             race.begin(guesses)
             race.run(config.stages[0])

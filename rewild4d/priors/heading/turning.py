@@ -1,6 +1,7 @@
 """How an animal turns in the course of a clip, from what a network reads in its frames."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -32,10 +33,9 @@ def turning(found: Headings, count: int, least: float) -> Tensor:
     Returns:
         Angles about y, from z to x, without jumps, radians, [count].
     """
-    angles = torch.arange(ANGLES) * (2 * math.pi / ANGLES) - math.pi
-    heads = torch.stack((angles.sin(), torch.zeros(ANGLES), angles.cos()), dim=1)
+    angles = _even()
     costs = torch.zeros(count, ANGLES)
-    costs.index_add_(0, found.timesteps, found.nats(heads[:, None].expand(-1, count, -1)).T)
+    costs.index_add_(0, found.timesteps, found.nats(_heads(angles[:, None].expand(-1, count))).T)
     turns = 0.5 * (wrapped(angles[:, None] - angles) / PACE).square()
     total, origins = costs[0], []
     for cost in costs[1:]:
@@ -47,3 +47,26 @@ def turning(found: Headings, count: int, least: float) -> Tensor:
         rows.append(int(origin[rows[-1]]))
     path = gaussian_filter1d(np.unwrap(angles[rows[::-1]].double().numpy()), SMOOTHING, mode="nearest")
     return torch.from_numpy(path - path.mean()).float() if np.ptp(path) >= least else torch.zeros(count)
+
+
+def along(found: Headings, turn: Tensor) -> Headings:
+    """Return the same readings, counted from the likeliest heading of an animal that turns, in the mean over frames.
+
+    Counted from the likeliest constant heading, one that turns would have a negative `Headings.distance`.
+
+    Args:
+        found: in a frame whose y axis is up.
+        turn: of `turning`, [T].
+    """
+    if not turn.any():
+        return found
+    return replace(found, scores=found.scores + found.distance(_heads(_even()[:, None] + turn)).min())
+
+
+def _even() -> Tensor:
+    return torch.arange(ANGLES) * (2 * math.pi / ANGLES) - math.pi
+
+
+def _heads(angles: Tensor) -> Tensor:
+    """Return the directions of angles about y, from z to x, [...] -> [..., 3]."""
+    return torch.stack((angles.sin(), torch.zeros_like(angles), angles.cos()), dim=-1)

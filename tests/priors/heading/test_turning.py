@@ -12,7 +12,7 @@ from rewild4d.priors import fit
 from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.heading.network import SECTORS, HeadingNetwork, shares_around
 from rewild4d.priors.heading.reading import Headings
-from rewild4d.priors.heading.turning import turning
+from rewild4d.priors.heading.turning import along, turning
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.search import facings
 from rewild4d.priors.trained import Trained
@@ -52,6 +52,20 @@ def test_times_without_a_reading_are_bridged_and_one_time_may_have_several() -> 
     found = turning(read(ramp[kept], kept), 12, LEAST)
     assert (found - (ramp - ramp.mean())).abs().max() < 12 * DEGREES and (found.diff() >= 0).all()
     assert turning(read(ramp[:1]), 1, LEAST).tolist() == [0.0]
+
+
+def test_nats_of_an_animal_that_turns_count_from_its_likeliest_heading() -> None:
+    turn = torch.linspace(-0.7, 0.7, 15)
+    found = read(turn + 0.4)
+
+    def at(angles: Tensor) -> float:
+        heads = torch.stack((angles.sin(), torch.zeros(15), angles.cos()), dim=-1)
+        return float(along(found, turn).distance(heads[None]))
+
+    assert at(turn + 0.4) == pytest.approx(0.0, abs=0.05), "not negative: costs of bodies are compared by their ratio"
+    assert at(turn + 0.4 + math.pi) == pytest.approx(at(turn - 1.2), abs=0.05) and at(turn - 1.2) > 2.5
+    assert at(torch.full((15,), 0.4)) > 0.5
+    assert along(found, torch.zeros(15)) is found
 
 
 def test_guesses_head_as_far_from_their_facing_as_the_turn_says() -> None:
