@@ -70,7 +70,7 @@ class Views(Hypotheses):
     """A batch of guesses under the fixed camera.
 
     Unlike under known cameras, `rotation` is a series of (azimuth, elevation), [B, K, 2], and `shift` has a row for
-    each frame, [B, T, 3], since the windows may move fast.
+    each frame, [B, T, 3], since the windows may move fast. `turn` counts for nothing: the azimuth is free to change.
     """
 
     @classmethod
