@@ -268,6 +268,8 @@ class OneSide(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """Instead of `canonical.thickness`."""
     opacity: Opacity = 0.98
     """Instead of `canonical.opacity`."""
+    max_scale: Weight = 0.009
+    """Instead of `canonical.max_scale`: where a foot is not where the prior has it, a few large ones blur it."""
     pull: Weight = 5.0
     """Instead of `prior.pull`."""
     pull_until: Weight = 0.35

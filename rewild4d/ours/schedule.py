@@ -49,9 +49,10 @@ def _for_footage(config: Config) -> Config:
 
 def _for_one_side(config: Config) -> Config:
     own, replace = config.one_side, msgspec.structs.replace
+    canonical = {"samples": own.samples, "thickness": own.thickness, "opacity": own.opacity, "max_scale": own.max_scale}
     return replace(
         config,
-        canonical=replace(config.canonical, samples=own.samples, thickness=own.thickness, opacity=own.opacity),
+        canonical=replace(config.canonical, **canonical),
         prior=replace(config.prior, pull=own.pull, pull_until=own.pull_until, untold=own.untold),
         pose=replace(config.pose, turns=own.turns),
         geometry=replace(config.geometry, temporal=own.temporal, stray=own.stray),

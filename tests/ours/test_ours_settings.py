@@ -58,6 +58,7 @@ def test_where_one_side_is_seen_beyond_keeps_what_the_prior_knows_of_the_others(
     changed = {name for name in beyond.__struct_fields__ if getattr(beyond, name) != getattr(held, name)}
     assert changed == {"canonical", "skin", "pose", "prior", "rates", "density", "geometry", "one_side"}
     assert (held.canonical.samples, held.density.cap, held.geometry.temporal) == (12_000, 16_000, 5.0)
+    assert (beyond.canonical.max_scale, held.canonical.max_scale) == (0.05, 0.009)
     assert held.skin.holds and held.prior.untold and not beyond.skin.holds and not beyond.prior.untold
     assert beyond.pose.turns and not held.pose.turns, "one side does not tell turns"
     assert not for_clip_of_ours(load_preset("ours", Config, "beyond"), 24, filmed=True).pose.turns
