@@ -57,6 +57,7 @@ class Follower:
 
     Attributes:
         mask: of the last frame, bool [h, w]; all False where the animal is lost.
+        loose: what came loose in the last frame and was dropped, bool [h, w].
     """
 
     def __init__(
@@ -82,13 +83,14 @@ class Follower:
         else:
             odds = np.mean([self._outstanding(image, window) for window in windows], axis=0)
         chance = expit(np.where(inside, odds, -9.0))
-        self.mask = _main_parts(chance > 0.5, inside)
+        self.mask = main_parts(chance > 0.5, inside)
         if said is not None:
             chance = corrected(image, chance, said)
             near = said > 0 if (said > 0).any() else inside
-            self.mask = _as_said(_main_parts(chance > 0.5, near, touching=0.0), said)
+            self.mask = _as_said(main_parts(chance > 0.5, near, touching=0.0), said)
         if not self.mask.any():  # nothing stands out: the box itself is the best guess
             self.mask = inside
+        self.loose = np.zeros_like(self.mask)
         self._chance = np.where(self.mask, np.maximum(chance, expit(1.0)), chance).astype(np.float32)
         self._seen = self.mask.astype(np.float32)  # for how many frames flow has carried each pixel
         self._colours = _Colours(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), self._chance)
@@ -112,7 +114,7 @@ class Follower:
             return
         before = np.where(self.mask, self._chance.clip(0.5 + DOUBT), self._chance.clip(0, 0.5 - DOUBT))
         chance = corrected(image, before, said)
-        mask = _as_said(_main_parts(chance > 0.5, self.mask | (said > 0), touching=0.0), said)
+        mask = _as_said(main_parts(chance > 0.5, self.mask | (said > 0), touching=0.0), said)
         oldest = float(self._seen.max())
         self._seen = np.where(mask, np.where(self.mask, self._seen, oldest), 0).astype(np.float32)
         self.mask, self._chance = mask, np.where(mask | (chance < 0.5), chance, DROPPED).astype(np.float32)
@@ -123,6 +125,7 @@ class Follower:
     def step(self, image: np.ndarray) -> np.ndarray:
         """Return the mask in the next frame, bool [h, w]; all False where the animal is lost or not found again."""
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        self.loose = np.zeros(grey.shape, bool)
         if not self.mask.any():
             self._find_again(image)
             self._grey = grey
@@ -135,9 +138,10 @@ class Follower:
         soft = logit(cv2.GaussianBlur(before, (0, 0), SOFT).clip(0, 1)).clip(-CARRIED_RANGE, CARRIED_RANGE)
         odds += CARRIED * np.where(sure, 1.0, UNSURE) * soft
         odds -= np.where(sure, 0.0, UNCOVERED)
-        mask = _main_parts((odds > 0) & _window_of(near), cv2.dilate(near.astype(np.uint8), np.ones((9, 9))) > 0)
+        mask = main_parts((odds > 0) & _window_of(near), cv2.dilate(near.astype(np.uint8), np.ones((9, 9))) > 0)
         seen = np.where(mask, np.where(sure, carried(self._seen, flow, cv2.INTER_NEAREST), 0) + 1, 0)
-        mask = _without_young(mask, seen)
+        whole, mask = mask, _without_young(mask, seen)
+        self.loose = whole & ~mask
         self._keep(image, lab, mask, np.where(mask | (odds <= 0), odds, -3.0), seen)
         self._grey = grey
         return self.mask
@@ -236,7 +240,7 @@ def _window_of(mask: np.ndarray) -> np.ndarray:
     return inside
 
 
-def _main_parts(mask: np.ndarray, near: np.ndarray, touching: float = TOUCHING) -> np.ndarray:
+def main_parts(mask: np.ndarray, near: np.ndarray, touching: float = TOUCHING) -> np.ndarray:
     """Return the parts of a mask that are not small and of which more than a share lies in ``near``."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     areas = stats[:, cv2.CC_STAT_AREA].astype(np.float64)

@@ -12,6 +12,7 @@ from rewild4d.datasets.masking.following import Follower, standing_out
 from rewild4d.datasets.masking.grabcut import rough_masks
 from rewild4d.datasets.masking.makers import Box, Unmasked
 from rewild4d.datasets.masking.marks import resized
+from rewild4d.datasets.masking.neighbours import Recent
 from rewild4d.datasets.masking.saliency import NAME, Saliency
 from rewild4d.errors import UserError
 from rewild4d.metrics.weights import FETCH, is_here, load_weights
@@ -64,29 +65,32 @@ def _boxes_of(marks: dict[int, np.ndarray]) -> dict[int, Box]:
 def _followed(source: Unmasked, saliency: Saliency, size: tuple[int, int]) -> Iterator[np.ndarray]:
     """Yield a mask of each frame at the size at which frames are read.
 
-    Of the frames between two that somebody told about, the nearer half is followed back from the second.
+    Of the frames between two that somebody told about, the nearer half is followed back from the second. Masks come
+    `neighbours.FRAMES` frames late.
     """
     told = sorted({*source.boxes, *source.marks})
     late: list[bytes] = []  # frames that are followed back, compressed
-    last, follower = -1, None
+    last, follower, recent = -1, None, Recent()
     for index, image in enumerate(source.images()):
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         start = _start_of(source, index, small, saliency, follower)
         if start is not None:
             follower = start
+            yield from recent.rest()
             yield from _backwards(late, follower)
             late, last = [], index
             yield follower.mask
             continue
         ahead = told[bisect_right(told, index) :]
         if follower is not None and (not ahead or index - last <= ahead[0] - index):
-            yield follower.step(small)
+            yield from recent.add(small, follower.step(small), follower.loose)
             continue
         if follower is not None and not _is_start(source, ahead[0]):
             follower.step(small)  # strokes will correct what it finds there
         late.append(cv2.imencode(".jpg", small, (cv2.IMWRITE_JPEG_QUALITY, 95))[1].tobytes())
     if follower is None:
         raise UserError(f"{source.title}: nothing in it stands out; give a box: --box frame:left,top,width,height.")
+    yield from recent.rest()
 
 
 def _is_start(source: Unmasked, index: int) -> bool:
@@ -161,9 +165,9 @@ def _outstanding(source: Unmasked, index: int, small: np.ndarray, saliency: Sali
 
 def _backwards(late: list[bytes], follower: Follower) -> list[np.ndarray]:
     """Return the masks of the frames before a start, in the film's order."""
-    masks, back = [], follower.twin()
+    masks, back, recent = list[np.ndarray](), follower.twin(), Recent()
     for data in reversed(late):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
-        masks.append(back.step(image))
-    return masks[::-1]
+        masks += recent.add(image, back.step(image), back.loose)
+    return [*masks, *recent.rest()][::-1]

@@ -1,6 +1,7 @@
 """`masks --tool track`: boxes on any frame or none, both directions, neighbours, losses; and the network's plumbing."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,7 @@ import pytest
 from calling import call, refusal
 from films import iou
 
-from rewild4d.datasets.masking import tracking
+from rewild4d.datasets.masking import neighbours, tracking
 from rewild4d.datasets.masking.flow import Flow, carried
 from rewild4d.datasets.masking.following import Follower
 from rewild4d.datasets.masking.makers import Unmasked
@@ -118,9 +119,8 @@ def test_an_animal_that_leaves_is_lost_and_found_again() -> None:
     assert not found(film([*walking(3), meadow, other], at0=BOX))[4].any()
 
 
-@pytest.mark.usefixtures("network")
-def test_a_neighbour_that_was_covered_is_no_part_of_the_animal() -> None:
-    """A stripe of the animal's colours comes out from behind it as it walks, and comes loose."""
+def uncovering() -> tuple[Unmasked, list[np.ndarray]]:
+    """A stripe of the animal's colours comes out from behind it as it walks, and comes loose; the film, the truth."""
     wide, high = 640, 320
     noise = cv2.GaussianBlur(np.random.default_rng(1).normal(0, 60, (high, wide, 3)), (0, 0), 2.0) * 2
     still = np.clip(np.array((200, 60, 40)) + noise, 0, 255)
@@ -134,9 +134,45 @@ def test_a_neighbour_that_was_covered_is_no_part_of_the_animal() -> None:
         pictures.append(picture.astype(np.uint8))
         truth.append(animal)
     stems = tuple(map(str, range(24)))
-    masks = list(track_masks(Unmasked("film", stems, (wide, high), lambda: iter(pictures), {0: (80, 100, 160, 140)})))
-    assert iou(masks[-1] > 0, truth[-1]) > 0.9
-    assert not masks[-1][130:210, 190:230].any()
+    return Unmasked("film", stems, (wide, high), lambda: iter(pictures), {0: (80, 100, 160, 140)}), truth
+
+
+def neighbour(mask: np.ndarray, animal: np.ndarray) -> float:
+    """Share of what is seen of the neighbour that is in a mask."""
+    seen = ~animal[130:210, 190:230]
+    return float((mask[130:210, 190:230] > 0)[seen].mean()) if seen.any() else 0.0
+
+
+@pytest.mark.usefixtures("network")
+def test_a_neighbour_that_comes_loose_is_no_part_of_the_animal_before_it_does() -> None:
+    source, truth = uncovering()
+    masks = list(track_masks(source))
+    assert max(map(neighbour, masks, truth)) < 0.05
+    assert min(iou(mask > 0, animal) for mask, animal in zip(masks, truth, strict=True)) > 0.94
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(neighbours, "LEAST_LOOSE", 9.0)
+        late = list(map(neighbour, track_masks(source), truth))
+    assert late[-1] == 0 and max(late) > 0.9, "what is known when it has come loose alone"
+
+
+@pytest.mark.usefixtures("network")
+def test_it_is_taken_out_of_what_is_followed_back_too() -> None:
+    source, truth = uncovering()
+    back = replace(source, images=lambda: reversed(list(source.images())), boxes={23: (80.0, 100.0, 160.0, 140.0)})
+    masks = list(track_masks(back))
+    assert max(map(neighbour, masks, reversed(truth))) < 0.05
+
+
+def test_masks_come_late_in_their_order_and_small_loose_parts_change_none() -> None:
+    image, recent = textured(moving.image(0, SIZE)), neighbours.Recent()
+    masks = [np.zeros(SIZE[::-1], bool) for _ in range(neighbours.FRAMES + 2)]
+    speck = np.zeros(SIZE[::-1], bool)
+    for number, mask in enumerate(masks):
+        mask[40:96, 8 : 72 + number] = True
+    speck[40:42, 8:20] = True
+    ready = [each for mask in masks for each in recent.add(image, mask, speck)]
+    assert [int(mask.sum()) for mask in [*ready, *recent.rest()]] == [56 * (64 + number) for number in range(26)]
+    assert len(ready) == 2 and not recent.rest()
 
 
 def test_flow_says_where_pixels_came_from_and_where_it_is_not_sure() -> None:
