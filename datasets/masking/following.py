@@ -65,6 +65,7 @@ class Follower:
     ) -> None:
         self._saliency, self._flow = saliency, Flow()
         self._start(image, box, said)
+        self.loose = np.zeros_like(self.mask)
         self._looks, self._areas = colors(image, self.mask.astype(np.uint8)), [int(self.mask.sum())]
 
     def _start(self, image: np.ndarray, box: Box | None, said: np.ndarray | None = None) -> None:
@@ -90,7 +91,6 @@ class Follower:
             self.mask = _as_said(main_parts(chance > 0.5, near, touching=0.0), said)
         if not self.mask.any():  # nothing stands out: the box itself is the best guess
             self.mask = inside
-        self.loose = np.zeros_like(self.mask)
         self._chance = np.where(self.mask, np.maximum(chance, expit(1.0)), chance).astype(np.float32)
         self._seen = self.mask.astype(np.float32)  # for how many frames flow has carried each pixel
         self._colours = _Colours(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), self._chance)

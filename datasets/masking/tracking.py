@@ -83,7 +83,8 @@ def _followed(source: Unmasked, saliency: Saliency, size: tuple[int, int]) -> It
             continue
         ahead = told[bisect_right(told, index) :]
         if follower is not None and (not ahead or index - last <= ahead[0] - index):
-            yield from recent.add(small, follower.step(small), follower.loose)
+            mask = follower.step(small)
+            yield from recent.add(small, mask, follower.loose)
             continue
         if follower is not None and not _is_start(source, ahead[0]):
             follower.step(small)  # strokes will correct what it finds there
@@ -169,5 +170,6 @@ def _backwards(late: list[bytes], follower: Follower) -> list[np.ndarray]:
     for data in reversed(late):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
-        masks += recent.add(image, back.step(image), back.loose)
+        mask = back.step(image)
+        masks += recent.add(image, mask, back.loose)
     return [*masks, *recent.rest()][::-1]
