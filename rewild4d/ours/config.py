@@ -96,6 +96,9 @@ class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """Let each frame turn its joints a little beside the network (`ours.turns`; docs/experiments/tuning.md)."""
     turns_from: Share = 0.3
     """Fraction from which the turns learn."""
+    search_limbs: Share = 0.0
+    """Fraction at which limbs that others hide are searched where the mask is empty (`ours.limbs`;
+    docs/experiments/films.md); 0 for never."""
 
     def __post_init__(self) -> None:
         _require_heads(self.width, self.heads)
@@ -253,6 +256,12 @@ class Footage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """Instead of `rates.deform`."""
     turns: bool = False
     """Instead of `pose.turns`."""
+    turns_from: Share = 0.3
+    """Instead of `pose.turns_from`."""
+    turns_rate: Weight = 1e-4
+    """Instead of `rates.turns`."""
+    search_limbs: Share = 0.0
+    """Instead of `pose.search_limbs`."""
     cameras: Literal["both", "own"] = "own"
     """Instead of `cameras`: fits of a film and of its mirror image disagree by some pixels."""
 

@@ -18,6 +18,7 @@ from rewild4d.ours.evidence import Sighting, pull_shares
 from rewild4d.ours.gradients import all_finite, clip_gradients, norm_of, require_finite, scale_gradients
 from rewild4d.ours.graphs import CudaRecorder, StepGraphs, can_record
 from rewild4d.ours.inputs import StepInput
+from rewild4d.ours.limbs import LimbSearch, learn_poses
 from rewild4d.ours.losses.images import WINDOW, colour_losses, silhouette_loss, union_window
 from rewild4d.ours.losses.regularizers import compact_loss, neighbours, random_direction, rigid_loss, smooth_loss
 from rewild4d.ours.losses.skeleton import neighbour_keys, posture
@@ -214,11 +215,28 @@ class Training(GaussianTraining):
         if self.config.geometry.rigid and len(self.model.gaussians) > 1 and self.near is None:
             self.near = neighbours(self.model.gaussians.means, self.config.geometry.rigid_neighbours)
 
+    def search_limbs(self, small: Supervision) -> None:
+        """Search limbs in ``small`` images; from now on the poses that were found are the prior's."""
+        config, supervision = self.config, self.supervision
+        progress = config.pose.search_limbs
+        strength = config.deform.enabled * ramp(progress, config.deform.ramp_start, config.deform.ramp_end)
+        search, found = LimbSearch.of(self.model, small, strength), {}
+        for view in (1, -1):
+            if not small.frames_of(view) or (view < 0 and not config.mirrored):
+                continue
+            found[view], bones = search.poses(view)
+            rows = int(view < 0), torch.tensor(small.frames_of(view))[:, None], torch.tensor(bones, dtype=torch.long)
+            supervision.prior_quats[rows] = found[view].quats[:, bones].cpu()
+            supervision.prior_shifts[rows] = found[view].shifts[:, bones].cpu()
+        learn_poses(self.model, small, found, self.generator)
+
     def state(self) -> dict[str, Any]:
-        return super().state() | {"marks": self.marks and tuple(self.marks)}
+        prior = (self.supervision.prior_quats, self.supervision.prior_shifts)
+        return super().state() | {"marks": self.marks and tuple(self.marks), "prior": prior}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         super().restore(state)
+        self.supervision.prior_quats, self.supervision.prior_shifts = state["prior"]
         self.marks = state["marks"] and Marks(*state["marks"])
 
     def sightings(self) -> Iterator[Sighting]:
@@ -268,6 +286,8 @@ def train(
     def step(index: int) -> dict[str, float]:
         if index == warmup.total:
             model.gaussians.colors.data[:, 0] = initial_colors(model, supervision)
+        if config.pose.search_limbs and index == warmup.total + round(config.pose.search_limbs * config.iterations):
+            main.search_limbs(small)
         return warmup.step(index) if index < warmup.total else main.step(index - warmup.total)
 
     def state() -> dict[str, Any]:

@@ -48,6 +48,7 @@ def test_what_is_beyond_the_paper_differs_from_standard_in_these_alone() -> None
         rates=own(standard.rates, deform=(2e-3, 1e-5)),
         density=own(standard.density, cap=14_000, end=0.9),
         one_side=own(standard.one_side, when="known"),
+        footage=own(standard.footage, turns=True, turns_from=0.1, turns_rate=1e-3, search_limbs=0.12),
     )
     assert standard.loss.isolated and standard.geometry.limb_plane == standard.geometry.sideways == 0
 
@@ -61,7 +62,6 @@ def test_where_one_side_is_seen_beyond_keeps_what_the_prior_knows_of_the_others(
     assert (beyond.canonical.max_scale, held.canonical.max_scale) == (0.05, 0.009)
     assert held.skin.holds and held.prior.untold and not beyond.skin.holds and not beyond.prior.untold
     assert beyond.pose.turns and not held.pose.turns, "one side does not tell turns"
-    assert not for_clip_of_ours(load_preset("ours", Config, "beyond"), 24, filmed=True).pose.turns
     assert for_clip_of_ours(held, 300, one_sided=True).skin == held.skin, "a saved fit stays as it is"
 
 
@@ -83,6 +83,17 @@ def test_one_side_is_within_forty_degrees_of_the_mean(toy: tuple[Clip, Prior], d
         turned[:3, :3] = rotation_about(1, angle[None])[0]
         cameras.append(camera_in_object(prior.cameras[0], turned))
     assert sees_one_side(replace(prior, cameras=tuple(cameras))) == one_sided
+
+
+def test_in_films_beyond_turns_joints_of_each_frame_and_searches_limbs() -> None:
+    known, film = (
+        for_clip_of_ours(load_preset("ours", Config, "beyond"), 24, filmed=filmed) for filmed in (False, True)
+    )
+    assert (known.pose.turns_from, known.rates.turns, known.pose.search_limbs) == (0.3, 1e-4, 0)
+    assert film.pose.turns and (film.pose.turns_from, film.rates.turns, film.pose.search_limbs) == (0.1, 1e-3, 0.12)
+    assert for_clip_of_ours(film, 24, filmed=True) == film
+    plain = for_clip_of_ours(load_preset("ours", Config, "standard"), 24, filmed=True)
+    assert not plain.pose.turns and not plain.pose.search_limbs
 
 
 def test_settings_follow_whether_the_cameras_are_known() -> None:
