@@ -45,7 +45,7 @@ class RunChoice:
         case: names or patterns of cases ("wolf/Run", "wolf/*"); all (of real videos: quadrupeds) where it is left out.
         protocol: what is held out and measured (see `list`); the data set's default where it is left out.
         preset: settings and length of the fit: quick, standard or paper; of `ours` also beyond, which is standard with
-            terms that the paper does not have, for known cameras.
+            terms that the paper does not have.
         seeds: one run for each.
         prior: "template" (fitted to the clip's masks and colours: a quadruped, biped or primate, whichever fits best),
             "template:<which>" (one of these, or a rig of your own, FILE.glb), "masks" (the same from masks alone),

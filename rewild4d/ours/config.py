@@ -256,8 +256,6 @@ class Footage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """Instead of `rates.deform`."""
     turns: bool = False
     """Instead of `pose.turns`."""
-    turns_from: Share = 0.3
-    """Instead of `pose.turns_from`."""
     turns_rate: Weight = 1e-4
     """Instead of `rates.turns`."""
     search_limbs: Share = 0.0

@@ -40,7 +40,7 @@ def _for_footage(config: Config) -> Config:
         steps_per_frame=own.steps_per_frame,
         geometry=replace(config.geometry, temporal=own.temporal, rigid=own.rigid),
         prior=replace(prior, blend=blend, pull=pull, pull_until=own.pull_until),
-        pose=replace(config.pose, turns=own.turns, turns_from=own.turns_from, search_limbs=own.search_limbs),
+        pose=replace(config.pose, turns=own.turns, search_limbs=own.search_limbs),
         rates=replace(config.rates, pose=own.pose, deform=own.deform, turns=own.turns_rate),
         cameras=own.cameras,
         footage=replace(own, use=False),

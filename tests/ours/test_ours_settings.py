@@ -48,7 +48,7 @@ def test_what_is_beyond_the_paper_differs_from_standard_in_these_alone() -> None
         rates=own(standard.rates, deform=(2e-3, 1e-5)),
         density=own(standard.density, cap=14_000, end=0.9),
         one_side=own(standard.one_side, when="known"),
-        footage=own(standard.footage, turns=True, turns_from=0.1, turns_rate=1e-3, search_limbs=0.12),
+        footage=own(standard.footage, turns=True, turns_rate=4e-4, search_limbs=0.12, steps_per_frame=125),
     )
     assert standard.loss.isolated and standard.geometry.limb_plane == standard.geometry.sideways == 0
 
@@ -70,7 +70,7 @@ def test_films_keep_it_only_where_it_is_asked_for_and_the_paper_never_does() -> 
     always = msgspec.structs.replace(beyond, one_side=msgspec.structs.replace(beyond.one_side, when="always"))
     assert not for_clip_of_ours(beyond, 24, filmed=True, one_sided=True).skin.holds
     film = for_clip_of_ours(always, 24, filmed=True, one_sided=True)
-    assert film.skin.holds and film.prior.pull_until == film.footage.pull_until and film.iterations == 24 * 250
+    assert film.skin.holds and film.prior.pull_until == film.footage.pull_until and film.iterations == 24 * 125
     assert for_clip_of_ours(standard, 24, one_sided=True) == for_clip_of_ours(standard, 24)
 
 
@@ -89,9 +89,10 @@ def test_in_films_beyond_turns_joints_of_each_frame_and_searches_limbs() -> None
     known, film = (
         for_clip_of_ours(load_preset("ours", Config, "beyond"), 24, filmed=filmed) for filmed in (False, True)
     )
-    assert (known.pose.turns_from, known.rates.turns, known.pose.search_limbs) == (0.3, 1e-4, 0)
-    assert film.pose.turns and (film.pose.turns_from, film.rates.turns, film.pose.search_limbs) == (0.1, 1e-3, 0.12)
+    assert (known.rates.turns, known.pose.search_limbs) == (1e-4, 0)
+    assert film.pose.turns and (film.rates.turns, film.pose.search_limbs, film.iterations) == (4e-4, 0.12, 3000)
     assert for_clip_of_ours(film, 24, filmed=True) == film
+    assert for_clip_of_ours(load_preset("ours", Config, "beyond"), 90, filmed=True).iterations == 90 * 125
     plain = for_clip_of_ours(load_preset("ours", Config, "standard"), 24, filmed=True)
     assert not plain.pose.turns and not plain.pose.search_limbs
 
