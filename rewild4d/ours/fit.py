@@ -220,7 +220,7 @@ class Training(GaussianTraining):
         config, supervision = self.config, self.supervision
         progress = config.pose.search_limbs
         strength = config.deform.enabled * ramp(progress, config.deform.ramp_start, config.deform.ramp_end)
-        search, found = LimbSearch.of(self.model, small, strength), {}
+        search, found, elsewhere = LimbSearch.of(self.model, small, strength), {}, False
         for view in (1, -1):
             if not small.frames_of(view) or (view < 0 and not config.mirrored):
                 continue
@@ -228,7 +228,9 @@ class Training(GaussianTraining):
             rows = int(view < 0), torch.tensor(small.frames_of(view))[:, None], torch.tensor(bones, dtype=torch.long)
             supervision.prior_quats[rows] = found[view].quats[:, bones].cpu()
             supervision.prior_shifts[rows] = found[view].shifts[:, bones].cpu()
-        learn_poses(self.model, small, found, self.generator)
+            elsewhere = elsewhere or bool(bones)
+        if elsewhere:
+            learn_poses(self.model, small, found, self.generator)
 
     def state(self) -> dict[str, Any]:
         prior = (self.supervision.prior_quats, self.supervision.prior_shifts)

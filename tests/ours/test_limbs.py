@@ -175,6 +175,21 @@ def test_the_network_learns_what_was_found(monkeypatch: pytest.MonkeyPatch) -> N
     assert after < 0.2 * before
 
 
+def test_where_nothing_is_found_a_fit_goes_on_as_without_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    clip, prior = seen_from_the_left({})
+    searched: list[int] = []
+
+    def nothing(self: LimbSearch, view: int) -> tuple[Pose, list[int]]:
+        searched.append(view)
+        return rest_pose(FRAMES), []
+
+    monkeypatch.setattr(LimbSearch, "poses", nothing)
+    brief = msgspec.structs.replace(SEARCHING, iterations=4)
+    never = msgspec.structs.replace(brief, pose=TINY.pose)
+    a, b = (train(clip, prior, config, 0, CPU, quiet, None).state_dict() for config in (brief, never))
+    assert searched == [1, -1] and all(torch.equal(a[name], b[name]) for name in a)
+
+
 def test_a_fit_pulls_to_what_was_found_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rewild4d.ours.limbs.COPIES", 10)
     clip, prior = seen_from_the_left({RIGHT.bones[0]: 0.6})
