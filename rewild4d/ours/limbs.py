@@ -18,7 +18,9 @@ from torch import Tensor, nn
 from rewild4d.ours.canonical import Posed
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import Pose, joint_transforms, pose_distance
+from rewild4d.ours.schedule import rise_and_fall
 from rewild4d.ours.symmetry import Key, Supervision, Target
+from rewild4d.priors.paths import cheapest_path
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import quat_multiply, quat_to_matrix
 
@@ -110,20 +112,6 @@ def bent(pose: Pose, pivots: Tensor, parents: Tensor, limb: Limb, bends: Bends) 
         quats[:, bone] = quat_multiply(turn, pose.quats[:, bone])
         shifts[:, bone] = _turned(whole, joint - top) + top + along - pivots[bone]
     return Pose(quats, shifts, pose.features)
-
-
-def cheapest_path(costs: Tensor, steps: Tensor) -> Tensor:
-    """Choose a row for each frame, so that its costs [T, C] and those of the steps [C, C] between frames are least in
-    sum, [T]."""
-    total, back = costs[0], []
-    for cost in costs[1:]:
-        least, origin = (total[:, None] + steps).min(dim=0)
-        back.append(origin)
-        total = least + cost
-    path = [total.argmin()]
-    for origin in reversed(back):
-        path.append(origin[path[-1]])
-    return torch.stack(path[::-1])
 
 
 class Shown(NamedTuple):
@@ -247,7 +235,7 @@ def learn_poses(model: Model, supervision: Supervision, found: Mapping[int, Pose
     optimizer = torch.optim.Adam(model.network.parameters(), lr=RATE, fused=True)
     for index in range(COPIES):
         for group in optimizer.param_groups:
-            group["lr"] = RATE * min(1.0, 0.01 + 10 * index / COPIES, 1.5 * (1 - index / COPIES))
+            group["lr"] = RATE * rise_and_fall(index / COPIES)
         distances = []
         for view, pose in found.items():
             frames = supervision.frames_of(view)

@@ -92,3 +92,8 @@ def ramp(progress: float, start: float, end: float) -> float:
 def fade(progress: float, end: float) -> float:
     """Fall linearly from one to zero at end."""
     return 1.0 - ramp(progress, 0.0, end)
+
+
+def rise_and_fall(progress: float) -> float:
+    """Rise over the first tenth, and fall to zero over the last third: of a rate while poses are copied."""
+    return min(1.0, 0.01 + 10 * progress, 1.5 * (1 - progress))

@@ -13,6 +13,7 @@ from rewild4d.ours.losses.images import blurred
 from rewild4d.ours.losses.skeleton import neighbour_keys, skeleton_losses
 from rewild4d.ours.model import Model
 from rewild4d.ours.pose import pose_distance
+from rewild4d.ours.schedule import rise_and_fall
 from rewild4d.ours.symmetry import Key, Supervision
 from rewild4d.priors.motion import sample_surface
 from rewild4d.rasterizer import rasterize
@@ -84,7 +85,7 @@ class WarmUp:
         if index == stage.regress:
             self.optimizer.state.clear()
         for group in self.optimizer.param_groups:
-            group["lr"] = rate * min(1.0, 0.01 + 10 * progress, 1.5 * (1 - progress))
+            group["lr"] = rate * rise_and_fall(progress)
 
     def _silhouette(self, key: Key, transforms: Tensor, progress: float) -> Tensor:
         """Compute L2 (per pixel of the animal's box) + Dice of blurred mattes."""

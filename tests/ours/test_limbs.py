@@ -1,6 +1,5 @@
 """The search for limbs that others hide."""
 
-import itertools
 from pathlib import Path
 
 import msgspec
@@ -11,7 +10,7 @@ from toys import FRAMES, TINY, camera
 
 from rewild4d.ours.config import Skinning
 from rewild4d.ours.fit import Training, train
-from rewild4d.ours.limbs import Limb, LimbSearch, bent, cheapest_path, guesses, learn_poses, limbs_of
+from rewild4d.ours.limbs import Limb, LimbSearch, bent, guesses, learn_poses, limbs_of
 from rewild4d.ours.model import Model, build_model
 from rewild4d.ours.pose import Pose, joint_transforms
 from rewild4d.ours.symmetry import Key, Supervision
@@ -80,20 +79,6 @@ def rest_pose(count: int) -> Pose:
     """The rest pose of twenty bones, several times."""
     quats = torch.tensor((1.0, 0, 0, 0)).expand(count, 20, 4)
     return Pose(quats, torch.zeros(count, 20, 3), torch.zeros(count, 20, 1))
-
-
-def test_a_path_is_the_cheapest_of_all() -> None:
-    generator = torch.Generator().manual_seed(0)
-    costs, steps = torch.rand(5, 4, generator=generator), torch.rand(4, 4, generator=generator)
-
-    def total(path: tuple[int, ...]) -> float:
-        changes = zip(path[:-1], path[1:], strict=True)
-        return float(sum(costs[t, row] for t, row in enumerate(path)) + sum(steps[a, b] for a, b in changes))
-
-    best = min(itertools.product(range(4), repeat=5), key=total)
-    assert tuple(cheapest_path(costs, steps).tolist()) == best
-    assert cheapest_path(costs, 100 * (1 - torch.eye(4))).tolist() == [int(costs.sum(0).argmin())] * 5
-    assert cheapest_path(costs[:1], steps).tolist() == [int(costs[0].argmin())]
 
 
 @pytest.mark.parametrize("body", [QUADRUPED, BIPED])

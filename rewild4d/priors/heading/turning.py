@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rewild4d.priors.heading.network import wrapped
 from rewild4d.priors.heading.reading import Headings
+from rewild4d.priors.paths import cheapest_path
 
 ANGLES = 72
 """Even headings between which the path chooses."""
@@ -37,15 +38,8 @@ def turning(found: Headings, count: int, least: float) -> Tensor:
     costs = torch.zeros(count, ANGLES)
     costs.index_add_(0, found.timesteps, found.nats(_heads(angles[:, None].expand(-1, count))).T)
     turns = 0.5 * (wrapped(angles[:, None] - angles) / PACE).square()
-    total, origins = costs[0], []
-    for cost in costs[1:]:
-        lowest, origin = (turns + total).min(1)
-        total = lowest + cost
-        origins.append(origin)
-    rows = [int(total.argmin())]
-    for origin in reversed(origins):
-        rows.append(int(origin[rows[-1]]))
-    path = gaussian_filter1d(np.unwrap(angles[rows[::-1]].double().numpy()), SMOOTHING, mode="nearest")
+    rows = cheapest_path(costs, turns)
+    path = gaussian_filter1d(np.unwrap(angles[rows].double().numpy()), SMOOTHING, mode="nearest")
     return torch.from_numpy(path - path.mean()).float() if np.ptp(path) >= least else torch.zeros(count)
 
 
