@@ -10,6 +10,7 @@ import torch
 from rewild4d.contracts import Log
 from rewild4d.errors import UserError
 from rewild4d.files import digest
+from rewild4d.kernels.switch import chosen_kernels
 from rewild4d.machine import code_version
 from rewild4d.priors.bodies.body import Body
 from rewild4d.priors.bodies.choice import bodies, identity, is_rig_file
@@ -164,6 +165,7 @@ class PriorChoice:
         if self.is_fitted:
             parts += ["template", msgspec.json.encode(self.settings(clip)), repr(self._pairs), self.use]
             parts += [package_digest(), package_density_digest()] if self._kind == "template" else []
+            parts += [f"{name} {mode}" for name, mode in chosen_kernels().items()]
             if self.is_learned:
                 parts += ["learned", self._weights_file.read_bytes()]
             else:

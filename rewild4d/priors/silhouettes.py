@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from rewild4d.errors import UserError
+from rewild4d.priors.fused.splats import SPLATS, densities
 from rewild4d.rasterizer import rasterize
 from rewild4d.transforms import camera_in_object, matrix_to_quat
 from rewild4d.types import Camera, Frame
@@ -138,6 +139,8 @@ def splat(points: Tensor, sizes: Tensor, intrinsics: Tensor, size: int) -> Tenso
     spread = sizes[..., None] * focal / depth[..., None]
     widened = spread.square() + 0.3
     strength = DENSITY * (spread.square() / widened).prod(-1).sqrt()
+    if SPLATS.takes(center, widened, strength):
+        return 1 - torch.exp(-densities(center, widened, strength, size))
     pixels = torch.arange(size) + 0.5
     kernel = torch.exp(-0.5 * (center[..., None] - pixels).square() / widened[..., None])
     density = (kernel[..., 1, :] * strength[..., None]).transpose(-1, -2) @ kernel[..., 0, :]

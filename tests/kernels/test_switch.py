@@ -15,6 +15,7 @@ from numba.core.registry import CPUDispatcher
 from torch import nn
 
 import rewild4d.ours.fused
+import rewild4d.priors.fused
 from rewild4d.benchmarks.scenes import training
 from rewild4d.cli import main
 from rewild4d.errors import UserError
@@ -34,8 +35,9 @@ from rewild4d.ours.deform import DeformNetwork
 from rewild4d.ours.losses import regularizers
 from rewild4d.ours.pose import PoseNetwork
 
-for module in pkgutil.iter_modules(rewild4d.ours.fused.__path__, "rewild4d.ours.fused."):
-    importlib.import_module(module.name)
+for room in (rewild4d.ours.fused, rewild4d.priors.fused):
+    for module in pkgutil.iter_modules(room.__path__, f"{room.__name__}."):
+        importlib.import_module(module.name)
 importlib.import_module("rewild4d.harmonics")
 
 
@@ -52,7 +54,7 @@ def mode(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_every_kernel_was_written_for_the_twins_that_are_here(name: str) -> None:
     kernel = KERNELS[name]
     found = twin_digest(kernel)
-    hint = "compare kernel and twins (tests/ours/test_ours_fused*.py), then write this digest beside the kernel"
+    hint = "compare kernel and twins (tests/**/*fused*.py), then write this digest beside the kernel"
     assert not kernel.twins or kernel.digest == found, f"{name}: {found}: {hint}"
 
 
