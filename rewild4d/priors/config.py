@@ -16,7 +16,8 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         steps: of Adam.
         frames: used in each step; of longer clips as many are drawn at random.
         blur: standard deviation of the blur of both silhouettes at the first and last step, as a share of the crop.
-        keep: hypotheses that survive; if two or more, the best of the opposite heading is among them.
+        keep: most hypotheses that survive; if two or more, the best of the opposite heading is among them unless its
+            misfit is far higher (`race.LOST`).
         joints: fit joint angles and their motion.
         rasterized: draw silhouettes by the rasterizer; otherwise by its batched approximation.
         relief: fit the cross sections too, beyond the proportions.

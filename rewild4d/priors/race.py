@@ -1,5 +1,6 @@
 """Fit competing hypotheses: rounds of gradient descent on silhouettes; after each the worst are dropped."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -18,6 +19,8 @@ from rewild4d.types import Frame
 HANDICAP, ONE_SIDE_HANDICAP = 1.4, 1.65
 """The costs of all kinds of body but the usual one are multiplied by this where they are compared: by the second where
 one side is seen (a dog that sits has the outline of a biped)."""
+LOST = 2.0
+"""Once joints have been fitted, a guess whose misfit is more than this times the best's is dropped."""
 COLOR_RATE = 0.05
 """Learning rate of the surface's colours."""
 STILL_PARAMETERS = ("scale", "rotation", "shift", "shape")
@@ -128,7 +131,7 @@ class Race:
             self.costs = self.misfits + self.verdict(stage)
         if not len(self.start_costs):
             self.start_costs = self.costs
-        self._cut(stage.keep)
+        self._cut(stage.keep, LOST if stage.joints else math.inf)
 
     def _targets(self, size: int) -> Targets:
         return crop_targets(self.frames, self.timesteps, self.working, size, self.name)
@@ -155,11 +158,13 @@ class Race:
         penalty = penalty + config.color_weight * color_mismatch(images, targets, sigma)
         return mismatch(mattes, targets, stage.size * stage.blur[1]) + penalty
 
-    def _cut(self, keep: int) -> None:
-        """Keep the best guess, its rivals and the next best, ``keep`` in all."""
+    def _cut(self, keep: int, lost: float) -> None:
+        """Keep the best guess, its rivals and the next best, at most ``keep`` in all; none whose misfit is
+        more than ``lost`` times the best's."""
         order = self.costs.argsort().tolist()
         if away := self._reversed(order):
             self.figures["facing_margin"] = float(self.costs[away[0]] - self.costs[order[0]])
+        order = [row for row in order if self.misfits[row] <= lost * self.misfits[order[0]]]
         wanted = [order[0], *(row for row in self.rivals(order) if row != order[0])][:keep]
         rest = [row for row in order if row not in wanted][: keep - len(wanted)]
         rows = torch.tensor(sorted(wanted + rest, key=order.index))

@@ -100,3 +100,22 @@ def test_the_chosen_template_is_fitted(one_thread: None) -> None:
     config = msgspec.structs.replace(shortened(2), stages=shortened(2).stages[:2])
     prior = fit_template(walking_clip(2, "sweep"), config=config, seed=0, log=silent, bodies=KINDS[1:2])
     assert prior.provenance.startswith("Template (biped)") and "body_margin" not in prior.quality
+
+
+def kept(misfits: tuple[float, ...], facing: tuple[float, ...], *, keep: int, lost: float) -> list[float]:
+    """Costs of the guesses that stay, of some that face one way (1) or the other (-1)."""
+    race = object.__new__(Race)
+    heads = torch.tensor([(0.0, 0.0, way) for way in facing])
+    race.guesses = cast(Any, SimpleNamespace(heading=lambda: heads, select=lambda rows: rows))
+    race.costs = race.misfits = torch.tensor(misfits)
+    race.figures = {}
+    race._cut(keep, lost)
+    return race.costs.tolist()  # type: ignore[no-any-return]
+
+
+def test_the_best_that_faces_the_other_way_stays_unless_it_has_lost() -> None:
+    misfits, facing = (0.25, 0.125, 0.375, 0.5), (1.0, 1.0, -1.0, -1.0)
+    assert kept(misfits, facing, keep=2, lost=4.0) == [0.125, 0.375]
+    assert kept(misfits, facing, keep=2, lost=2.0) == [0.125, 0.25]
+    assert kept(misfits, facing, keep=3, lost=3.0) == [0.125, 0.25, 0.375]
+    assert kept(misfits, facing, keep=2, lost=1.5) == [0.125]
