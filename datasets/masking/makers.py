@@ -8,7 +8,7 @@ import math
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -59,7 +59,8 @@ def write_masks(
         source: the frames.
         maker: of their masks.
         folder: for the files.
-        log: called with the number of masks so far and of frames.
+        log: called with the number of frames that are done and of all; one that was read and has no mask yet is half
+            done, since masks may come many frames later.
 
     Returns:
         The files, and in how many of them there is no animal.
@@ -67,14 +68,22 @@ def write_masks(
     Raises:
         UserError: what the maker raises, or a folder that cannot be written.
     """
-    paths, empty = [], 0
-    for stem, mask in zip(source.stems, maker(source), strict=False):
+    paths, empty, read, total = list[Path](), 0, 0, len(source.stems)
+
+    def told() -> Iterator[np.ndarray]:
+        nonlocal read
+        for image in source.images():
+            yield image
+            read = min(read + 1, total)
+            log((read + len(paths)) // 2, total)
+
+    for stem, mask in zip(source.stems, maker(replace(source, images=told)), strict=False):
         paths.append(folder / f"{stem}.png")
         _write(paths[-1], mask)
         empty += not (mask > 127).any()
-        log(len(paths), len(source.stems))
-    if len(paths) < len(source.stems):
-        raise UserError(f"{source.title}: expected a mask for each of {len(source.stems)} frames, got {len(paths)}.")
+        log((max(read, len(paths)) + len(paths)) // 2, total)
+    if len(paths) < total:
+        raise UserError(f"{source.title}: expected a mask for each of {total} frames, got {len(paths)}.")
     return paths, empty
 
 

@@ -1,6 +1,7 @@
 """Masks where there are none: programs through folders, the rough way, and the networks' plumbing."""
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -68,6 +69,22 @@ def test_any_program_through_folders(tmp_path: Path) -> None:
     paths, empty = write_masks(source(), maker, tmp_path / "out")
     assert [path.name for path in paths] == [f"{i:05d}.png" for i in range(12)] and empty == 0
     assert (next(iter(maker(source()))) == moving.mask(0)).all()
+
+
+def test_frames_that_wait_for_their_masks_are_half_done(tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+
+    def late(film: Unmasked) -> Iterator[np.ndarray]:
+        yield from [np.zeros(image.shape[:2], np.uint8) for image in film.images()]
+
+    def blind(film: Unmasked) -> Iterator[np.ndarray]:
+        yield from (np.zeros((8, 8), np.uint8) for _ in film.stems)
+
+    write_masks(source(4), late, tmp_path, lambda *counts: told.append(counts))
+    assert told == [(done, 4) for done in (0, 1, 1, 2, 2, 3, 3, 4)], "four are read, then four are written"
+    told.clear()
+    write_masks(source(3), blind, tmp_path, lambda *counts: told.append(counts))
+    assert told == [(1, 3), (2, 3), (3, 3)]
 
 
 @pytest.mark.parametrize(
