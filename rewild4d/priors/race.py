@@ -159,15 +159,15 @@ class Race:
         return mismatch(mattes, targets, stage.size * stage.blur[1]) + penalty
 
     def _cut(self, keep: int, lost: float) -> None:
-        """Keep the best guess, its rivals and the next best, at most ``keep`` in all; none whose misfit is
-        more than ``lost`` times the best's."""
+        """Keep the best guess, its rivals and the next best, ``keep`` in all, but for those whose misfit is more than
+        ``lost`` times the best's: nothing takes their place."""
         order = self.costs.argsort().tolist()
         if away := self._reversed(order):
             self.figures["facing_margin"] = float(self.costs[away[0]] - self.costs[order[0]])
-        order = [row for row in order if self.misfits[row] <= lost * self.misfits[order[0]]]
         wanted = [order[0], *(row for row in self.rivals(order) if row != order[0])][:keep]
         rest = [row for row in order if row not in wanted][: keep - len(wanted)]
-        rows = torch.tensor(sorted(wanted + rest, key=order.index))
+        kept = [row for row in wanted + rest if self.misfits[row] <= lost * self.misfits[order[0]]]
+        rows = torch.tensor(sorted(kept, key=order.index))
         self.guesses, self.costs, self.misfits = self.guesses.select(rows), self.costs[rows], self.misfits[rows]
 
 

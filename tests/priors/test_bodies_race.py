@@ -116,6 +116,7 @@ def kept(misfits: tuple[float, ...], facing: tuple[float, ...], *, keep: int, lo
 def test_the_best_that_faces_the_other_way_stays_unless_it_has_lost() -> None:
     misfits, facing = (0.25, 0.125, 0.375, 0.5), (1.0, 1.0, -1.0, -1.0)
     assert kept(misfits, facing, keep=2, lost=4.0) == [0.125, 0.375]
-    assert kept(misfits, facing, keep=2, lost=2.0) == [0.125, 0.25]
+    assert kept(misfits, facing, keep=2, lost=2.0) == [0.125], "nothing takes its place"
     assert kept(misfits, facing, keep=3, lost=3.0) == [0.125, 0.25, 0.375]
+    assert kept(misfits, facing, keep=3, lost=2.0) == [0.125, 0.25]
     assert kept(misfits, facing, keep=2, lost=1.5) == [0.125]
