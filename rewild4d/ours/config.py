@@ -260,14 +260,6 @@ class Footage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """Instead of `rates.turns`."""
     search_limbs: Share = 0.0
     """Instead of `pose.search_limbs`."""
-    thickness: Positive | None = None
-    """Instead of `canonical.thickness`; None leaves it."""
-    opacity: Opacity | None = None
-    """Instead of `canonical.opacity`; None leaves it."""
-    max_scale: Weight | None = None
-    """Instead of `canonical.max_scale`; None leaves it."""
-    colors_epsilon: Positive | None = None
-    """Instead of `rates.colors_epsilon`; None leaves it."""
     cameras: Literal["both", "own"] = "own"
     """Instead of `cameras`: fits of a film and of its mirror image disagree by some pixels."""
 

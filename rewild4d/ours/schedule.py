@@ -33,21 +33,15 @@ def for_clip_of_ours(config: Config, frames: int, *, filmed: bool = False, one_s
 
 
 def _for_footage(config: Config) -> Config:
-    own, replace = config.footage, msgspec.structs.replace
-
-    def said(*names: str) -> dict[str, Any]:
-        """Return the named values that are not None."""
-        return {name: value for name in names if (value := getattr(own, name)) is not None}
-
-    rates = said("colors_epsilon") | {"pose": own.pose, "deform": own.deform, "turns": own.turns_rate}
+    own, prior, replace = config.footage, config.prior, msgspec.structs.replace
+    blend, pull = prior.blend if own.blend is None else own.blend, prior.pull if own.pull is None else own.pull
     return replace(
         config,
         steps_per_frame=own.steps_per_frame,
-        canonical=replace(config.canonical, **said("thickness", "opacity", "max_scale")),
         geometry=replace(config.geometry, temporal=own.temporal, rigid=own.rigid),
-        prior=replace(config.prior, pull_until=own.pull_until, **said("blend", "pull")),
+        prior=replace(prior, blend=blend, pull=pull, pull_until=own.pull_until),
         pose=replace(config.pose, turns=own.turns, search_limbs=own.search_limbs),
-        rates=replace(config.rates, **rates),
+        rates=replace(config.rates, pose=own.pose, deform=own.deform, turns=own.turns_rate),
         cameras=own.cameras,
         footage=replace(own, use=False),
     )

@@ -48,11 +48,8 @@ def test_what_is_beyond_the_paper_differs_from_standard_in_these_alone() -> None
         rates=own(standard.rates, deform=(2e-3, 1e-5)),
         density=own(standard.density, cap=14_000, end=0.9),
         one_side=own(standard.one_side, when="known"),
-        footage=own(
-            standard.footage, turns=True, turns_rate=4e-4, search_limbs=0.12, steps_per_frame=125,
-            thickness=0.3, opacity=0.98, max_scale=0.012, colors_epsilon=1e-4,
-        ),
-    )  # fmt: skip
+        footage=own(standard.footage, turns=True, turns_rate=4e-4, search_limbs=0.12, steps_per_frame=125),
+    )
     assert standard.loss.isolated and standard.geometry.limb_plane == standard.geometry.sideways == 0
 
 
@@ -115,17 +112,6 @@ def test_settings_follow_whether_the_cameras_are_known() -> None:
     assert (film.prior.blend_until, film.prior.pull_until) == (7_000 / 20_000, 4_000 / 20_000)
     rest = {"prior": known.prior, "footage": known.footage}
     assert msgspec.structs.replace(film, **rest) == known, "and nothing else differs"
-
-
-def test_films_start_from_other_gaussians_where_a_preset_says_so() -> None:
-    standard, beyond = (load_preset("ours", Config, name) for name in ("standard", "beyond"))
-    known, film = (for_clip_of_ours(beyond, 24, filmed=filmed) for filmed in (False, True))
-    assert (known.canonical.thickness, known.canonical.opacity, known.canonical.max_scale) == (0.5, 0.9, 0.05)
-    assert (film.canonical.thickness, film.canonical.opacity, film.canonical.max_scale) == (0.3, 0.98, 0.012)
-    assert (known.rates.colors_epsilon, film.rates.colors_epsilon) == (1e-15, 1e-4)
-    assert film.canonical.samples == known.canonical.samples
-    plain = for_clip_of_ours(standard, 24, filmed=True)
-    assert (plain.canonical, plain.rates.colors_epsilon) == (standard.canonical, standard.rates.colors_epsilon)
 
 
 def test_a_short_run_of_the_paper_ends_its_stages_at_the_same_steps() -> None:
