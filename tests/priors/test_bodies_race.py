@@ -9,6 +9,7 @@ import torch
 from walking import shortened, silent, walking_clip
 
 from rewild4d.errors import UserError
+from rewild4d.kernels.switch import VARIABLE
 from rewild4d.priors import fit
 from rewild4d.priors.bodies.choice import KINDS
 from rewild4d.priors.choose import PriorChoice
@@ -100,6 +101,15 @@ def test_the_chosen_template_is_fitted(one_thread: None) -> None:
     config = msgspec.structs.replace(shortened(2), stages=shortened(2).stages[:2])
     prior = fit_template(walking_clip(2, "sweep"), config=config, seed=0, log=silent, bodies=KINDS[1:2])
     assert prior.provenance.startswith("Template (biped)") and "body_margin" not in prior.quality
+
+
+def test_torch_kernels_have_a_prior_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    clip, truth = walking_clip(2, "sweep"), cast(Any, None)
+    made = set()
+    for mode in ("auto", "torch"):
+        monkeypatch.setenv(VARIABLE, mode)
+        made.add(PriorChoice("template", STANDARD).identity(clip, truth))
+    assert len(made) == 2
 
 
 def kept(misfits: tuple[float, ...], facing: tuple[float, ...], *, keep: int, lost: float) -> list[float]:

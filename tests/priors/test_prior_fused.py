@@ -5,7 +5,8 @@ import torch
 from torch import Tensor
 from twins import check_twins, leaves, normal, same_on_any_threads
 
-from rewild4d.kernels.switch import without_kernels
+from rewild4d.kernels.switch import VARIABLE, without_kernels
+from rewild4d.priors import silhouettes
 from rewild4d.priors.fused.splats import SPLATS
 from rewild4d.priors.silhouettes import splat
 
@@ -51,10 +52,16 @@ def test_a_position_that_is_not_a_number_shows_in_its_silhouette_alone() -> None
     assert bad.tolist() == twin.isnan().flatten(2).any(-1).tolist() == [[False] * 3, [False, False, True]]
 
 
-def test_the_kernel_is_used() -> None:
+def test_the_kernel_is_used_unless_torch_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     given, intrinsics = scene(torch.float32, 32)
     fused = splat(given["points"], given["sizes"], intrinsics, 32)
-    with without_kernels(SPLATS.name):
-        twin = splat(given["points"], given["sizes"], intrinsics, 32)
-    assert type(fused.grad_fn) is type(twin.grad_fn)
+
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(silhouettes, "densities", broken)
+    with pytest.raises(ZeroDivisionError):
+        splat(given["points"], given["sizes"], intrinsics, 32)
+    monkeypatch.setenv(VARIABLE, "torch")
+    twin = splat(given["points"], given["sizes"], intrinsics, 32)
     assert not torch.equal(fused, twin) and torch.allclose(fused, twin, atol=1e-5)

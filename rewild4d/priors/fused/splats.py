@@ -12,6 +12,7 @@ from rewild4d.kernels.compiling import inlined, kernel
 from rewild4d.kernels.powers import LOG2_E, exp2
 from rewild4d.kernels.simd import LANES, fma, load, maximum, splat, store, take_ticket
 from rewild4d.kernels.switch import Kernel
+from rewild4d.kernels.tails import lanes_sum
 from rewild4d.kernels.threads import run_tickets
 
 SPLATS = Kernel("silhouettes of the template", "6736075dd066", "rewild4d.priors.silhouettes:splat")
@@ -65,14 +66,6 @@ def _draw(tickets: np.ndarray, splats: Splats, middles: np.ndarray, drawn: np.nd
                     store(own, y * row + first, fma(splat(down[y]), here, load(own, y * row + first)))
 
 
-@inlined
-def _total(lanes: np.ndarray) -> np.float32:
-    total = np.float32(0)
-    for lane in range(LANES):
-        total += lanes[lane]
-    return total
-
-
 @kernel
 def _pull(
     tickets: np.ndarray, splats: Splats, middles: np.ndarray, on_drawn: np.ndarray, on_centers: np.ndarray,
@@ -81,7 +74,6 @@ def _pull(
     """Set gradients of the Gaussians from those of the images that `_draw` makes."""
     row = len(middles)
     across, down = np.empty(row, np.float32), np.empty(row, np.float32)
-    sums = np.empty((5, LANES), np.float32)
     while True:
         image = take_ticket(tickets)
         if image >= len(on_drawn):
@@ -104,16 +96,12 @@ def _pull(
                 plain = plain * shape
                 whole, on_x, on_xx = whole + plain, fma(aside, plain, on_x), fma(aside * aside, plain, on_xx)
                 on_y, on_yy = fma(slope, shape, on_y), fma(bend, shape, on_yy)
-            store(sums[0], 0, whole)
-            store(sums[1], 0, on_x)
-            store(sums[2], 0, on_y)
-            store(sums[3], 0, on_xx)
-            store(sums[4], 0, on_yy)
-            on_strengths[image, n] = _total(sums[0])
+            on_strengths[image, n] = lanes_sum(whole)
+            slopes, bends = (lanes_sum(on_x), lanes_sum(on_y)), (lanes_sum(on_xx), lanes_sum(on_yy))
             for axis in range(2):
                 factor = strengths[n] / variances[n, axis]
-                on_centers[image, n, axis] = factor * _total(sums[1 + axis])
-                on_variances[image, n, axis] = np.float32(0.5) * factor / variances[n, axis] * _total(sums[3 + axis])
+                on_centers[image, n, axis] = factor * slopes[axis]
+                on_variances[image, n, axis] = np.float32(0.5) * factor / variances[n, axis] * bends[axis]
 
 
 def densities(centers: Tensor, variances: Tensor, strengths: Tensor, size: int) -> Tensor:
