@@ -1,9 +1,10 @@
 """Follow one animal from frame to frame, from a box around it, a mask of it or strokes on it.
 
-Each frame adds three kinds of evidence for every pixel, as log odds: how far it stands out in a window around the
-animal (`saliency`), whether optical flow carries it from the mask of the frame before (`flow`), and whether its colour
-is the animal's or its surroundings'. What the frame before had hidden is no part of the animal at first. A part that
-comes loose is dropped where most of it was hidden a while ago: it is a neighbour that the animal had covered.
+Each frame adds four kinds of evidence for every pixel, as log odds: how far it stands out in a window around the
+animal (`saliency`), whether optical flow carries it from the mask of the frame before (`flow`), whether its colour is
+the animal's or its surroundings', and whether other frames show the same there (`backdrop`). What the frame before had
+hidden is no part of the animal at first, nor is what was seen apart from it before. A part that comes loose is dropped
+where most of it was hidden a while ago: it is a neighbour that the animal had covered.
 """
 
 from copy import copy
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 from scipy.special import expit, logit
 
+from rewild4d.datasets.masking.backdrop import others
 from rewild4d.datasets.masking.correcting import corrected
 from rewild4d.datasets.masking.flow import Flow, carried
 from rewild4d.datasets.masking.grabcut import LOST, STRANGE, colors
@@ -30,14 +32,19 @@ UNSURE, UNCOVERED = 0.2, 2.0
 """Where flow there and back does not agree: share of that weight, and log odds against the animal."""
 COLOURED, COLOURED_RANGE = 0.2, 2.5
 """The same of colours."""
+BEHIND = 0.6
+"""Weight of the log odds that a pixel is no backdrop."""
+OTHER = 4.5
+"""Log odds against the animal where something else is carried to that was seen apart from it (`backdrop.others`)."""
 BINS, LEARNED = 16, 0.1
 """Colours a channel, and share of them that each frame teaches anew."""
 TAUGHT = 0.5
 """The same of a frame that a person has corrected."""
 DOUBT, DROPPED = 0.1, 0.05
 """How far from a half a chance is at least before strokes change it, and the chance of what they cut off."""
-YOUNG = 0.5
-"""A loose part is dropped where it was first seen less than this share of the largest part's frames ago."""
+YOUNG, GAP = 0.5, 5
+"""A loose part is dropped where it was first seen less than this share of the largest part's frames ago; parts with a
+narrower gap between them, pixels, are one."""
 LEAST_PART, TOUCHING = 0.02, 0.3
 """Least area of a part, of the largest one's, and the least share of it where flow carries the mask, or near."""
 ALIKE = 0.5
@@ -54,6 +61,7 @@ class Follower:
         image: the frame, uint8 [h, w, 3].
         box: around the animal in its pixels; None: around the marks on it.
         said: marks (`marks`), int8 [h, w]; None where there are none.
+        apart: log odds that a pixel is no backdrop (`backdrop`), float32 [h, w]; None where nothing is known.
 
     Attributes:
         mask: of the last frame, bool [h, w]; all False where the animal is lost.
@@ -61,14 +69,21 @@ class Follower:
     """
 
     def __init__(
-        self, saliency: Saliency, image: np.ndarray, box: Box | None = None, said: np.ndarray | None = None
+        self,
+        saliency: Saliency,
+        image: np.ndarray,
+        box: Box | None = None,
+        said: np.ndarray | None = None,
+        apart: np.ndarray | None = None,
     ) -> None:
         self._saliency, self._flow = saliency, Flow()
-        self._start(image, box, said)
+        self._start(image, box, said, apart)
         self.loose = np.zeros_like(self.mask)
         self._looks, self._areas = colors(image, self.mask.astype(np.uint8)), [int(self.mask.sum())]
 
-    def _start(self, image: np.ndarray, box: Box | None, said: np.ndarray | None = None) -> None:
+    def _start(
+        self, image: np.ndarray, box: Box | None, said: np.ndarray | None = None, apart: np.ndarray | None = None
+    ) -> None:
         self._grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         inside = np.zeros(self._grey.shape, bool)
         if box is not None:
@@ -82,7 +97,7 @@ class Follower:
         if said is not None and said.all():
             odds = np.zeros(inside.shape)
         else:
-            odds = np.mean([self._outstanding(image, window) for window in windows], axis=0)
+            odds = _apart(np.mean([self._outstanding(image, window) for window in windows], axis=0), apart)
         chance = expit(np.where(inside, odds, -9.0))
         self.mask = main_parts(chance > 0.5, inside)
         if said is not None:
@@ -92,6 +107,7 @@ class Follower:
         if not self.mask.any():  # nothing stands out: the box itself is the best guess
             self.mask = inside
         self._chance = np.where(self.mask, np.maximum(chance, expit(1.0)), chance).astype(np.float32)
+        self._other = others(self.mask, apart)
         self._seen = self.mask.astype(np.float32)  # for how many frames flow has carried each pixel
         self._colours = _Colours(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), self._chance)
 
@@ -118,29 +134,38 @@ class Follower:
         oldest = float(self._seen.max())
         self._seen = np.where(mask, np.where(self.mask, self._seen, oldest), 0).astype(np.float32)
         self.mask, self._chance = mask, np.where(mask | (chance < 0.5), chance, DROPPED).astype(np.float32)
+        self._other = np.where(mask, 0, self._other).astype(np.float32)
         if mask.any():
             self._areas[-1] = int(mask.sum())
             self._colours.learn(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), self._chance, TAUGHT)
 
-    def step(self, image: np.ndarray) -> np.ndarray:
-        """Return the mask in the next frame, bool [h, w]; all False where the animal is lost or not found again."""
+    def step(self, image: np.ndarray, apart: np.ndarray | None = None) -> np.ndarray:
+        """Return the mask in the next frame, bool [h, w]; all False where the animal is lost or not found again.
+
+        Args:
+            image: the frame, uint8 [h, w, 3].
+            apart: log odds that a pixel is no backdrop (`backdrop`), float32 [h, w]; None where nothing is known.
+        """
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         self.loose = np.zeros(grey.shape, bool)
         if not self.mask.any():
-            self._find_again(image)
+            self._find_again(image, apart)
             self._grey = grey
             return self.mask
         flow, sure = self._flow.checked(grey, self._grey)
         before = carried(self._chance, flow)
         near = before > 0.5
         lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
-        odds = self._outstanding(image, _window(near)) + COLOURED * self._colours.odds(lab)
+        odds = _apart(self._outstanding(image, _window(near)), apart) + COLOURED * self._colours.odds(lab)
         soft = logit(cv2.GaussianBlur(before, (0, 0), SOFT).clip(0, 1)).clip(-CARRIED_RANGE, CARRIED_RANGE)
         odds += CARRIED * np.where(sure, 1.0, UNSURE) * soft
         odds -= np.where(sure, 0.0, UNCOVERED)
+        other = carried(self._other, flow)
+        odds -= OTHER * other
         mask = main_parts((odds > 0) & _window_of(near), cv2.dilate(near.astype(np.uint8), np.ones((9, 9))) > 0)
         seen = np.where(mask, np.where(sure, carried(self._seen, flow, cv2.INTER_NEAREST), 0) + 1, 0)
         whole, mask = mask, _without_young(mask, seen)
+        self._other = np.where(mask, 0, np.maximum(other, others(mask, apart))).astype(np.float32)
         self.loose = whole & ~mask
         self._keep(image, lab, mask, np.where(mask | (odds <= 0), odds, -3.0), seen)
         self._grey = grey
@@ -166,7 +191,7 @@ class Follower:
             odds[top:bottom, left:right] = OUTSTANDING * found
         return odds
 
-    def _find_again(self, image: np.ndarray) -> None:
+    def _find_again(self, image: np.ndarray, apart: np.ndarray | None) -> None:
         """Start again from what stands out in the whole frame and looks most as the animal did, if anything does."""
         found = []
         for box, mask in standing_out(self._saliency(image)):
@@ -174,7 +199,7 @@ class Follower:
             if away < ALIKE and mask.sum() > LOST * np.median(self._areas):
                 found.append((away, box))
         if found:
-            self._start(image, min(found)[1])
+            self._start(image, min(found)[1], None, apart)
 
 
 class _Colours:
@@ -199,6 +224,13 @@ class _Colours:
         odds = np.log((self._inside + 1e-4) / (self._outside + 1e-4)).clip(-COLOURED_RANGE, COLOURED_RANGE)
         found: np.ndarray = odds.astype(np.float32)[_codes(lab)]
         return found
+
+
+def _apart(odds: np.ndarray, apart: np.ndarray | None) -> np.ndarray:
+    if apart is None:
+        return odds
+    found: np.ndarray = odds + BEHIND * apart
+    return found
 
 
 def _codes(lab: np.ndarray) -> np.ndarray:
@@ -266,10 +298,11 @@ def _without_young(mask: np.ndarray, seen: np.ndarray) -> np.ndarray:
         mask: bool [h, w].
         seen: for how many frames flow has carried each pixel, [h, w].
     """
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    together = cv2.dilate(mask.astype(np.uint8), np.ones((GAP, GAP), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(together)
     if count <= 2:
         return mask
-    ages = [float(np.median(seen[labels == part])) for part in range(1, count)]
+    ages = [float(np.median(seen[(labels == part) & mask])) for part in range(1, count)]
     oldest = ages[int(stats[1:, cv2.CC_STAT_AREA].argmax())]
     return mask & np.isin(labels, [part + 1 for part, age in enumerate(ages) if age >= YOUNG * oldest])
 

@@ -36,6 +36,7 @@ class Unmasked:
         images: every frame, uint8 [h, w, 3].
         boxes: of the animal, by the frame's place; empty where nobody knows one.
         marks: what a person says of single frames (`marks`), by the frame's place, int8 [h, w].
+        log: called with the share of the work that is done by a maker whose masks come later than their work.
     """
 
     title: str
@@ -44,6 +45,7 @@ class Unmasked:
     images: Callable[[], Iterator[np.ndarray]]
     boxes: dict[int, Box]
     marks: dict[int, np.ndarray] = field(default_factory=dict)
+    log: Callable[[float], None] = lambda _: None
 
 
 MaskMaker = Callable[[Unmasked], Iterator[np.ndarray]]
@@ -59,8 +61,8 @@ def write_masks(
         source: the frames.
         maker: of their masks.
         folder: for the files.
-        log: called with the number of frames that are done and of all; one that was read and has no mask yet is half
-            done, since masks may come many frames later.
+        log: called with the number of frames that are done and of all. A maker that tells how much of its work is done
+            (`Unmasked.log`) counts by that, since its masks may come many frames later.
 
     Returns:
         The files, and in how many of them there is no animal.
@@ -68,20 +70,19 @@ def write_masks(
     Raises:
         UserError: what the maker raises, or a folder that cannot be written.
     """
-    paths, empty, read, total = list[Path](), 0, 0, len(source.stems)
+    paths, empty, total = list[Path](), 0, len(source.stems)
+    done = 0
 
-    def told() -> Iterator[np.ndarray]:
-        nonlocal read
-        for image in source.images():
-            yield image
-            read = min(read + 1, total)
-            log((read + len(paths)) // 2, total)
+    def told(share: float) -> None:
+        nonlocal done
+        done = max(done, int(share * total))
+        log(done, total)
 
-    for stem, mask in zip(source.stems, maker(replace(source, images=told)), strict=False):
+    for stem, mask in zip(source.stems, maker(replace(source, log=told)), strict=False):
         paths.append(folder / f"{stem}.png")
         _write(paths[-1], mask)
         empty += not (mask > 127).any()
-        log((max(read, len(paths)) + len(paths)) // 2, total)
+        told(len(paths) / total)
     if len(paths) < total:
         raise UserError(f"{source.title}: expected a mask for each of {total} frames, got {len(paths)}.")
     return paths, empty

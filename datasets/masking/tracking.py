@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from rewild4d.datasets.masking.backdrop import Backdrop
 from rewild4d.datasets.masking.following import Follower, standing_out
 from rewild4d.datasets.masking.grabcut import rough_masks
 from rewild4d.datasets.masking.makers import Box, Unmasked
@@ -19,6 +20,8 @@ from rewild4d.metrics.weights import FETCH, is_here, load_weights
 
 WORK_SIDE = 854
 """Frames are read at this longer side."""
+LOOKED = 0.15
+"""Share of the work that is done once all frames have been looked through for their backdrops."""
 RIVAL = 0.5
 """What has this share of the largest thing's area competes with it."""
 
@@ -71,27 +74,47 @@ def _followed(source: Unmasked, saliency: Saliency, size: tuple[int, int]) -> It
     told = sorted({*source.boxes, *source.marks})
     late: list[bytes] = []  # frames that are followed back, compressed
     last, follower, recent = -1, None, Recent()
+    backdrop, done = Backdrop(_looked_through(source, size), saliency), _Done(source)
     for index, image in enumerate(source.images()):
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        start = _start_of(source, index, small, saliency, follower)
+        small = _resized(image, size)
+        start = _start_of(source, index, small, saliency, follower, backdrop)
         if start is not None:
             follower = start
             yield from recent.rest()
-            yield from _backwards(late, follower)
+            yield from _backwards(late, follower, backdrop, index - len(late), done)
             late, last = [], index
+            done.one()
             yield follower.mask
             continue
         ahead = told[bisect_right(told, index) :]
         if follower is not None and (not ahead or index - last <= ahead[0] - index):
-            mask = follower.step(small)
+            mask = follower.step(small, backdrop.odds(index, small))
+            done.one()
             yield from recent.add(small, mask, follower.loose)
             continue
         if follower is not None and not _is_start(source, ahead[0]):
-            follower.step(small)  # strokes will correct what it finds there
+            follower.step(small, backdrop.odds(index, small))  # strokes will correct what it finds there
         late.append(cv2.imencode(".jpg", small, (cv2.IMWRITE_JPEG_QUALITY, 95))[1].tobytes())
     if follower is None:
         raise UserError(f"{source.title}: nothing in it stands out; give a box: --box frame:left,top,width,height.")
     yield from recent.rest()
+
+
+class _Done:
+    """Counts the frames in which the animal was followed."""
+
+    def __init__(self, source: Unmasked) -> None:
+        self._log, self._total, self._count = source.log, len(source.stems), 0
+
+    def one(self) -> None:
+        self._count += 1
+        self._log(LOOKED + (1 - LOOKED) * self._count / self._total)
+
+
+def _looked_through(source: Unmasked, size: tuple[int, int]) -> Iterator[np.ndarray]:
+    for count, image in enumerate(source.images(), 1):
+        yield _resized(image, size)
+        source.log(LOOKED * count / len(source.stems))
 
 
 def _is_start(source: Unmasked, index: int) -> bool:
@@ -99,8 +122,17 @@ def _is_start(source: Unmasked, index: int) -> bool:
     return index in source.boxes or bool(source.marks[index].all() and source.marks[index].max() > 0)
 
 
+def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
 def _start_of(
-    source: Unmasked, index: int, small: np.ndarray, saliency: Saliency, follower: Follower | None
+    source: Unmasked,
+    index: int,
+    small: np.ndarray,
+    saliency: Saliency,
+    follower: Follower | None,
+    backdrop: Backdrop,
 ) -> Follower | None:
     """Return what follows the animal on from a frame that somebody told about, or in which one thing stands out first.
 
@@ -110,14 +142,15 @@ def _start_of(
         small: the frame as it is read.
         saliency: the network.
         follower: of the frames before.
+        backdrop: of all frames.
     """
     said = source.marks.get(index)
     if said is not None:
         said = resized(said, (small.shape[1], small.shape[0]))
     if index in source.boxes:
-        return Follower(saliency, small, _box(source, index, small), said)
+        return Follower(saliency, small, _box(source, index, small), said, backdrop.odds(index, small))
     if said is not None and follower is not None and not (said.all() and said.max() > 0):
-        follower.step(small)
+        follower.step(small, backdrop.odds(index, small))
         follower.correct(small, said)
         return follower
     if said is not None:
@@ -126,11 +159,11 @@ def _start_of(
                 f"{source.title}: the first marked frame, {source.stems[index]}, has no stroke on the animal; "
                 "draw one, or give a box."
             )
-        return Follower(saliency, small, None, said)
+        return Follower(saliency, small, None, said, backdrop.odds(index, small))
     if source.boxes or source.marks or follower is not None:
         return None
     box = _outstanding(source, index, small, saliency)
-    return None if box is None else Follower(saliency, small, box)
+    return None if box is None else Follower(saliency, small, box, None, backdrop.odds(index, small))
 
 
 def _box(source: Unmasked, index: int, small: np.ndarray) -> Box:
@@ -164,12 +197,13 @@ def _outstanding(source: Unmasked, index: int, small: np.ndarray, saliency: Sali
     return found[0][0]
 
 
-def _backwards(late: list[bytes], follower: Follower) -> list[np.ndarray]:
-    """Return the masks of the frames before a start, in the film's order."""
+def _backwards(late: list[bytes], follower: Follower, backdrop: Backdrop, first: int, done: _Done) -> list[np.ndarray]:
+    """Return the masks of the frames before a start, the first of which has place ``first``, in the film's order."""
     masks, back, recent = list[np.ndarray](), follower.twin(), Recent()
-    for data in reversed(late):
+    for index, data in reversed([*enumerate(late, first)]):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
-        mask = back.step(image)
+        mask = back.step(image, backdrop.odds(index, image))
+        done.one()
         masks += recent.add(image, mask, back.loose)
     return [*masks, *recent.rest()][::-1]

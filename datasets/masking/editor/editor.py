@@ -229,7 +229,7 @@ class Editor:
         job = self._job
         left = job.left
         return {
-            "done": job.written, "read": job.read, "total": job.total, "first": job.first,
+            "done": job.written, "share": job.share, "total": job.total, "first": job.first,
             "left": None if left is None else round(left, 1), "stopping": job.is_stopping,
         }  # fmt: skip
 

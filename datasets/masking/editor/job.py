@@ -33,13 +33,14 @@ class Job(Thread):
     Attributes:
         total: frames to do.
         written: masks so far.
+        share: of the work that is done, 0 to 1.
     """
 
     def __init__(self, work: Work, source: Unmasked, maker: MaskMaker, first: int = 0) -> None:
         super().__init__(name="rewild4d-editor-job", daemon=True)
         self.work, self.maker, self.first = work, maker, first
         self.source = source if first == 0 else _from(source, first, work.mask(first))
-        self.total, self.read, self.written = len(self.source.stems), 0, 0
+        self.total, self.written, self.share = len(self.source.stems), 0, 0.0
         self._cancelled, self._began = Event(), time.monotonic()
 
     def cancel(self) -> None:
@@ -55,19 +56,19 @@ class Job(Thread):
     @property
     def left(self) -> float | None:
         """Seconds that are left, from the time that each frame took so far; None where nobody knows."""
-        done = (self.read + self.written) / 2
-        if done < 2:
+        if self.share * self.total < 2:
             return None
-        return (time.monotonic() - self._began) / done * (self.total - done)
+        return (time.monotonic() - self._began) / self.share * (1 - self.share)
 
     def run(self) -> None:
         parts: list[tuple[str, int, Any, Any]] = []
         kind, said = "bad", ""
         try:
-            watched = replace(self.source, images=self._watched)
+            watched = replace(self.source, images=self._watched, log=self._told)
             for offset, mask in enumerate(self.maker(watched)):
                 self._stop_if_cancelled()
                 self.written = offset + 1
+                self._told(self.written / self.total)
                 parts += self.work.put_mask(self.first + offset, mask)
             lost = sum(self.work.is_empty[self.first + offset] for offset in range(self.written))
             kind, said = "good", f"Followed through {self.written} frames, {lost} of them without the animal."
@@ -87,9 +88,11 @@ class Job(Thread):
     def _watched(self) -> Iterator[np.ndarray]:
         for image in self.source.images():
             self._stop_if_cancelled()
-            self.read += 1
-            self.work.touch()
             yield image
+
+    def _told(self, share: float) -> None:
+        self.share = max(self.share, share)
+        self.work.touch()
 
     def _stop_if_cancelled(self) -> None:
         if self.is_stopping:

@@ -131,7 +131,7 @@ def test_while_it_follows_nothing_is_drawn_masks_appear_as_they_come_and_it_can_
         assert slow.seen.wait(20)
         state = editor.state()
         assert state["job"] == {
-            "done": 1, "read": 2, "total": COUNT, "first": 0, "left": None, "stopping": False
+            "done": 1, "share": 1 / COUNT, "total": COUNT, "first": 0, "left": None, "stopping": False
         }  # fmt: skip
         assert state["frames"][0][2] == "mask" and state["frames"][1][2] == ""
         for request in (stroke(), {"kind": "save"}, {"kind": "undo", "version": state["version"]}):

@@ -71,17 +71,21 @@ def test_any_program_through_folders(tmp_path: Path) -> None:
     assert (next(iter(maker(source()))) == moving.mask(0)).all()
 
 
-def test_frames_that_wait_for_their_masks_are_half_done(tmp_path: Path) -> None:
+def test_a_maker_whose_masks_come_late_tells_how_much_is_done(tmp_path: Path) -> None:
     told: list[tuple[int, int]] = []
 
     def late(film: Unmasked) -> Iterator[np.ndarray]:
-        yield from [np.zeros(image.shape[:2], np.uint8) for image in film.images()]
+        masks = []
+        for number, image in enumerate(film.images(), 1):
+            masks.append(np.zeros(image.shape[:2], np.uint8))
+            film.log(0.6 * number / 4)
+        yield from masks
 
     def blind(film: Unmasked) -> Iterator[np.ndarray]:
         yield from (np.zeros((8, 8), np.uint8) for _ in film.stems)
 
     write_masks(source(4), late, tmp_path, lambda *counts: told.append(counts))
-    assert told == [(done, 4) for done in (0, 1, 1, 2, 2, 3, 3, 4)], "four are read, then four are written"
+    assert told == [(done, 4) for done in (0, 1, 1, 2, 2, 2, 3, 4)], "0.15 of 4 each, then four are written"
     told.clear()
     write_masks(source(3), blind, tmp_path, lambda *counts: told.append(counts))
     assert told == [(1, 3), (2, 3), (3, 3)]

@@ -119,8 +119,8 @@ function showState() {
   show(place);
 }
 
-function showJob({ done, read, total, left, stopping }) {
-  $("job-bar").value = (done + read) / 2 / total;
+function showJob({ done, share, total, left, stopping }) {
+  $("job-bar").value = share;
   const rest = left === null ? "" : left < 90 ? `, ${Math.ceil(left)} s left` : `, ${Math.ceil(left / 60)} min left`;
   $("job-text").textContent = stopping ? "Stopping after this stretch" : `Following: ${done} of ${total} masks${rest}`;
   $("cancel").disabled = stopping;
