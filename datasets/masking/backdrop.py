@@ -50,14 +50,20 @@ class Backdrop:
     """The backdrops of a film's frames.
 
     Args:
-        images: all frames, uint8 [h, w, 3].
+        images: all frames, uint8 [h, w, 3]; they are read when the first backdrop is wanted.
         saliency: the network.
     """
 
     def __init__(self, images: Iterable[np.ndarray], saliency: Saliency) -> None:
+        self._images: Iterable[np.ndarray] | None = images
+        self._saliency = saliency
         self._kept, self._to = list[_Kept](), list[np.ndarray]()
         self._shot = [0]  # places at which what comes cannot be laid over what was before
+
+    def _look_through(self) -> None:
+        """Register all frames, and keep those that others are compared with."""
         before: np.ndarray | None = None
+        images, self._images = self._images or (), None
         for place, image in enumerate(images):
             small = _small(image)
             grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
@@ -68,7 +74,7 @@ class Backdrop:
             self._to.append(step @ self._to[-1] if self._to else step)
             before = grey
             if place % EVERY == 0:
-                found = (saliency(small) > OUTSTANDING).astype(np.uint8)
+                found = (self._saliency(small) > OUTSTANDING).astype(np.uint8)
                 hidden = cv2.dilate(found, np.ones((MARGIN, MARGIN), np.uint8))
                 self._kept.append(_Kept(place, _lab(small), 1 - hidden))
 
@@ -79,6 +85,8 @@ class Backdrop:
             place: of the frame in the film.
             image: the frame, uint8 [h, w, 3].
         """
+        if self._images is not None:
+            self._look_through()
         lab = _lab(_small(image))
         high, wide = lab.shape[:2]
         least = np.full((2, high, wide), np.inf, np.float32)  # the two smallest differences

@@ -1,5 +1,7 @@
 """What lies behind an animal: still and panning cameras, cuts, what is never seen; and what it gives to `track`."""
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 import pytest
@@ -76,6 +78,20 @@ def test_one_frame_alone_and_pictures_without_corners_tell_nothing() -> None:
     assert not Backdrop([ground()], red).odds(0, ground()).any()
     plain = np.full((HIGH, WIDE, 3), 90, np.uint8)
     assert not Backdrop([plain] * COUNT, red).odds(20, plain).any()
+
+
+def test_frames_are_read_when_the_first_backdrop_is_wanted_and_once() -> None:
+    read: list[int] = []
+
+    def images() -> Iterator[np.ndarray]:
+        for number in range(COUNT):
+            read.append(number)
+            yield ground()
+
+    backdrop = Backdrop(images(), red)
+    assert not read, "a film in which two things stand out is refused before that"
+    for _ in range(2):
+        assert (backdrop.odds(20, ground()) < 0).mean() > 0.95 and read == [*range(COUNT)]
 
 
 def test_others_are_large_things_away_from_the_animal() -> None:
