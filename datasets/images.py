@@ -141,6 +141,12 @@ def target_size(source: tuple[int, int], selection: Selection) -> tuple[int, int
     return max(1, round(source[0] * scale)), max(1, round(source[1] * scale))
 
 
+def size_within(size: tuple[int, int], side: int) -> tuple[int, int]:
+    """Return the width and height that an image is shrunk to so that neither is above ``side`` pixels."""
+    scale = min(1.0, side / max(size))
+    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+
+
 def cut_window(rgb: np.ndarray, alpha: np.ndarray, window: Window, size: tuple[int, int]) -> np.ndarray:
     """Cut a window out of an image and average it down to ``size``, colour weighted by the matte, uint8 [h, w, 4]."""
     height, width = alpha.shape

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from rewild4d.datasets.images import size_within
 from rewild4d.datasets.masking.saliency import Saliency
 
 SIDE = 427
@@ -32,11 +33,9 @@ CHANNELS = (1.0, 1.5, 1.5)
 AROUND, LOUD = 61, 3.0
 """Side of the square around a pixel over which differences are averaged; those above so many medians count as that."""
 FLOOR, TIMES = 5.0, 2.0
-"""A pixel differs as backdrop does where it does by this, plus so many times the average around it; its odds are 1."""
+"""Log odds are 0 where a pixel differs by the first, and the second times the average around it, together."""
 STEEP, RANGE = 2.3, (-3.0, 4.0)
 """Log odds for each e-fold of that, and their range: fitted to the true masks of two films."""
-AWAY, LEAST, GRAIN = 15, 0.3, 5
-"""Something else lies so many pixels from the animal, has this share of its area, and is nowhere thinner, pixels."""
 
 
 @dataclass
@@ -118,31 +117,8 @@ class Backdrop:
         return sorted(fitting, key=lambda kept: abs(kept.place - place))[:MOST]
 
 
-def others(mask: np.ndarray, apart: np.ndarray | None) -> np.ndarray:
-    """Return what is there apart from the animal, a person for one, float32 [h, w], 0 or 1.
-
-    Args:
-        mask: of the animal, bool [h, w].
-        apart: log odds that a pixel is no backdrop; 0, where nothing is known, is no backdrop either, since something
-            stood out there throughout. None: nothing is known of the whole frame.
-    """
-    if apart is None or not mask.any():
-        return np.zeros(mask.shape, np.float32)
-    animal = mask.astype(np.uint8)
-    things = ((apart > 1) | (apart == 0)).astype(np.uint8)
-    things[:] = cv2.morphologyEx(things, cv2.MORPH_OPEN, np.ones((GRAIN, GRAIN), np.uint8))
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(things | animal)
-    is_other = stats[:, cv2.CC_STAT_AREA] >= LEAST * mask.sum()
-    is_other[0] = False
-    is_other[np.unique(labels[cv2.dilate(animal, np.ones((2 * AWAY + 1,) * 2, np.uint8)) > 0])] = False
-    found: np.ndarray = is_other[labels].astype(np.float32)
-    return found
-
-
 def _small(image: np.ndarray) -> np.ndarray:
-    scale = min(1.0, SIDE / max(image.shape[:2]))
-    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return cv2.resize(image, size_within(image.shape[1::-1], SIDE), interpolation=cv2.INTER_AREA)
 
 
 def _lab(image: np.ndarray) -> np.ndarray:

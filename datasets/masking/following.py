@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from scipy.special import expit, logit
 
-from rewild4d.datasets.masking.backdrop import others
 from rewild4d.datasets.masking.correcting import corrected
 from rewild4d.datasets.masking.flow import Flow, carried
 from rewild4d.datasets.masking.grabcut import LOST, STRANGE, colors
 from rewild4d.datasets.masking.makers import Box
+from rewild4d.datasets.masking.parts import main_parts, others, without_young
 from rewild4d.datasets.masking.saliency import Saliency
 
 WINDOW = 0.6
@@ -35,18 +35,13 @@ COLOURED, COLOURED_RANGE = 0.2, 2.5
 BEHIND = 0.6
 """Weight of the log odds that a pixel is no backdrop."""
 OTHER = 4.5
-"""Log odds against the animal where something else is carried to that was seen apart from it (`backdrop.others`)."""
+"""Log odds against the animal where something else is carried to that was seen apart from it (`parts.others`)."""
 BINS, LEARNED = 16, 0.1
 """Colours a channel, and share of them that each frame teaches anew."""
 TAUGHT = 0.5
 """The same of a frame that a person has corrected."""
 DOUBT, DROPPED = 0.1, 0.05
 """How far from a half a chance is at least before strokes change it, and the chance of what they cut off."""
-YOUNG, GAP = 0.5, 5
-"""A loose part is dropped where it was first seen less than this share of the largest part's frames ago; parts with a
-narrower gap between them, pixels, are one."""
-LEAST_PART, TOUCHING = 0.02, 0.3
-"""Least area of a part, of the largest one's, and the least share of it where flow carries the mask, or near."""
 ALIKE = 0.5
 """What stands out elsewhere is the lost animal where its colours are this near (Bhattacharyya) those at the start."""
 LEAST_AREA = 0.01
@@ -59,9 +54,9 @@ class Follower:
     Args:
         saliency: the network.
         image: the frame, uint8 [h, w, 3].
+        apart: log odds that a pixel is no backdrop (`backdrop`), float32 [h, w].
         box: around the animal in its pixels; None: around the marks on it.
         said: marks (`marks`), int8 [h, w]; None where there are none.
-        apart: log odds that a pixel is no backdrop (`backdrop`), float32 [h, w]; None where nothing is known.
 
     Attributes:
         mask: of the last frame, bool [h, w]; all False where the animal is lost.
@@ -72,18 +67,16 @@ class Follower:
         self,
         saliency: Saliency,
         image: np.ndarray,
+        apart: np.ndarray,
         box: Box | None = None,
         said: np.ndarray | None = None,
-        apart: np.ndarray | None = None,
     ) -> None:
         self._saliency, self._flow = saliency, Flow()
-        self._start(image, box, said, apart)
+        self._start(image, apart, box, said)
         self.loose = np.zeros_like(self.mask)
         self._looks, self._areas = colors(image, self.mask.astype(np.uint8)), [int(self.mask.sum())]
 
-    def _start(
-        self, image: np.ndarray, box: Box | None, said: np.ndarray | None = None, apart: np.ndarray | None = None
-    ) -> None:
+    def _start(self, image: np.ndarray, apart: np.ndarray, box: Box | None, said: np.ndarray | None = None) -> None:
         self._grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         inside = np.zeros(self._grey.shape, bool)
         if box is not None:
@@ -97,7 +90,7 @@ class Follower:
         if said is not None and said.all():
             odds = np.zeros(inside.shape)
         else:
-            odds = _apart(np.mean([self._outstanding(image, window) for window in windows], axis=0), apart)
+            odds = np.mean([self._outstanding(image, window) for window in windows], axis=0) + BEHIND * apart
         chance = expit(np.where(inside, odds, -9.0))
         self.mask = main_parts(chance > 0.5, inside)
         if said is not None:
@@ -117,16 +110,17 @@ class Follower:
         other._areas, other._colours = [*self._areas], copy(self._colours)
         return other
 
-    def correct(self, image: np.ndarray, said: np.ndarray) -> None:
+    def correct(self, image: np.ndarray, apart: np.ndarray, said: np.ndarray) -> None:
         """Change the last frame's mask as strokes say.
 
         Args:
             image: the last frame, uint8 [h, w, 3].
+            apart: its log odds that a pixel is no backdrop, float32 [h, w].
             said: marks, int8 [h, w].
         """
         if not self.mask.any():
             if (said > 0).any():
-                self._start(image, None, said)
+                self._start(image, apart, None, said)
             return
         before = np.where(self.mask, self._chance.clip(0.5 + DOUBT), self._chance.clip(0, 0.5 - DOUBT))
         chance = corrected(image, before, said)
@@ -139,12 +133,12 @@ class Follower:
             self._areas[-1] = int(mask.sum())
             self._colours.learn(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), self._chance, TAUGHT)
 
-    def step(self, image: np.ndarray, apart: np.ndarray | None = None) -> np.ndarray:
+    def step(self, image: np.ndarray, apart: np.ndarray) -> np.ndarray:
         """Return the mask in the next frame, bool [h, w]; all False where the animal is lost or not found again.
 
         Args:
             image: the frame, uint8 [h, w, 3].
-            apart: log odds that a pixel is no backdrop (`backdrop`), float32 [h, w]; None where nothing is known.
+            apart: log odds that a pixel is no backdrop (`backdrop`), float32 [h, w].
         """
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         self.loose = np.zeros(grey.shape, bool)
@@ -156,7 +150,7 @@ class Follower:
         before = carried(self._chance, flow)
         near = before > 0.5
         lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
-        odds = _apart(self._outstanding(image, _window(near)), apart) + COLOURED * self._colours.odds(lab)
+        odds = self._outstanding(image, _window(near)) + BEHIND * apart + COLOURED * self._colours.odds(lab)
         soft = logit(cv2.GaussianBlur(before, (0, 0), SOFT).clip(0, 1)).clip(-CARRIED_RANGE, CARRIED_RANGE)
         odds += CARRIED * np.where(sure, 1.0, UNSURE) * soft
         odds -= np.where(sure, 0.0, UNCOVERED)
@@ -164,7 +158,7 @@ class Follower:
         odds -= OTHER * other
         mask = main_parts((odds > 0) & _window_of(near), cv2.dilate(near.astype(np.uint8), np.ones((9, 9))) > 0)
         seen = np.where(mask, np.where(sure, carried(self._seen, flow, cv2.INTER_NEAREST), 0) + 1, 0)
-        whole, mask = mask, _without_young(mask, seen)
+        whole, mask = mask, without_young(mask, seen)
         self._other = np.where(mask, 0, np.maximum(other, others(mask, apart))).astype(np.float32)
         self.loose = whole & ~mask
         self._keep(image, lab, mask, np.where(mask | (odds <= 0), odds, -3.0), seen)
@@ -191,7 +185,7 @@ class Follower:
             odds[top:bottom, left:right] = OUTSTANDING * found
         return odds
 
-    def _find_again(self, image: np.ndarray, apart: np.ndarray | None) -> None:
+    def _find_again(self, image: np.ndarray, apart: np.ndarray) -> None:
         """Start again from what stands out in the whole frame and looks most as the animal did, if anything does."""
         found = []
         for box, mask in standing_out(self._saliency(image)):
@@ -199,7 +193,7 @@ class Follower:
             if away < ALIKE and mask.sum() > LOST * np.median(self._areas):
                 found.append((away, box))
         if found:
-            self._start(image, min(found)[1], None, apart)
+            self._start(image, apart, min(found)[1])
 
 
 class _Colours:
@@ -224,13 +218,6 @@ class _Colours:
         odds = np.log((self._inside + 1e-4) / (self._outside + 1e-4)).clip(-COLOURED_RANGE, COLOURED_RANGE)
         found: np.ndarray = odds.astype(np.float32)[_codes(lab)]
         return found
-
-
-def _apart(odds: np.ndarray, apart: np.ndarray | None) -> np.ndarray:
-    if apart is None:
-        return odds
-    found: np.ndarray = odds + BEHIND * apart
-    return found
 
 
 def _codes(lab: np.ndarray) -> np.ndarray:
@@ -272,39 +259,10 @@ def _window_of(mask: np.ndarray) -> np.ndarray:
     return inside
 
 
-def main_parts(mask: np.ndarray, near: np.ndarray, touching: float = TOUCHING) -> np.ndarray:
-    """Return the parts of a mask that are not small and of which more than a share lies in ``near``."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    areas = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
-    inside = np.bincount(labels[near], minlength=count)
-    is_kept = inside > touching * areas
-    is_kept[0] = False
-    if is_kept.any():
-        is_kept &= areas >= LEAST_PART * areas[is_kept].max()
-    found: np.ndarray = is_kept[labels]
-    return found
-
-
 def _as_said(mask: np.ndarray, said: np.ndarray) -> np.ndarray:
     """Return a mask that keeps to the marks, however small."""
     found: np.ndarray = (mask | (said > 0)) & (said >= 0)
     return found
-
-
-def _without_young(mask: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return a mask without the loose parts that were first seen long after the largest one.
-
-    Args:
-        mask: bool [h, w].
-        seen: for how many frames flow has carried each pixel, [h, w].
-    """
-    together = cv2.dilate(mask.astype(np.uint8), np.ones((GAP, GAP), np.uint8))
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(together)
-    if count <= 2:
-        return mask
-    ages = [float(np.median(seen[(labels == part) & mask])) for part in range(1, count)]
-    oldest = ages[int(stats[1:, cv2.CC_STAT_AREA].argmax())]
-    return mask & np.isin(labels, [part + 1 for part, age in enumerate(ages) if age >= YOUNG * oldest])
 
 
 def standing_out(found: np.ndarray) -> list[tuple[Box, np.ndarray]]:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
+from rewild4d.datasets.images import size_within
 from rewild4d.datasets.masking.flow import Flow, carried
 from rewild4d.datasets.masking.makers import Box, Unmasked
 from rewild4d.errors import UserError
@@ -35,7 +36,7 @@ def rough_masks(source: Unmasked) -> Iterator[np.ndarray]:
     if not source.boxes:
         raise UserError("--box: the rough masks need a box around the animal: --box left,top,width,height (pixels).")
     scale = min(1.0, WORK_SIDE / max(source.size))
-    size = (max(1, round(source.size[0] * scale)), max(1, round(source.size[1] * scale)))
+    size = size_within(source.size, WORK_SIDE)
     flow = Flow()
     before: np.ndarray | None = None
     mask: np.ndarray | None = None

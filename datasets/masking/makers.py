@@ -75,7 +75,7 @@ def write_masks(
 
     def told(share: float) -> None:
         nonlocal done
-        done = max(done, int(share * total))
+        done = max(done, len(paths), int(share * total))
         log(done, total)
 
     for stem, mask in zip(source.stems, maker(replace(source, log=told)), strict=False):
@@ -114,8 +114,9 @@ def run_program(command: str, timeout: float = TIMEOUT) -> MaskMaker:
             places["frames"].mkdir()
             places["masks"].mkdir()
             stems = [f"{index:05d}" for index in range(len(source.stems))]
-            for stem, image in zip(stems, source.images(), strict=True):
+            for count, (stem, image) in enumerate(zip(stems, source.images(), strict=True), 1):
                 _write(places["frames"] / f"{stem}.png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+                source.log(count / len(stems) / 2)
             lines = [f"{index} {' '.join(f'{x:g}' for x in box)}\n" for index, box in sorted(source.boxes.items())]
             places["boxes"].write_text("".join(lines), encoding="utf-8")
             _call([word.format(**places) for word in words], timeout)

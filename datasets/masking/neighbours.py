@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from rewild4d.datasets.masking.flow import Flow, carried
-from rewild4d.datasets.masking.following import main_parts
+from rewild4d.datasets.masking.parts import coarse, main_parts
 
 FRAMES = 24
 """Whose masks are kept back."""
@@ -19,8 +19,6 @@ LEAST_LOOSE, LEAST_LEFT = 0.05, 0.02
 """Shares of the animal's area: of a loose part from which on it is followed back, and below which it is hidden."""
 NEAR = 15
 """Pixels around what flow carries back, within which what the next mask lacks goes too."""
-GRAIN = 5
-"""Side of the smallest square that is taken out, pixels."""
 
 
 @dataclass
@@ -60,7 +58,7 @@ class Recent:
         """Follow a loose part back through the frames that are kept, until it is hidden."""
         last = self._kept[-1]
         came = carried(last.mask.astype(np.float32), self._flow(after.grey, last.grey)) > 0.5
-        part = (loose | _coarse((came | loose) & ~after.mask)).astype(np.float32)
+        part = (loose | coarse((came | loose) & ~after.mask)).astype(np.float32)
         for frame in reversed(self._kept):
             flow, sure = self._flow.checked(frame.grey, after.grey)
             part = carried(part, flow) * frame.mask
@@ -68,12 +66,6 @@ class Recent:
                 return
             ahead = carried(after.mask.astype(np.float32), flow) > 0.5
             around = cv2.dilate((part > 0.5).astype(np.uint8), np.ones((2 * NEAR + 1,) * 2, np.uint8)) > 0
-            gone = (part > 0.5) | (around & _coarse(frame.mask & ~ahead & sure))
+            gone = (part > 0.5) | (around & coarse(frame.mask & ~ahead & sure))
             frame.mask = main_parts(frame.mask & ~gone, ahead)
             after = frame
-
-
-def _coarse(mask: np.ndarray) -> np.ndarray:
-    """Return a mask without what is too thin for a square of `GRAIN` pixels: rims that flow leaves over."""
-    found: np.ndarray = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((GRAIN, GRAIN), np.uint8)) > 0
-    return found

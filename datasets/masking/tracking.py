@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from rewild4d.datasets.images import size_within
 from rewild4d.datasets.masking.backdrop import Backdrop
 from rewild4d.datasets.masking.following import Follower, standing_out
 from rewild4d.datasets.masking.grabcut import rough_masks
@@ -51,8 +52,7 @@ def _made(source: Unmasked) -> Iterator[np.ndarray]:
         yield from rough_masks(replace(source, boxes={**_boxes_of(source.marks), **source.boxes}))
         return
     saliency = Saliency(load_weights(NAME))
-    scale = min(1.0, WORK_SIDE / max(source.size))
-    size = (max(1, round(source.size[0] * scale)), max(1, round(source.size[1] * scale)))
+    size = size_within(source.size, WORK_SIDE)
     for mask in _followed(source, saliency, size):
         found = cv2.resize(mask.astype(np.float32), source.size, interpolation=cv2.INTER_LINEAR) > 0.5
         yield found * np.uint8(255)
@@ -148,10 +148,12 @@ def _start_of(
     if said is not None:
         said = resized(said, (small.shape[1], small.shape[0]))
     if index in source.boxes:
-        return Follower(saliency, small, _box(source, index, small), said, backdrop.odds(index, small))
+        box = _box(source, index, small)
+        return Follower(saliency, small, backdrop.odds(index, small), box, said)
     if said is not None and follower is not None and not (said.all() and said.max() > 0):
-        follower.step(small, backdrop.odds(index, small))
-        follower.correct(small, said)
+        apart = backdrop.odds(index, small)
+        follower.step(small, apart)
+        follower.correct(small, apart, said)
         return follower
     if said is not None:
         if not (said > 0).any():
@@ -159,11 +161,11 @@ def _start_of(
                 f"{source.title}: the first marked frame, {source.stems[index]}, has no stroke on the animal; "
                 "draw one, or give a box."
             )
-        return Follower(saliency, small, None, said, backdrop.odds(index, small))
+        return Follower(saliency, small, backdrop.odds(index, small), None, said)
     if source.boxes or source.marks or follower is not None:
         return None
-    box = _outstanding(source, index, small, saliency)
-    return None if box is None else Follower(saliency, small, box, None, backdrop.odds(index, small))
+    found = _outstanding(source, index, small, saliency)
+    return None if found is None else Follower(saliency, small, backdrop.odds(index, small), found)
 
 
 def _box(source: Unmasked, index: int, small: np.ndarray) -> Box:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from rewild4d.contracts import Verdict
+from rewild4d.datasets.images import size_within
 from rewild4d.datasets.masking.facts import FRAMED, MaskFacts, jumps, mask_facts
 from rewild4d.datasets.masking.flow import Flow, carried
 from rewild4d.datasets.masking.saliency import NAME, Saliency
@@ -79,8 +80,7 @@ class MaskTrust:
         before, self._before = self._before, None
         if before is None and index not in self._chosen:
             return
-        scale = min(1.0, WORK_SIDE / max(image.shape[:2]))
-        size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+        size = size_within(image.shape[1::-1], WORK_SIDE)
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         solid = np.zeros(size[::-1], bool)
         if mask is not None:

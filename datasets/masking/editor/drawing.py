@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from rewild4d.datasets.images import size_within
 from rewild4d.datasets.masking.correcting import corrected
 from rewild4d.datasets.masking.marks import is_whole, resized
 from rewild4d.datasets.masking.tracking import WORK_SIDE
@@ -47,8 +48,7 @@ def mask_of(image: np.ndarray, base: np.ndarray | None, said: np.ndarray) -> np.
     if is_whole(said):
         return np.where(said > 0, 255, 0).astype(np.uint8)
     before = np.zeros(said.shape, np.uint8) if base is None else base
-    scale = min(1.0, WORK_SIDE / max(said.shape))
-    size = (max(1, round(said.shape[1] * scale)), max(1, round(said.shape[0] * scale)))
+    size = size_within(said.shape[::-1], WORK_SIDE)
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     chance = cv2.resize(before.astype(np.float32) / 255, size, interpolation=cv2.INTER_AREA)
     found = corrected(small, chance, resized(said, size))

@@ -8,8 +8,9 @@ import pytest
 from films import iou
 
 from rewild4d.datasets.masking import following, tracking
-from rewild4d.datasets.masking.backdrop import RANGE, Backdrop, others
+from rewild4d.datasets.masking.backdrop import RANGE, Backdrop
 from rewild4d.datasets.masking.makers import Unmasked
+from rewild4d.datasets.masking.parts import others
 from rewild4d.datasets.masking.tracking import track_masks
 
 WIDE, HIGH, COUNT = 320, 160, 60
@@ -99,7 +100,7 @@ def test_others_are_large_things_away_from_the_animal() -> None:
     apart = np.where(animal | person | speck | near, 3.0, -3.0).astype(np.float32)
     assert iou(others(animal, apart) > 0, person) == 1
     assert iou(others(animal, np.where(person, 0, apart)) > 0, person) == 1, "what is hidden throughout"
-    assert not others(animal, None).any() and not others(np.zeros_like(animal), apart).any()
+    assert not others(animal, np.zeros_like(apart)).any() and not others(np.zeros_like(animal), apart).any()
 
 
 def followed(pictures: list[np.ndarray], at: tuple[int, int, int, int]) -> list[np.ndarray]:

@@ -66,7 +66,9 @@ def test_any_program_through_folders(tmp_path: Path) -> None:
     script = tmp_path / "red parts.py"
     script.write_text(COPY)
     maker = run_program(f"{sys.executable} '{script}' {{frames}} {{masks}}")
-    paths, empty = write_masks(source(), maker, tmp_path / "out")
+    told: list[int] = []
+    paths, empty = write_masks(source(), maker, tmp_path / "out", lambda done, _: told.append(done))
+    assert told == [0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, *[6] * 6, *range(7, 13)], "half is done when frames are written"
     assert [path.name for path in paths] == [f"{i:05d}.png" for i in range(12)] and empty == 0
     assert (next(iter(maker(source()))) == moving.mask(0)).all()
 
@@ -89,6 +91,9 @@ def test_a_maker_whose_masks_come_late_tells_how_much_is_done(tmp_path: Path) ->
     told.clear()
     write_masks(source(3), blind, tmp_path, lambda *counts: told.append(counts))
     assert told == [(1, 3), (2, 3), (3, 3)]
+    told.clear()
+    write_masks(source(49), blind, tmp_path, lambda *counts: told.append(counts))
+    assert told == [(done, 49) for done in range(1, 50)], "1 / 49 * 49 is less than 1"
 
 
 @pytest.mark.parametrize(
