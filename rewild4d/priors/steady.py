@@ -51,8 +51,8 @@ def clusters(points: Tensor, eps: float = EPS, neighbours: int = NEIGHBOURS) -> 
 def steady(cameras: Sequence[Camera], times: Tensor) -> Tensor:
     """Return which cameras, in the object frame, belong to the largest cluster, or all where there is none, bool, [T].
 
-    Between ``times`` (seconds, [T]) up to `GAP` missing frames, such as held-out ones, are interpolated; where the way is
-    smooth (`SPEED`) as many as keep its ends in one cluster, so that a film with few frames a second parts no way.
+    Between ``times`` (seconds, [T]) up to `GAP` missing frames, such as held-out ones, are interpolated; where the way
+    is smooth (`SPEED`) as many as keep its ends in one cluster, so that few frames a second part no way.
     """
     matrices = torch.stack([camera.world_to_camera.double() for camera in cameras])
     centers = -(matrices[:, :3, :3].transpose(1, 2) @ matrices[:, :3, 3:])[..., 0]

@@ -83,8 +83,10 @@ def test_a_smooth_way_is_one_at_any_rate_of_frames() -> None:
     assert 2 * math.sin(0.2) * 12 < SPEED < 2 * math.sin(0.2) * 24
     assert steady(cameras, torch.arange(12).double() / 12).all()
     assert not steady(cameras, torch.arange(12).double() / 24).all(), "twice as fast is a hop"
-    reversed_for_a_while = ring([angle + math.pi * (t in (9, 10)) for t, angle in enumerate(turned)])
-    assert steady(reversed_for_a_while, torch.arange(12).double() / 12).tolist() == [t not in (9, 10) for t in range(12)]
+    reversed_for_a_while = ring([angle + math.pi / 2 * (t in (9, 10)) for t, angle in enumerate(turned)])
+    assert steady(reversed_for_a_while, torch.arange(12).double() / 12).tolist() == [
+        t not in (9, 10) for t in range(12)
+    ]
 
 
 def farther(camera: Camera, share: float) -> Camera:
