@@ -17,6 +17,7 @@ from rewild4d.priors.bodies.body import Body, Proportions, diagonal
 from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.config import PriorConfig, Stage
 from rewild4d.priors.heading.reading import Headings, read_headings
+from rewild4d.priors.heading.turning import along, turning
 from rewild4d.priors.io import seal
 from rewild4d.priors.judge import measured
 from rewild4d.priors.kinematics import pose
@@ -145,13 +146,14 @@ def fit_footage(
 
     Shapes of random animals take no part: in films they move joints away (docs/experiments/headings.md).
 
-    The seed is that of the frames drawn for each step of a long clip. Of several ``bodies`` the one that fits the clip
+    All guesses start with the turns that a network reads. The seed is that of the frames drawn for each step of a long
+    clip. Of several ``bodies`` the one that fits the clip
     best is taken.
 
     Returns:
         A prior with one camera and pose per frame and for its mirror image; `quality` has the figures of
-        `judge.measured`, cost, facing_margin (the lead of the best guess over the best that heads against it), and of
-        several bodies the figures of `decided`.
+        `judge.measured`, cost, facing_margin (the lead of the best guess over the best that heads against it), turn
+        (degrees, with a network), and of several bodies the figures of `decided`.
 
     Raises:
         UserError: no mask shows anything.
@@ -191,6 +193,11 @@ def _race(
     # known proportions need fewer starts
     count = config.yaw_starts if known is None else max(4, config.yaw_starts // 2)
     starts = Views.start(body, facings(count), torch.zeros(len(frames), 3), config.root_period)
+    if race.headings is not None:
+        turn = turning(race.headings, len(frames), math.radians(config.least_turn))
+        race.headings = along(race.headings, turn)
+        race.figures["turn"] = math.degrees(float(turn.max() - turn.min()))
+        starts = starts.turned(turn)
     race.begin(starts)
     if known is not None:
         race.given = True

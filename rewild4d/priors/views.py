@@ -80,6 +80,13 @@ class Views(Hypotheses):
         rotation, shift = torch.zeros(*still.rotation.shape[:2], 2), torch.zeros(len(facing), len(path), 3)
         return replace(still, rotation=rotation, shift=shift)
 
+    def turned(self, turn: Tensor) -> Self:
+        """Return these guesses as they turn besides, by angles about y, radians, [T]; none is fixed."""
+        series = cosine_series(len(turn), self.rotation.shape[1])
+        rotation = self.rotation.clone()
+        rotation[..., 0] += torch.linalg.lstsq(series, turn[:, None] / AZIMUTH_SPREAD).solution[:, 0]
+        return replace(self, rotation=rotation)
+
     def with_depth_mirrored(self) -> Self:
         """Return these guesses and their reflections in the image plane, [2 B].
 

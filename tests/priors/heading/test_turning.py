@@ -1,21 +1,25 @@
 """How an animal turns: the path through what a network reads, and guesses that turn along it."""
 
 import math
+from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 from walking import shortened, silent, walking_clip
 
-from rewild4d.priors import fit
+from rewild4d.priors import fit, footage
 from rewild4d.priors.bodies.quadruped import QUADRUPED
+from rewild4d.priors.config import FOOTAGE
 from rewild4d.priors.heading.network import SECTORS, HeadingNetwork, shares_around
 from rewild4d.priors.heading.reading import Headings
 from rewild4d.priors.heading.turning import along, turning
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.search import facings
 from rewild4d.priors.trained import Trained
+from rewild4d.priors.views import Views
 
 DEGREES = math.pi / 180
 LEAST = 40 * DEGREES
@@ -89,3 +93,26 @@ def test_the_fit_starts_from_the_turn_and_its_record_has_it(cameras: str, monkey
     assert between == pytest.approx(1.6, abs=0.2)
     assert made.quality["turn"] == pytest.approx(math.degrees(1.6), abs=0.1)
     assert ("turning as a network reads" in made.provenance) == (cameras == "sweep")
+
+
+def test_guesses_under_unknown_cameras_turn_too_and_their_reflections_the_other_way() -> None:
+    turn = turning(read(1.2 * torch.tanh((torch.arange(24) - 12) / 3.0)), 24, LEAST)
+    guesses = Views.start(QUADRUPED, facings(4), torch.zeros(24, 3)).turned(turn)
+    for found, wanted in ((guesses, turn), (guesses.with_depth_mirrored().select(torch.arange(4, 8)), -turn)):
+        heads = found.roots()[..., :3, 2]
+        angles = np.unwrap(torch.atan2(heads[..., 0], heads[..., 2]))
+        assert np.allclose(angles - angles[:, :1], np.tile(wanted - wanted[0], (4, 1)), atol=8 * DEGREES)
+    assert torch.equal(guesses.turned(torch.zeros(24)).rotation, guesses.rotation)
+
+
+def test_an_animal_that_turns_in_a_film_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = torch.linspace(-0.8, 0.8, 6)
+    monkeypatch.setattr(footage, "turning", lambda found, count, least: told if least == LEAST else torch.zeros(count))
+    clip = walking_clip(6, "fixed")
+    film = replace(clip, frames=tuple(replace(frame, camera=None) for frame in clip.frames))
+    stages = tuple(msgspec.structs.replace(stage, steps=1, frames=6, size=24) for stage in FOOTAGE.stages[:2])
+    config, network = msgspec.structs.replace(FOOTAGE, stages=stages, yaw_starts=4), HeadingNetwork().eval()
+    made = footage.fit_footage(film, config=config, seed=0, log=silent, trained=Trained(headings=network))
+    first, last = (made.cameras[row].world_to_camera[:3, 2] for row in (0, -1))
+    assert math.acos(float(first @ last)) == pytest.approx(1.6, abs=0.25)
+    assert made.quality["turn"] == pytest.approx(math.degrees(1.6), abs=0.1)
