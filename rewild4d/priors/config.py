@@ -58,6 +58,7 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             an angle looks like a shorter one.
         least_turn: span of headings that a network reads, degrees, from which all guesses turn as the readings do.
         heading_weight: nats below the heading that a network finds likeliest, likewise.
+        turned_weight: the same of an animal that turns before unknown cameras.
         gait_weight: feet on the ground that move towards the head, when hypotheses are compared.
         travel_weight: heading against the direction of travel, when hypotheses are compared.
         carriage_weight: heads folded into the body and raised tails, under unknown cameras.
@@ -81,6 +82,7 @@ class PriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     view_weight: float = 0.01
     least_turn: float = 40.0
     heading_weight: float = 0.03
+    turned_weight: float = 0.06
     gait_weight: float = 0.015
     travel_weight: float = 0.08
     carriage_weight: float = 1.0

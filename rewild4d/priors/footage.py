@@ -73,6 +73,7 @@ class FixedCamera(Race):
         said: marks and travel.
         points: that a network found; None without one.
         headings: that a network read; None without one.
+        turns: whether they tell of an animal that turns.
         boxes: windows of the frames, [T, 3].
         given: keep scale and proportions as they are.
     """
@@ -82,6 +83,7 @@ class FixedCamera(Race):
     guesses: Views
     points: PointEvidence | None = None
     headings: Headings | None = None
+    turns: bool = False
     given: bool = False
 
     def free(self, stage: Stage) -> list[str]:
@@ -94,7 +96,8 @@ class FixedCamera(Race):
         if self.said.marks is not None and len(self.said.marks):
             cost = cost + self.config.keypoint_weight * self._off_marks(self.said.marks)
         if self.headings is not None:
-            cost = cost + self.config.heading_weight * self.headings.distance(self.guesses.roots()[..., :3, 2])
+            weight = self.config.turned_weight if self.turns else self.config.heading_weight
+            cost = cost + weight * self.headings.distance(self.guesses.roots()[..., :3, 2])
         if self.points is not None:
             cost = cost + self.config.points_weight * self.points.distance(self.guesses.points(*indices()))
         return cost
@@ -195,7 +198,7 @@ def _race(
     starts = Views.start(body, facings(count), torch.zeros(len(frames), 3), config.root_period)
     if race.headings is not None:
         turn = turning(race.headings, len(frames), math.radians(config.least_turn))
-        race.headings = along(race.headings, turn)
+        race.headings, race.turns = along(race.headings, turn), bool(turn.any())
         race.figures["turn"] = math.degrees(float(turn.max() - turn.min()))
         starts = starts.turned(turn)
     race.begin(starts)

@@ -33,8 +33,8 @@ def _older_prior(run: RunRecord) -> str:
     else:
         coloured = run.preset == "quick" or any("colors" in stage for stage in settings["stages"])
         missing = [] if coloured else ["colours"]
-    if cameras != "unknown":
-        missing += [] if "least_turn" in settings else ["turns that a network reads"]
+    turns = "turned_weight" if cameras == "unknown" else "least_turn"
+    missing += [] if turns in settings else ["turns that a network reads"]
     return PRIOR.format(parts=" and ".join(missing)) if missing else ""
 
 

@@ -98,4 +98,6 @@ def test_runs_from_priors_of_masks_alone_stand_for_their_row_with_a_note_until_t
     films = [msgspec.to_builtins(FOOTAGE)]
     films.insert(0, {name: value for name, value in films[0].items() if name != "heading_weight"})
     assert row(films[0], cameras="unknown").notes == (PRIOR.format(parts="headings"),)
+    stiff = {name: value for name, value in films[1].items() if name != "turned_weight"}
+    assert row(stiff, cameras="unknown").notes == (PRIOR.format(parts="turns that a network reads"),)
     assert not row(*films, cameras="unknown").notes

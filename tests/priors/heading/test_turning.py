@@ -105,6 +105,22 @@ def test_guesses_under_unknown_cameras_turn_too_and_their_reflections_the_other_
     assert torch.equal(guesses.turned(torch.zeros(24)).rotation, guesses.rotation)
 
 
+def test_of_an_animal_that_turns_in_a_film_readings_count_for_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    clip = walking_clip(6, "fixed")
+    film = tuple(replace(frame, camera=None) for frame in clip.frames)
+    costs = []
+    for told in (torch.zeros(6), torch.linspace(-0.8, 0.8, 6)):
+        monkeypatch.setattr(footage, "turning", lambda *_, told=told: told)
+        race = footage._race(
+            "film", film, footage.NOTHING, msgspec.structs.replace(FOOTAGE, view_weight=0.0, carriage_weight=0.0), 0,
+            footage.Steps(silent, 1), QUADRUPED, Trained(headings=HeadingNetwork().eval()),
+        )  # fmt: skip
+        assert race.headings is not None
+        nats = race.headings.distance(race.guesses.roots()[..., :3, 2])
+        costs.append(race.evidence() / nats)
+    assert torch.allclose(costs[0], torch.tensor(0.03)) and torch.allclose(costs[1], torch.tensor(0.06))
+
+
 def test_an_animal_that_turns_in_a_film_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     told = torch.linspace(-0.8, 0.8, 6)
     monkeypatch.setattr(footage, "turning", lambda found, count, least: told if least == LEAST else torch.zeros(count))
