@@ -20,8 +20,8 @@ EPS, NEIGHBOURS = 0.25, 3
 """DBSCAN's eps and min_samples (a point counts itself)."""
 GAP = 2
 """Most missing frames in a row that are interpolated."""
-SPEED = 24 * EPS
-"""Fastest way that is smooth, per second: at 24 frames a second `EPS` a frame, a turn of 340 degrees a second."""
+SMOOTH = frozenset({"template", "learned"})
+"""Names of priors whose cameras the fit moves smoothly: one that is far from the others tells of a fast turn."""
 TRANSLATION_RANGE = 0.11
 """Range of Fauna's translation along the view over its camera's distance: 1.1 of 10 units."""
 
@@ -51,8 +51,7 @@ def clusters(points: Tensor, eps: float = EPS, neighbours: int = NEIGHBOURS) -> 
 def steady(cameras: Sequence[Camera], times: Tensor) -> Tensor:
     """Return which cameras, in the object frame, belong to the largest cluster, or all where there is none, bool, [T].
 
-    Between ``times`` (seconds, [T]) up to `GAP` missing frames, such as held-out ones, are interpolated; where the way
-    is smooth (`SPEED`) as many as keep its ends in one cluster, so that few frames a second part no way.
+    Up to `GAP` missing frames between ``times`` (seconds, [T]), such as held-out ones, are interpolated.
     """
     matrices = torch.stack([camera.world_to_camera.double() for camera in cameras])
     centers = -(matrices[:, :3, :3].transpose(1, 2) @ matrices[:, :3, 3:])[..., 0]
@@ -66,15 +65,13 @@ def steady(cameras: Sequence[Camera], times: Tensor) -> Tensor:
 
 
 def _between(features: Tensor, times: Tensor) -> Tensor:
-    """Interpolate points between neighbours that are at most `GAP` frames apart, [m, d]."""
-    gaps, ways = times.diff(), features.diff(dim=0).norm(dim=1)
+    """Interpolate points for up to `GAP` frames that are missing between neighbours, [m, d]."""
+    gaps = times.diff()
     missing = (gaps / gaps.median()).round().long() - 1 if len(gaps) else gaps.long()
-    linked = torch.where(ways <= SPEED * gaps, (ways / (EPS / 2)).ceil().long() - 1, 0)
     parts = [
         torch.lerp(features[row], features[row + 1], k / (count + 1))
-        for row, (lost, more) in enumerate(zip(missing.tolist(), linked.tolist(), strict=True))
-        if lost <= GAP
-        for count in (max(lost, more),)
+        for row, count in enumerate(missing.tolist())
+        if count <= GAP
         for k in range(1, count + 1)
     ]
     return torch.stack(parts) if parts else features[:0]
@@ -86,8 +83,10 @@ def without_hops(prior: Prior) -> Filtered:
     The other sequence's camera and pose of a marked frame become mirror images of the steady one's, so that every row
     can be rendered and interpolated; a fit is not trained from them. `object_to_world`, which belongs to the plain
     camera, is interpolated where that camera is not steady. A sequence in which less than half of the cameras agree is
-    not filtered, and a note says so.
+    not filtered, and a note says so; nor is a `SMOOTH` prior.
     """
+    if prior.name in SMOOTH:
+        return Filtered(prior, tuple(range(len(prior.times))), ())
     plain, flipped = steady(prior.cameras, prior.times), steady(prior.cameras_flip, prior.times)
     count, undecided = len(plain), []
     for each, what in ((plain, ""), (flipped, "mirrored ")):
