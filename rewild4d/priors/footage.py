@@ -17,7 +17,7 @@ from rewild4d.priors.bodies.body import Body, Proportions, diagonal
 from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.config import PriorConfig, Stage
 from rewild4d.priors.heading.reading import Headings, read_headings
-from rewild4d.priors.heading.turning import along, turning
+from rewild4d.priors.heading.turning import PACE, along, turning
 from rewild4d.priors.io import seal
 from rewild4d.priors.judge import measured
 from rewild4d.priors.kinematics import pose
@@ -197,7 +197,7 @@ def _race(
     count = config.yaw_starts if known is None else max(4, config.yaw_starts // 2)
     starts = Views.start(body, facings(count), torch.zeros(len(frames), 3), config.root_period)
     if race.headings is not None:
-        turn = turning(race.headings, len(frames), math.radians(config.least_turn))
+        turn = turning(race.headings, len(frames), math.radians(config.least_turn), PACE * _apart(frames))
         race.headings, race.turns = along(race.headings, turn), bool(turn.any())
         race.figures["turn"] = math.degrees(float(turn.max() - turn.min()))
         starts = starts.turned(turn)
@@ -208,6 +208,12 @@ def _race(
         for part in ("scale", "shape", "relief"):
             setattr(race.guesses, part, getattr(known, part)[rows])
     return race
+
+
+def _apart(frames: tuple[Frame, ...]) -> float:
+    """Return how far apart frames are, in 1/24 of a second; 1 for nearer ones."""
+    times = torch.tensor([frame.time for frame in frames])
+    return max(1.0, 24 * float(times.diff().median())) if len(times) > 1 else 1.0
 
 
 def _prior(clip: Clip, race: FixedCamera, race_flip: FixedCamera, name: str, seed: int) -> Prior:

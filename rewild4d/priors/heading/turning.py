@@ -15,21 +15,22 @@ from rewild4d.priors.paths import cheapest_path
 ANGLES = 72
 """Even headings between which the path chooses."""
 PACE = math.radians(20.0)
-"""Standard deviation of the turn from one frame to the next."""
+"""Standard deviation of the turn from one frame to the next, up to 1/24 of a second apart."""
 SMOOTHING = 0.8
 """Standard deviation in time of what smooths the path, frames."""
 
 
-def turning(found: Headings, count: int, least: float) -> Tensor:
+def turning(found: Headings, count: int, least: float, pace: float = PACE) -> Tensor:
     """Return by how much the heading at each of ``count`` times differs from the mean; 0 where it hardly turns at all.
 
-    Of all paths it is the one whose readings, in nats below the likeliest, and squared turns, in `PACE`, sum to least.
-    Readings of an animal that keeps its heading waver too: paths that span less than ``least`` count for nothing.
+    Of all paths it is the one whose readings, in nats below the likeliest, and squared turns, in ``pace``, sum to
+    least. Readings of an animal that keeps its heading waver too: paths that span less than ``least`` count for nothing.
 
     Args:
         found: in a frame whose y axis is up.
         count: of times; those that nothing was read of are bridged.
         least: radians.
+        pace: standard deviation of the turn from one time to the next, radians.
 
     Returns:
         Angles about y, from z to x, without jumps, radians, [count].
@@ -37,7 +38,7 @@ def turning(found: Headings, count: int, least: float) -> Tensor:
     angles = _even()
     costs = torch.zeros(count, ANGLES)
     costs.index_add_(0, found.timesteps, found.nats(_heads(angles[:, None].expand(-1, count))).T)
-    turns = 0.5 * (wrapped(angles[:, None] - angles) / PACE).square()
+    turns = 0.5 * (wrapped(angles[:, None] - angles) / pace).square()
     rows = cheapest_path(costs, turns)
     path = gaussian_filter1d(np.unwrap(angles[rows].double().numpy()), SMOOTHING, mode="nearest")
     return torch.from_numpy(path - path.mean()).float() if np.ptp(path) >= least else torch.zeros(count)

@@ -15,7 +15,7 @@ from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.config import FOOTAGE
 from rewild4d.priors.heading.network import SECTORS, HeadingNetwork, shares_around
 from rewild4d.priors.heading.reading import Headings
-from rewild4d.priors.heading.turning import along, turning
+from rewild4d.priors.heading.turning import PACE, along, turning
 from rewild4d.priors.hypotheses import Hypotheses
 from rewild4d.priors.search import facings
 from rewild4d.priors.trained import Trained
@@ -56,6 +56,14 @@ def test_times_without_a_reading_are_bridged_and_one_time_may_have_several() -> 
     found = turning(read(ramp[kept], kept), 12, LEAST)
     assert (found - (ramp - ramp.mean())).abs().max() < 12 * DEGREES and (found.diff() >= 0).all()
     assert turning(read(ramp[:1]), 1, LEAST).tolist() == [0.0]
+
+
+def test_an_animal_may_turn_farther_between_frames_that_are_farther_apart() -> None:
+    """Half round within three frames, and on: at a narrow pace the way back, which no reading tells, is cheaper."""
+    angles = torch.tensor([0.0] * 6 + [1.0, 2.1, 3.1] + [3.5, 4.5, 5.5] + [6.2] * 6)
+    turned, held = (turning(read(angles), 18, LEAST, pace) for pace in (2.5 * PACE, PACE / 4))
+    assert float(turned[-1] - turned[0]) == pytest.approx(2 * math.pi, abs=0.3)
+    assert float(held[-1] - held[0]) == pytest.approx(0.0, abs=0.3)
 
 
 def test_nats_of_an_animal_that_turns_count_from_its_likeliest_heading() -> None:
@@ -123,9 +131,14 @@ def test_of_an_animal_that_turns_in_a_film_readings_count_for_more(monkeypatch: 
 
 def test_an_animal_that_turns_in_a_film_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     told = torch.linspace(-0.8, 0.8, 6)
-    monkeypatch.setattr(footage, "turning", lambda found, count, least: told if least == LEAST else torch.zeros(count))
+
+    def said(found: Headings, count: int, least: float, pace: float) -> Tensor:
+        assert count == 6 and pace == pytest.approx(2 * PACE), "twelve frames a second"
+        return told if least == LEAST else torch.zeros(count)
+
+    monkeypatch.setattr(footage, "turning", said)
     clip = walking_clip(6, "fixed")
-    film = replace(clip, frames=tuple(replace(frame, camera=None) for frame in clip.frames))
+    film = replace(clip, frames=tuple(replace(frame, camera=None, time=t / 12) for t, frame in enumerate(clip.frames)))
     stages = tuple(msgspec.structs.replace(stage, steps=1, frames=6, size=24) for stage in FOOTAGE.stages[:2])
     config, network = msgspec.structs.replace(FOOTAGE, stages=stages, yaw_starts=4), HeadingNetwork().eval()
     made = footage.fit_footage(film, config=config, seed=0, log=silent, trained=Trained(headings=network))
