@@ -24,7 +24,7 @@ def turning(found: Headings, count: int, least: float, pace: float = PACE) -> Te
     """Return by how much the heading at each of ``count`` times differs from the mean; 0 where it hardly turns at all.
 
     Of all paths it is the one whose readings, in nats below the likeliest, and squared turns, in ``pace``, sum to
-    least. Readings of an animal that keeps its heading waver too: paths that span less than ``least`` count for nothing.
+    least. Readings of an animal that keeps its heading waver too, so paths that span less than ``least`` do not count.
 
     Args:
         found: in a frame whose y axis is up.
