@@ -149,9 +149,8 @@ def fit_footage(
 
     Shapes of random animals take no part: in films they move joints away (docs/experiments/headings.md).
 
-    All guesses start with the turns that a network reads. The seed is that of the frames drawn for each step of a long
-    clip. Of several ``bodies`` the one that fits the clip
-    best is taken.
+    All guesses start with the turns that a network reads. Of several ``bodies`` the one that fits the clip best is
+    taken. The seed is that of the frames drawn for each step of a long clip.
 
     Returns:
         A prior with one camera and pose per frame and for its mirror image; `quality` has the figures of
