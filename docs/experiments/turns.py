@@ -1,7 +1,6 @@
 """Fit the template to films of random animals whose camera goes half around them, and measure headings (headings.md).
 
-python docs/experiments/turns.py 1 3 5 8 13 14 18 20               # seeds of the zoo, 0 to 99 for development
-python docs/experiments/turns.py 1 3 5 8 13 14 18 20 --still       # the camera stays where it is
+python docs/experiments/turns.py 1 3 5 8 13 14 18 20       # seeds of the zoo, 0 to 99 for development
 """
 
 import sys
@@ -15,6 +14,7 @@ from rewild4d.datasets.rigs.studio import camera_ring, picture
 from rewild4d.priors.bodies.quadruped import QUADRUPED
 from rewild4d.priors.config import FOOTAGE
 from rewild4d.priors.footage import fit_footage
+from rewild4d.priors.heading.network import wrapped
 from rewild4d.priors.heading.weights import package_weights
 from rewild4d.priors.trained import Trained
 from rewild4d.types import Clip, Frame
@@ -26,13 +26,13 @@ GOES, COMES = 10, 18
 """Frames between which the camera goes on."""
 
 
-def film(seed: int, still: bool) -> tuple[Clip, Tensor]:
+def film(seed: int) -> tuple[Clip, Tensor]:
     """Return a film of an animal and its headings in the camera's axes, x to the right and z to it, radians, [T]."""
     animal, random = animals.build(seed, COUNT), np.random.default_rng(seed)
     posed = np.stack([np.concatenate(animal.posed(t))[::5] for t in range(COUNT)])
     ring = camera_ring(posed, animal.up, RING, WIDTH, HEIGHT)
     start, side = int(random.integers(RING)), 1 if random.random() < 0.5 else -1
-    ways = np.interp(np.arange(COUNT), (GOES, COMES), (0, 0 if still else side * RING // 2)).round().astype(int)
+    ways = np.interp(np.arange(COUNT), (GOES, COMES), (0, side * RING // 2)).round().astype(int)
     rear, front = (animal.bones[:, animal.bone_names.index(name), :3, 3] for name in ("spine.0", "neck.0"))
     frames, headings = [], []
     for t, way in enumerate(ways):
@@ -47,21 +47,20 @@ def film(seed: int, still: bool) -> tuple[Clip, Tensor]:
     return Clip(f"zoo/{seed}", "zoo", tuple(frames), RATE, "CC0", ""), torch.tensor(headings)
 
 
-def errors(seed: int, still: bool) -> Tensor:
+def errors(seed: int) -> Tensor:
     """Return how far the fit's headings are from the true ones, degrees, [T]."""
-    clip, true = film(seed, still)
+    clip, true = film(seed)
     prior = fit_footage(
         clip, config=FOOTAGE, seed=0, log=lambda *_: None, trained=Trained(headings=package_weights()),
         bodies=(QUADRUPED,),
     )  # fmt: skip
     ahead = torch.stack([camera.world_to_camera[:3, 2] for camera in prior.cameras])
-    away = torch.atan2(ahead[:, 0], -ahead[:, 2]) - true
-    return torch.atan2(away.sin(), away.cos()).abs().rad2deg()
+    return wrapped(torch.atan2(ahead[:, 0], -ahead[:, 2]) - true).abs().rad2deg()
 
 
 if __name__ == "__main__":
-    for seed in (int(word) for word in sys.argv[1:] if word != "--still"):
-        found = errors(seed, "--still" in sys.argv)
+    for seed in map(int, sys.argv[1:]):
+        found = errors(seed)
         print(
             f"{seed}: median {found.median():.0f}, mean {found.mean():.0f}, above 90: {(found > 90).sum()}", flush=True
         )
